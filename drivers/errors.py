@@ -1,0 +1,92 @@
+"""The one error tree of the cell.
+
+    CellError
+    ├── ConfigError        a value in a file or on the command line is wrong: nothing was started
+    ├── NotConnectedError  a device does not answer at its address, or was closed
+    ├── DeadlineError      a device answered before, but not within its deadline this time
+    ├── DeviceFault        a device reports a fault, or its driver found one (code, recoverable, hint)
+    ├── InterlockError     a command was refused because it is not safe now; nothing was sent
+    ├── LimitError         a command was refused because it leaves the limits; nothing was sent
+    ├── CalibrationStale   the stored calibration is not the one of this cell as configured
+    ├── RefusedError       a measurement is not good enough to go on
+    │   └── NotObservable  a direction of the place pose is not known well enough
+    └── Aborted            somebody asked for the end
+
+Every text says what happened, the value, the allowed range with units, and what to do next.
+"""
+
+from __future__ import annotations
+
+
+class CellError(Exception):
+    """Base of every error that the cell raises on purpose; `str()` is fit to be shown to an operator."""
+
+
+class ConfigError(CellError):
+    """A configuration, job or command-line value is wrong. Example: `rail.lead = 2`, a number without its unit."""
+
+
+class DeviceError(CellError):
+    """Base of the errors that belong to one device, whose name is in `device`."""
+
+    def __init__(self, device: str, message: str) -> None:
+        super().__init__(f"{device}: {message}")
+        self.device = device
+        self.message = message
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (type(self), (self.device, self.message))
+
+
+class NotConnectedError(DeviceError):
+    """The device does not answer at its address, or the driver was closed. Example: the rail's port is missing."""
+
+
+class DeadlineError(DeviceError):
+    """An answer or the end of a motion did not come in time. Example: no TMCL reply within 0.2 s."""
+
+
+class InterlockError(DeviceError):
+    """The command is not safe in the present state; nothing was sent. Example: laser on without an owner."""
+
+
+class LimitError(DeviceError):
+    """The command leaves the device's limits; nothing was sent. Example: rail to 120 mm, allowed 0 to 100 mm."""
+
+
+class DeviceFault(DeviceError):
+    """The device reports a fault, or the driver found one. Example: the arm is in protective stop.
+
+    `code` is short and stable, for scripts and for the recovery policy; `recoverable` says whether the driver's
+    own recovery can clear it; `hint` tells the operator what to do next.
+    """
+
+    def __init__(self, device: str, code: str, message: str, *, recoverable: bool, hint: str) -> None:
+        super().__init__(device, f"{message} ({code}). {hint}")
+        self.code = code
+        self.recoverable = recoverable
+        self.hint = hint
+        self._plain = message
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (_rebuild_fault, (self.device, self.code, self._plain, self.recoverable, self.hint))
+
+
+def _rebuild_fault(device: str, code: str, message: str, recoverable: bool, hint: str) -> DeviceFault:
+    return DeviceFault(device, code, message, recoverable=recoverable, hint=hint)
+
+
+class CalibrationStale(CellError):
+    """The stored calibration is missing, foreign or was made under another configuration."""
+
+
+class RefusedError(CellError):
+    """A measurement is not good enough to go on. Example: the board is seen too obliquely."""
+
+
+class NotObservable(RefusedError):
+    """A direction of the place pose is not known well enough; the text names it and its uncertainty."""
+
+
+class Aborted(CellError):
+    """The operator, a script or a signal asked for the end of the run; the text says who."""

@@ -1,0 +1,326 @@
+"""What each kind of device promises, whatever its make.
+
+Units are SI, times are seconds of the injected `Clock`. Every method raises a `drivers.errors.CellError`: limits are
+checked before anything is sent (`LimitError`), a peer that is silent is a `DeadlineError` or `NotConnectedError`, a
+fault of the device is a `DeviceFault` that names it. Nothing returns a stale reading as if it were fresh.
+
+Commands that move return at once with a `Motion`; `wait()` on it blocks. `stop()` may be called from any thread at any
+time, overtakes every queued or running command, returns when the device has taken it, and is idempotent. `close()`
+leaves the device safe and is idempotent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+"""Array of shape (n,), float64."""
+Image = NDArray[np.uint8]
+"""Grey image of shape (height, width), 8 bit, row 0 at the top."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who a device is: used by `cell diag` and to tie a calibration to its hardware."""
+
+    model: str
+    serial: str
+    firmware: str
+    address: str
+
+
+@dataclass
+class LinkStatistics:
+    """Health of a link since it was opened: round trips in seconds (newest 1000) and error counters by name."""
+
+    round_trips_s: list[float] = field(default_factory=list)
+    errors: dict[str, int] = field(default_factory=dict)
+
+    def add_round_trip(self, seconds: float) -> None:
+        """Record one round trip, forgetting the oldest beyond 1000."""
+        self.round_trips_s.append(seconds)
+        if len(self.round_trips_s) > 1000:
+            del self.round_trips_s[:500]
+
+    def count(self, name: str) -> None:
+        """Add one to the error counter `name`."""
+        self.errors[name] = self.errors.get(name, 0) + 1
+
+
+class Device(Protocol):
+    """What every device offers. `name` is its name in the configuration and in every error."""
+
+    name: str
+    statistics: LinkStatistics
+
+    def identity(self) -> Identity:
+        """Ask the device who it is."""
+
+    def ping(self) -> float:
+        """One harmless round trip on the wire, in wall seconds; also recorded in `statistics`."""
+
+    def stop(self) -> None:
+        """Bring the device to rest (or its output off) now, overtaking everything."""
+
+    def close(self) -> None:
+        """Stop, then release the connection."""
+
+
+class Motion(Protocol):
+    """A motion that was started."""
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+
+    def wait(self, timeout: float) -> None:
+        """Block until the motion has reached its end.
+
+        Raises `DeadlineError` after `timeout` seconds (the device is then stopped), `DeviceFault` when the device
+        failed, `Aborted` when `stop()` ended the motion early. Never returns for a motion that did not arrive.
+        """
+
+
+# --- rail ---
+
+
+@dataclass(frozen=True)
+class RailState:
+    """Rail reading; `stamp` is the host time (middle of the round trip) at which `position` held."""
+
+    stamp: float
+    position: float
+    velocity: float
+    homed: bool
+    moving: bool
+    left_switch: bool
+    right_switch: bool
+
+
+class Sweep(Motion, Protocol):
+    """A constant-velocity sweep that is being recorded."""
+
+    @property
+    def samples(self) -> Vector:
+        """Recorded (n, 2) array of host time in s and position in m, so far."""
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Host times between which the velocity is constant; known once the sweep has ended."""
+
+    def position_at(self, host_time: float) -> float:
+        """Position in m at a host time inside `window`; `ValueError` outside."""
+
+
+class Rail(Device, Protocol):
+    """A linear axis that carries the scan head; positions in m from the home switch."""
+
+    travel: tuple[float, float]
+
+    def state(self) -> RailState:
+        """Read position, velocity and switches now."""
+
+    def home(self) -> Motion:
+        """Search the reference switch; position 0 is there afterwards."""
+
+    def move_to(self, position: float, speed: float | None = None) -> Motion:
+        """Move to `position`; refused with `InterlockError` before homing."""
+
+    def sweep(self, start: float, stop: float, speed: float) -> Sweep:
+        """Move so that the velocity is constant from `start` to `stop`, with start-up and run-out outside of them.
+
+        The rail has to stand at `sweep_start(start, stop, speed)` already. Position is sampled all the way.
+        """
+
+    def sweep_start(self, start: float, stop: float, speed: float) -> float:
+        """Where the rail has to stand before `sweep`: `start` less the start-up distance; `LimitError` if outside."""
+
+
+# --- cameras ---
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture. Times are the start of the exposure on the device's and on the host's clock, in s."""
+
+    image: Image
+    frame_id: int
+    exposure: float
+    device_time: float
+    host_time: float
+    received: float
+    lost_before: int = 0
+
+    @property
+    def mid_exposure(self) -> float:
+        """Host time of the middle of the exposure."""
+        return self.host_time + 0.5 * self.exposure
+
+
+class FrameStream(Protocol):
+    """Frames as they come; knows how many were lost between them (from the gaps in the frame ids)."""
+
+    lost: int
+
+    def next(self, timeout: float) -> Frame:
+        """The next frame in order; `DeadlineError` when none comes in time, `DeviceFault` when the camera is lost."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames until the stream is closed."""
+
+
+class Camera(Device, Protocol):
+    """A camera that delivers 8-bit grey frames."""
+
+    shape: tuple[int, int]
+
+    def configure(self, exposure: float, frame_rate: float) -> None:
+        """Set exposure in s and frame rate in Hz; refused outside the camera's range or when they cannot go together."""
+
+    def grab(self, timeout: float = 2.0) -> Frame:
+        """One frame whose exposure began after the call: never a buffered one."""
+
+    def stream(self) -> AbstractContextManager[FrameStream]:
+        """Free-running acquisition for as long as the context is open."""
+
+
+# --- arm ---
+
+
+class ArmSafety(Enum):
+    """What the arm's safety system allows."""
+
+    NORMAL = "normal"
+    PROTECTIVE_STOP = "protective stop"
+    SAFEGUARD_STOP = "safeguard stop"
+    EMERGENCY_STOP = "emergency stop"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """One state packet. `flange` is base_from_flange as (x, y, z, rx, ry, rz), m and rotation vector in rad, as reported
+    by the arm from its joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m."""
+
+    stamp: float
+    joints: Vector
+    joint_speeds: Vector
+    flange: Vector
+    wrench: Vector
+    safety: ArmSafety
+    moving: bool
+    digital_inputs: int
+    digital_outputs: int
+
+
+class ArmMotion(Motion, Protocol):
+    """A motion of the arm; `contact` tells whether a guarded motion ended because the force limit was met."""
+
+    contact: bool
+
+
+class Arm(Device, Protocol):
+    """A six-axis arm with zero TCP: all Cartesian poses are of the flange in the base."""
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        """The newest state, at most `max_age` seconds old, else `DeadlineError`."""
+
+    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
+        """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
+
+    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
+        """Straight in space to the flange pose (x, y, z, rx, ry, rz) at `speed` m/s."""
+
+    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
+        """Stream a joint trajectory: `times` (n,) s from 0, `joints` (n, 6) rad, on absolute deadlines.
+
+        The first point must be where the arm stands (0.02 rad), else `InterlockError`. With `force_limit` (N) the motion
+        ends, held at rest and without error, as soon as the measured force has changed by that much since its start.
+        """
+
+    def zero_force(self) -> None:
+        """Take the present wrench as zero."""
+
+    def set_payload(self, mass: float, centre: Vector) -> None:
+        """Mass in kg and centre of gravity (3,) in the flange frame, m."""
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
+
+    def digital_input(self, index: int) -> bool:
+        """Read a digital input from the newest state."""
+
+    def recover(self) -> None:
+        """Clear a protective stop, restart the link if needed and upload the control program again."""
+
+
+# --- vehicle ---
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """Vehicle feedback. Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and
+    yaw in rad in the frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported."""
+
+    stamp: float
+    x: float
+    y: float
+    yaw: float
+    speed: float
+    yaw_rate: float
+    command_mode: bool
+    braked: bool
+    emergency_stop: bool
+    error_bits: int
+    battery_volts: float
+
+
+class Vehicle(Device, Protocol):
+    """A skid-steered carrier."""
+
+    def state(self, max_age: float = 0.2) -> VehicleState:
+        """The newest feedback, at most `max_age` seconds old, else `DeadlineError`."""
+
+    def enable(self) -> None:
+        """Take command over CAN and release the brake."""
+
+    def drive(self, speed: float, yaw_rate: float) -> None:
+        """Set the velocity that is kept alive until the next call or `stop()`; must be renewed within 0.5 s."""
+
+    def brake(self) -> None:
+        """Stop, wait for standstill and lock the brake."""
+
+
+# --- switches ---
+
+
+class Laser(Device, Protocol):
+    """A line laser on a switch with an interlock: lit only while its owner holds it."""
+
+    def lit(self) -> AbstractContextManager[None]:
+        """On inside the context, off after it, whatever happens inside."""
+
+    @property
+    def is_on(self) -> bool:
+        """What the output shows, not what was commanded."""
+
+
+class Claw(Device, Protocol):
+    """A gripper on a switch with a feedback input."""
+
+    def grip(self, timeout: float = 2.0) -> None:
+        """Close; `DeviceFault` when the feedback does not confirm a held part in time."""
+
+    def release(self, timeout: float = 2.0) -> None:
+        """Open; `DeviceFault` when the feedback still shows a held part."""
+
+    @property
+    def holding(self) -> bool:
+        """What the feedback shows."""

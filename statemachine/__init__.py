@@ -1,0 +1,1 @@
+"""The sequence as data: states, transitions, guards, deadlines, retries and the durable journal."""
