@@ -182,7 +182,7 @@ class Camera(Device, Protocol):
     shape: tuple[int, int]
 
     def configure(self, exposure: float, frame_rate: float) -> None:
-        """Set exposure in s and frame rate in Hz; refused outside the camera's range or when they cannot go together."""
+        """Set exposure in s and frame rate in Hz; refused outside the range or when they clash."""
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """One frame whose exposure began after the call: never a buffered one."""
@@ -206,8 +206,11 @@ class ArmSafety(Enum):
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """One state packet. `flange` is base_from_flange as (x, y, z, rx, ry, rz), m and rotation vector in rad, as reported
-    by the arm from its joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m."""
+    """One state packet.
+
+    `flange` is base_from_flange as (x, y, z, rx, ry, rz), m and rotation vector in rad, as the arm reports it from its
+    joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m.
+    """
 
     stamp: float
     joints: Vector
@@ -241,8 +244,8 @@ class Arm(Device, Protocol):
     def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
         """Stream a joint trajectory: `times` (n,) s from 0, `joints` (n, 6) rad, on absolute deadlines.
 
-        The first point must be where the arm stands (0.02 rad), else `InterlockError`. With `force_limit` (N) the motion
-        ends, held at rest and without error, as soon as the measured force has changed by that much since its start.
+        The first point must be where the arm stands (0.02 rad), else `InterlockError`. With `force_limit` (N) the
+        motion ends, held at rest and without error, as soon as the force has changed by that much since its start.
         """
 
     def zero_force(self) -> None:
@@ -266,8 +269,11 @@ class Arm(Device, Protocol):
 
 @dataclass(frozen=True)
 class VehicleState:
-    """Vehicle feedback. Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and
-    yaw in rad in the frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported."""
+    """Vehicle feedback.
+
+    Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
+    frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported.
+    """
 
     stamp: float
     x: float
