@@ -1,0 +1,36 @@
+"""The world's clock: seconds of the simulated world, running N times as fast as the wall.
+
+Devices' protocols keep their wall rates; physics, time stamps and exposures are in world seconds.
+"""
+
+from __future__ import annotations
+
+import time
+
+
+class WorldClock:
+    """World time in seconds since the world began, `speed` world seconds per wall second."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        """Start at zero. Raises ValueError unless `speed` is finite and greater than 0."""
+        if not 0.0 < speed < float("inf"):
+            raise ValueError(f"world speed {speed} must be a finite number greater than 0")
+        self.speed = float(speed)
+        self._origin = time.monotonic()
+
+    def now(self) -> float:
+        """World seconds since this clock was made."""
+        return (time.monotonic() - self._origin) * self.speed
+
+    def sleep(self, seconds: float) -> None:
+        """Wait `seconds` of world time; a value that is not positive returns at once."""
+        if seconds > 0:
+            time.sleep(seconds / self.speed)
+
+    def sleep_until(self, t: float) -> None:
+        """Wait until world time `t`; a time in the past returns at once."""
+        self.sleep(t - self.now())
+
+    def wall(self, seconds: float) -> float:
+        """The wall seconds that `seconds` of world time take, for time-outs of blocking system calls."""
+        return seconds / self.speed
