@@ -1,0 +1,152 @@
+"""The pinhole camera with Brown's lens distortion, forwards and backwards, with the derivatives of both.
+
+Camera frame: x right, y down, z into the scene, origin at the projection centre. Pixel (0, 0) is the middle of the
+upper left pixel. The coefficients are OpenCV's k1, k2, p1, p2, k3, so that its calibrations can be used as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+UNDISTORT_STEPS = 20
+UNDISTORT_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Image size in pixels, focal lengths and principal point in pixels, distortion (k1, k2, p1, p2, k3)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    dist: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def matrix(self) -> Array:
+        """The 3×3 camera matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def parameters(self) -> Array:
+        """The nine parameters in the order of `PARAMETER_NAMES`."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.dist])
+
+    def with_parameters(self, values: ArrayLike) -> CameraModel:
+        """The same sensor with other parameters, in the order of `PARAMETER_NAMES`."""
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(v) for v in np.asarray(values, dtype=np.float64))
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, dist=(k1, k2, p1, p2, k3))
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels (n, 2) of points (n, 3) in the camera frame, in m; NaN for points that are not in front."""
+        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        z = np.where(p[:, 2] > 0, p[:, 2], np.nan)
+        normalised = self.distort(p[:, :2] / z[:, None])
+        return normalised * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def project_with_jacobians(self, points: ArrayLike) -> tuple[Array, Array, Array]:
+        """Pixels (n, 2), ∂pixel/∂point (n, 2, 3) and ∂pixel/∂parameter (n, 2, 9) for points (n, 3) in front."""
+        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        z = p[:, 2]
+        x, y = p[:, 0] / z, p[:, 1] / z
+        focal = np.array([self.fx, self.fy])
+        distorted = self.distort(np.column_stack([x, y]))
+        by_normalised = focal[:, None] * self._distortion_jacobian(x, y)
+        by_point = np.empty((len(p), 2, 3))
+        by_point[:, :, :2] = by_normalised / z[:, None, None]
+        by_point[:, :, 2] = -(by_normalised[:, :, 0] * x[:, None] + by_normalised[:, :, 1] * y[:, None]) / z[:, None]
+        r2 = x * x + y * y
+        by_parameter = np.zeros((len(p), 2, 9))
+        by_parameter[:, 0, 0] = distorted[:, 0]
+        by_parameter[:, 1, 1] = distorted[:, 1]
+        by_parameter[:, 0, 2] = by_parameter[:, 1, 3] = 1.0
+        for axis, (f, a) in enumerate(zip(focal, (x, y), strict=True)):
+            by_parameter[:, axis, 4] = f * a * r2
+            by_parameter[:, axis, 5] = f * a * r2**2
+            by_parameter[:, axis, 8] = f * a * r2**3
+        by_parameter[:, 0, 6] = focal[0] * 2 * x * y
+        by_parameter[:, 1, 6] = focal[1] * (r2 + 2 * y * y)
+        by_parameter[:, 0, 7] = focal[0] * (r2 + 2 * x * x)
+        by_parameter[:, 1, 7] = focal[1] * 2 * x * y
+        return distorted * focal + (self.cx, self.cy), by_point, by_parameter
+
+    def distort(self, normalised: ArrayLike) -> Array:
+        """Distorted image coordinates (n, 2) of ideal ones (n, 2), both at unit distance."""
+        xy = np.atleast_2d(np.asarray(normalised, dtype=np.float64))
+        k1, k2, p1, p2, k3 = self.dist
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.column_stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+
+    def normalised(self, pixels: ArrayLike) -> Array:
+        """Ideal image coordinates (n, 2) at unit distance of pixels (n, 2), by Newton's method on `distort`.
+
+        NaN where the model has no inverse (a pixel beyond the fold of a strong distortion).
+        """
+        target = (np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not any(self.dist):
+            return target
+        xy = target.copy()
+        error = np.full_like(xy, np.inf)
+        for _ in range(UNDISTORT_STEPS):
+            error = self.distort(xy) - target
+            if np.nanmax(np.abs(error), initial=0.0) < UNDISTORT_TOLERANCE:
+                break
+            xy = xy - _solve2(self._distortion_jacobian(xy[:, 0], xy[:, 1]), error)
+        xy[~(np.abs(error).max(axis=1) < 1e-9)] = np.nan
+        return xy
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Unit rays (n, 3) in the camera frame through pixels (n, 2)."""
+        xy = self.normalised(pixels)
+        rays = np.column_stack([xy, np.ones(len(xy))])
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), dtype=np.float64)
+
+    def rays_with_jacobian(self, pixels: ArrayLike) -> tuple[Array, Array]:
+        """Unit rays (n, 3) and ∂ray/∂pixel (n, 3, 2) for pixels (n, 2)."""
+        xy = self.normalised(pixels)
+        direction = np.column_stack([xy, np.ones(len(xy))])
+        length = np.linalg.norm(direction, axis=1)
+        rays = direction / length[:, None]
+        across = (np.eye(3) - rays[:, :, None] * rays[:, None, :]) / length[:, None, None]
+        inverse = _inverse2(self._distortion_jacobian(xy[:, 0], xy[:, 1])) / np.array([self.fx, self.fy])
+        return rays, np.asarray(across[:, :, :2] @ inverse, dtype=np.float64)
+
+    def _distortion_jacobian(self, x: Array, y: Array) -> Array:
+        k1, k2, p1, p2, k3 = self.dist
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
+        jacobian = np.empty((len(x), 2, 2))
+        jacobian[:, 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+        jacobian[:, 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+        jacobian[:, 0, 1] = jacobian[:, 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
+        return jacobian
+
+
+def _inverse2(m: Array) -> Array:
+    """Inverses of (n, 2, 2) matrices."""
+    determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+    inverse = np.empty_like(m)
+    inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]
+    inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(inverse / determinant[:, None, None], dtype=np.float64)
+
+
+def _solve2(m: Array, right: Array) -> Array:
+    return np.asarray((_inverse2(m) @ right[:, :, None])[:, :, 0], dtype=np.float64)

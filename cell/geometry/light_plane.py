@@ -1,0 +1,137 @@
+"""The laser's light plane in the camera frame, and triangulation: where a pixel's ray meets it.
+
+The general form holds for any plane; the closed form of the paper (its equation 1, corrected) is the special case of a
+laser on the camera's x axis, kept because a test proves the two equal. Theory sheet, part 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cell.geometry.camera import Array, CameraModel
+
+# A ray that makes less than this angle (as its sine) with the plane meets it nowhere useful.
+VANISHING_SINE = 1e-6
+
+
+@dataclass(frozen=True)
+class LightPlane:
+    """The plane n·P = d: unit normal (3,), distance in m, in the camera frame. (n, d) and (−n, −d) are one plane."""
+
+    normal: tuple[float, float, float]
+    distance: float
+
+    def __post_init__(self) -> None:
+        length = float(np.linalg.norm(self.normal))
+        if not 0.999 < length < 1.001:
+            raise ValueError(f"the normal of a light plane must have length 1, not {length:.6g}: use LightPlane.of")
+
+    @classmethod
+    def of(cls, normal: ArrayLike, distance: float) -> LightPlane:
+        """The plane normal·P = distance with a normal of any length but zero."""
+        n = np.asarray(normal, dtype=np.float64)
+        length = float(np.linalg.norm(n))
+        if not length > 0:
+            raise ValueError("the normal of a light plane must not be zero")
+        x, y, z = (float(v) for v in n / length)
+        return cls((x, y, z), float(distance) / length)
+
+    @classmethod
+    def from_baseline(cls, baseline: float, theta: float) -> LightPlane:
+        """The paper's set-up: laser at (−baseline, 0, 0) in m, plane X = −baseline + Z cot(theta), theta in rad."""
+        return cls.of((1.0, 0.0, -1.0 / np.tan(theta)), -baseline)
+
+    @classmethod
+    def fit(cls, points: ArrayLike, weights: ArrayLike | None = None) -> LightPlane:
+        """Least-squares plane of points (n, 3); optional weights (n,). Paper, step 5 of section 4.1."""
+        p = np.asarray(points, dtype=np.float64)
+        w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
+        centre = np.average(p, axis=0, weights=w)
+        normal = np.linalg.svd((p - centre) * np.sqrt(w)[:, None], full_matrices=False)[2][2]
+        if normal @ centre < 0:
+            normal = -normal
+        return cls.of(normal, float(normal @ centre))
+
+    @property
+    def n(self) -> Array:
+        """The unit normal as an array (3,)."""
+        return np.array(self.normal)
+
+    def distances(self, points: ArrayLike) -> Array:
+        """Signed distances (n,) in m of points (n, 3) from the plane."""
+        return np.asarray(np.asarray(points, dtype=np.float64) @ self.n - self.distance, dtype=np.float64)
+
+    def intersect(self, rays: ArrayLike) -> Array:
+        """Points (n, 3) in m where unit rays (n, 3) meet the plane: P = d u/(n·u).
+
+        A ray near the plane's vanishing line, or one that would meet it behind the camera, gives NaN.
+        """
+        u = np.atleast_2d(np.asarray(rays, dtype=np.float64))
+        return np.asarray(u * self._range(u)[:, None], dtype=np.float64)
+
+    def intersect_with_jacobians(self, rays: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        """Points P (n, 3), ∂P/∂u (n, 3, 3), ∂P/∂n (n, 3, 3) and ∂P/∂d (n, 3) for unit rays u (n, 3).
+
+        ∂P/∂u = s(I − u nᵀ/(n·u)) with s = d/(n·u); ∂P/∂n = −P Pᵀ/d; ∂P/∂d = P/d (theory sheet, part 1).
+        """
+        u = np.atleast_2d(np.asarray(rays, dtype=np.float64))
+        s = self._range(u)
+        points = u * s[:, None]
+        slant = u @ self.n
+        by_ray = s[:, None, None] * (np.eye(3) - u[:, :, None] * self.n / slant[:, None, None])
+        by_normal = -points[:, :, None] * points[:, None, :] / self.distance
+        return points, by_ray, by_normal, points / self.distance
+
+    def _range(self, u: Array) -> Array:
+        slant = u @ self.n
+        usable = (np.abs(slant) > VANISHING_SINE) & (slant * self.distance > 0)
+        distances = np.full(len(u), np.nan)
+        np.divide(self.distance, slant, out=distances, where=usable)
+        return distances
+
+
+def triangulate(camera: CameraModel, plane: LightPlane, pixels: ArrayLike) -> tuple[Array, Array]:
+    """Points (n, 3) in m in the camera frame of stripe pixels (n, 2), and ∂P/∂pixel (n, 3, 2) in m/px.
+
+    NaN where a pixel's ray does not meet the plane in front of the camera.
+    """
+    rays, ray_by_pixel = camera.rays_with_jacobian(pixels)
+    points, by_ray, _, _ = plane.intersect_with_jacobians(rays)
+    return points, np.asarray(by_ray @ ray_by_pixel, dtype=np.float64)
+
+
+def closed_form(
+    x: ArrayLike, y: ArrayLike, baseline: float, focal: float, theta: float, least: float = 1e-9
+) -> NDArray[np.float64]:
+    """The paper's equation (1), corrected: points (n, 3) in m from image coordinates x', y' in m on the sensor.
+
+    D = f cotθ − x'; X = l x'/D, Y = l y'/D, Z = l f/D, with baseline l and focal length f in m, θ in rad. Rays with
+    D ≤ `least` (m) lie at or beyond the plane's vanishing line and give NaN.
+    """
+    xs, ys = np.atleast_1d(np.asarray(x, dtype=np.float64)), np.atleast_1d(np.asarray(y, dtype=np.float64))
+    d = focal / np.tan(theta) - xs
+    d = np.where(d > least, d, np.nan)
+    return np.column_stack([baseline * xs / d, baseline * ys / d, baseline * focal / d])
+
+
+def closed_form_jacobian(x: float, y: float, baseline: float, focal: float, theta: float) -> Array:
+    """∂(X, Y, Z)/∂(x', y', l, f, θ) of `closed_form`, (3, 5). Theory sheet, part 1, with ∂X/∂f and ∂Y/∂f added."""
+    d = focal / np.tan(theta) - x
+    px, py, pz = baseline * x / d, baseline * y / d, baseline * focal / d
+    cot, csc2 = 1 / np.tan(theta), 1 / np.sin(theta) ** 2
+    return np.array(
+        [
+            [baseline * focal * cot / d**2, 0.0, px / baseline, -px * cot / d, px * pz * csc2 / baseline],
+            [baseline * y / d**2, baseline / d, py / baseline, -py * cot / d, py * pz * csc2 / baseline],
+            [
+                pz**2 / (baseline * focal),
+                0.0,
+                pz / baseline,
+                -(pz**2) * x / (baseline * focal**2),
+                pz**2 * csc2 / baseline,
+            ],
+        ]
+    )

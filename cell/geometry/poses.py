@@ -1,0 +1,134 @@
+"""Poses as `pin.SE3`, their other spellings, and how their covariances travel.
+
+A pose named `a_from_b` maps b-coordinates into a. Its 6×6 covariance is of (δt, δφ) in the axes of a: t → t + δt for
+b's origin in m, R → exp(δφ) R in rad. Translation first, then rotation, everywhere in the cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from cell.geometry.camera import Array
+
+
+def from_matrix(matrix: ArrayLike) -> pin.SE3:
+    """Pose of a homogeneous 4×4 matrix; the rotation is brought back to the nearest true rotation."""
+    m = np.asarray(matrix, dtype=np.float64)
+    if m.shape != (4, 4) or not np.allclose(m[3], (0, 0, 0, 1), atol=1e-6):
+        raise ValueError(f"a pose must be a 4×4 matrix with last row 0 0 0 1, not of shape {m.shape}: {m.tolist()}")
+    u, s, vt = np.linalg.svd(m[:3, :3])
+    if abs(s - 1).max() > 1e-2 or np.linalg.det(m[:3, :3]) < 0:
+        raise ValueError(f"the upper left 3×3 of a pose must be a rotation; its singular values are {s.tolist()}")
+    return pin.SE3(u @ vt, m[:3, 3].copy())
+
+
+def from_parts(translation: ArrayLike, rotation: ArrayLike | None = None) -> pin.SE3:
+    """Pose of a translation (3,) in m and a 3×3 rotation (none: identity)."""
+    r = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    return pin.SE3(r, np.asarray(translation, dtype=np.float64).copy())
+
+
+def from_axes(translation: ArrayLike, x: ArrayLike, z: ArrayLike) -> pin.SE3:
+    """Pose whose x and z axes are given in the outer frame; they must be perpendicular. Translation in m."""
+    xs, zs = np.asarray(x, dtype=np.float64), np.asarray(z, dtype=np.float64)
+    xs, zs = xs / np.linalg.norm(xs), zs / np.linalg.norm(zs)
+    if abs(xs @ zs) > 1e-6:
+        raise ValueError(f"axes must be perpendicular; x·z is {xs @ zs:.3g}")
+    return from_parts(translation, np.column_stack([xs, np.cross(zs, xs), zs]))
+
+
+def from_ur(vector: ArrayLike) -> pin.SE3:
+    """Pose of the arm controller's six numbers: x, y, z in m and a rotation vector in rad."""
+    v = np.asarray(vector, dtype=np.float64)
+    if v.shape != (6,):
+        raise ValueError(f"an arm pose has 6 numbers (x, y, z, rx, ry, rz), not {v.size}")
+    return pin.SE3(pin.exp3(v[3:]), v[:3].copy())
+
+
+def to_ur(pose: pin.SE3) -> Array:
+    """The arm controller's six numbers of a pose: x, y, z in m and a rotation vector in rad."""
+    return np.concatenate([pose.translation, pin.log3(pose.rotation)])
+
+
+def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> pin.SE3:
+    """Pose of a translation (3,) in m and a quaternion (x, y, z, w) of about unit length."""
+    q = np.asarray(xyzw, dtype=np.float64)
+    length = float(np.linalg.norm(q))
+    if q.shape != (4,) or not 0.99 < length < 1.01:
+        raise ValueError(f"a rotation needs a quaternion (x, y, z, w) of length 1, not {q.tolist()}")
+    rotation = pin.Quaternion(*(q[[3, 0, 1, 2]] / length)).toRotationMatrix()
+    return from_parts(translation, rotation)
+
+
+def transform(pose: pin.SE3, points: ArrayLike) -> Array:
+    """Points (…, 3) of frame b in frame a, for `pose` = a_from_b."""
+    p = np.asarray(points, dtype=np.float64)
+    return np.asarray(p @ pose.rotation.T + pose.translation, dtype=np.float64)
+
+
+def perturbed(pose: pin.SE3, delta: ArrayLike) -> pin.SE3:
+    """The pose moved by (δt in m, δφ in rad), in the sense of the module's covariance."""
+    d = np.asarray(delta, dtype=np.float64)
+    return pin.SE3(pin.exp3(d[3:]) @ pose.rotation, pose.translation + d[:3])
+
+
+def difference(pose: pin.SE3, reference: pin.SE3) -> Array:
+    """The (δt, δφ) (6,) that `perturbed(reference, …)` needs to become `pose`."""
+    return np.concatenate([pose.translation - reference.translation, pin.log3(pose.rotation @ reference.rotation.T)])
+
+
+def mean(poses: Sequence[pin.SE3]) -> pin.SE3:
+    """Mean of poses that lie near each other: arithmetic for the translation, on the rotation group otherwise."""
+    if not poses:
+        raise ValueError("the mean of no poses does not exist: give at least one")
+    rotation = poses[0].rotation.copy()
+    for _ in range(20):
+        step = np.mean([pin.log3(p.rotation @ rotation.T) for p in poses], axis=0)
+        rotation = pin.exp3(step) @ rotation
+        if np.linalg.norm(step) < 1e-14:
+            break
+    return pin.SE3(rotation, np.mean([p.translation for p in poses], axis=0))
+
+
+def compose_covariance(a_from_b: pin.SE3, cov_ab: ArrayLike, b_from_c: pin.SE3, cov_bc: ArrayLike) -> Array:
+    """6×6 covariance of a_from_c = a_from_b · b_from_c, in the axes of a, of two independent poses."""
+    outer, inner = composition_jacobians(a_from_b, b_from_c)
+    first, second = np.asarray(cov_ab, dtype=np.float64), np.asarray(cov_bc, dtype=np.float64)
+    return np.asarray(outer @ first @ outer.T + inner @ second @ inner.T, dtype=np.float64)
+
+
+def composition_jacobians(a_from_b: pin.SE3, b_from_c: pin.SE3) -> tuple[Array, Array]:
+    """∂(a_from_c)/∂(a_from_b) and ∂(a_from_c)/∂(b_from_c), each 6×6, in the module's perturbations."""
+    outer = np.eye(6)
+    outer[:3, 3:] = -pin.skew(a_from_b.rotation @ b_from_c.translation)
+    inner = np.zeros((6, 6))
+    inner[:3, :3] = inner[3:, 3:] = a_from_b.rotation
+    return outer, inner
+
+
+def inverse_covariance_frame(a_from_b: pin.SE3, covariance: ArrayLike) -> Array:
+    """6×6 covariance of b_from_a, in the axes of b, from that of a_from_b."""
+    back = a_from_b.rotation.T
+    j = np.zeros((6, 6))
+    j[:3, :3] = j[3:, 3:] = -back
+    j[:3, 3:] = -back @ pin.skew(a_from_b.translation)
+    return np.asarray(j @ np.asarray(covariance, dtype=np.float64) @ j.T, dtype=np.float64)
+
+
+def point_covariances(
+    a_from_b: pin.SE3, pose_covariance: ArrayLike, points: ArrayLike, covariances: ArrayLike
+) -> Array:
+    """Covariances (n, 3, 3) in a of points (n, 3) in b with covariances (n, 3, 3) in b, the pose's 6×6 included."""
+    r = a_from_b.rotation
+    arm = np.asarray(points, dtype=np.float64) @ r.T
+    j = np.zeros((len(arm), 3, 6))
+    j[:, :, :3] = np.eye(3)
+    j[:, 0, 4], j[:, 0, 5] = arm[:, 2], -arm[:, 1]
+    j[:, 1, 3], j[:, 1, 5] = -arm[:, 2], arm[:, 0]
+    j[:, 2, 3], j[:, 2, 4] = arm[:, 1], -arm[:, 0]
+    pose_part = j @ np.asarray(pose_covariance, dtype=np.float64) @ j.transpose(0, 2, 1)
+    return np.asarray(r @ np.asarray(covariances, dtype=np.float64) @ r.T + pose_part, dtype=np.float64)

@@ -1,0 +1,176 @@
+"""Promises of the geometry: derivatives are those of finite differences, closed forms are cases of the general one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.geometry import poses
+from cell.geometry.camera import CameraModel
+from cell.geometry.light_plane import LightPlane, closed_form, closed_form_jacobian, triangulate
+
+CAMERA = CameraModel(640, 480, 1666.0, 1670.0, 322.0, 236.0, (-0.12, 0.21, 1.1e-3, -0.7e-3, -0.05))
+THETA = np.arctan(3.5)
+
+
+def points_in_front(n: int = 50) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return np.column_stack([rng.uniform(-0.02, 0.02, n), rng.uniform(-0.015, 0.015, n), rng.uniform(0.11, 0.15, n)])
+
+
+def numerical(f, x, step=1e-6):
+    """Central differences of a vector function at x: (outputs, inputs)."""
+    columns = []
+    for k in range(len(x)):
+        d = np.zeros(len(x))
+        d[k] = step
+        columns.append((f(x + d) - f(x - d)) / (2 * step))
+    return np.column_stack(columns)
+
+
+def test_projection_is_opencvs():
+    points = points_in_front()
+    ours = CAMERA.project(points)
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CAMERA.matrix, np.array(CAMERA.dist))
+    np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
+
+
+def test_rays_undo_the_projection():
+    points = points_in_front()
+    rays = CAMERA.rays(CAMERA.project(points))
+    np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-12)
+
+
+def test_a_point_behind_the_camera_has_no_pixel():
+    assert np.isnan(CAMERA.project([[0.0, 0.0, -1.0]])).all()
+
+
+def test_projection_jacobians_are_those_of_finite_differences():
+    points = points_in_front(5)
+    _, by_point, by_parameter = CAMERA.project_with_jacobians(points)
+    scale = np.maximum(np.abs(CAMERA.parameters), 1.0)
+    for p, jp, jq in zip(points, by_point, by_parameter, strict=True):
+        np.testing.assert_allclose(jp, numerical(lambda q: CAMERA.project(q)[0], p), rtol=1e-5, atol=1e-3)
+
+        def by_scaled(q, p=p):
+            return CAMERA.with_parameters(q * scale).project(p)[0]
+
+        expected = numerical(by_scaled, CAMERA.parameters / scale)
+        np.testing.assert_allclose(jq * scale, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_ray_jacobian_is_that_of_finite_differences():
+    pixel = np.array([120.0, 400.0])
+    _, jacobian = CAMERA.rays_with_jacobian(pixel)
+    expected = numerical(lambda q: CAMERA.rays(q)[0], pixel, 1e-3)
+    np.testing.assert_allclose(jacobian[0], expected, rtol=1e-6, atol=1e-10)
+
+
+def test_triangulation_jacobians_are_those_of_finite_differences():
+    plane = LightPlane.of((0.95, 0.03, -0.29), -0.034)
+    ray = CAMERA.rays([[300.0, 100.0]])[0]
+    _, by_ray, by_normal, by_distance = plane.intersect_with_jacobians(ray)
+
+    def meet(u, n=plane.n, d=plane.distance):
+        return d * u / (n @ u)
+
+    np.testing.assert_allclose(by_ray[0], numerical(meet, ray), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(by_normal[0], numerical(lambda n: meet(ray, n=n), plane.n), rtol=1e-6, atol=1e-8)
+    expected = numerical(lambda d: meet(ray, d=d[0]), np.array([plane.distance]))
+    np.testing.assert_allclose(by_distance[0], expected[:, 0], rtol=1e-6)
+
+
+def test_pixel_to_point_jacobian_is_that_of_finite_differences():
+    plane = LightPlane.from_baseline(0.035, THETA)
+    pixel = np.array([350.0, 200.0])
+    _, jacobian = triangulate(CAMERA, plane, pixel)
+    expected = numerical(lambda q: triangulate(CAMERA, plane, q)[0][0], pixel, 1e-3)
+    np.testing.assert_allclose(jacobian[0], expected, rtol=1e-6, atol=1e-10)
+
+
+def test_the_papers_closed_form_is_a_case_of_the_general_one():
+    f, baseline, pixel = 8e-3, 0.035, 4.8e-6
+    camera = CameraModel(640, 480, f / pixel, f / pixel, 319.5, 239.5)
+    pixels = np.column_stack([np.linspace(0, 639, 40), np.linspace(10, 470, 40)])
+    sensor = (pixels - (319.5, 239.5)) * pixel
+    general = LightPlane.from_baseline(baseline, THETA).intersect(camera.rays(pixels))
+    np.testing.assert_allclose(closed_form(sensor[:, 0], sensor[:, 1], baseline, f, THETA), general, rtol=1e-12)
+
+
+def test_the_stand_off_of_the_text_is_imaged_at_0_419_mm():
+    point = closed_form(0.419e-3, 0.0, 0.035, 8e-3, THETA)
+    assert point[0, 2] == pytest.approx(0.150, abs=5e-5)
+    assert closed_form(0.0, 0.0, 0.035, 8e-3, THETA)[0, 2] == pytest.approx(0.1225)
+
+
+def test_closed_form_jacobian_is_that_of_finite_differences():
+    at = np.array([0.4e-3, -0.3e-3, 0.035, 8e-3, THETA])
+    expected = numerical(lambda v: closed_form(v[0], v[1], *v[2:])[0], at, 1e-8)
+    np.testing.assert_allclose(closed_form_jacobian(*at), expected, rtol=2e-5, atol=1e-7)
+
+
+def test_rays_at_the_vanishing_line_are_rejected():
+    f = 8e-3
+    vanishing = f / np.tan(THETA)
+    assert np.isnan(closed_form([vanishing, vanishing * 1.2], [0.0, 0.0], 0.035, f, THETA)).all()
+    rays = np.array([[vanishing, 0.0, f], [vanishing * 1.2, 0.0, f]])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    assert np.isnan(LightPlane.from_baseline(0.035, THETA).intersect(rays)).all()
+
+
+def test_plane_fit_finds_the_plane_of_its_points():
+    truth = LightPlane.of((0.3, -0.2, 0.9), 0.4)
+    rays = CAMERA.rays(np.random.default_rng(1).uniform(0, 480, (30, 2)))
+    fitted = LightPlane.fit(truth.intersect(rays))
+    np.testing.assert_allclose([*fitted.normal, fitted.distance], [*truth.normal, truth.distance], atol=1e-9)
+
+
+def test_arm_vectors_and_quaternions_round_trip():
+    vector = np.array([0.1, -0.4, 0.7, 1.2, -0.5, 2.0])
+    np.testing.assert_allclose(poses.to_ur(poses.from_ur(vector)), vector, atol=1e-12)
+    half = np.sqrt(0.5)
+    turn = poses.from_quaternion([1, 2, 3], [0, 0, half, half])
+    np.testing.assert_allclose(poses.transform(turn, [1.0, 0.0, 0.0]), [1, 3, 3], atol=1e-12)
+
+
+def test_a_mirror_is_no_pose():
+    with pytest.raises(ValueError, match="rotation"):
+        poses.from_matrix(np.diag([1.0, 1.0, -1.0, 1.0]))
+
+
+def test_covariances_travel_like_random_perturbations():
+    rng = np.random.default_rng(7)
+    a_from_b, b_from_c = pin.SE3.Random(), pin.SE3.Random()
+    scale = np.array([1, 2, 3, 2, 1, 3]) * 1e-4
+    mix = rng.normal(size=(6, 6))
+    cov_ab, cov_bc = np.diag(scale**2), mix @ mix.T * 1e-8
+    first = rng.multivariate_normal(np.zeros(6), cov_ab, 20000)
+    second = rng.multivariate_normal(np.zeros(6), cov_bc, 20000)
+    nominal = a_from_b * b_from_c
+    draws = np.array(
+        [
+            poses.difference(poses.perturbed(a_from_b, d) * poses.perturbed(b_from_c, e), nominal)
+            for d, e in zip(first, second, strict=True)
+        ]
+    )
+    expected = poses.compose_covariance(a_from_b, cov_ab, b_from_c, cov_bc)
+    assert np.abs(np.cov(draws.T) - expected).max() < 0.05 * np.abs(expected).max()
+
+
+def test_the_covariance_of_an_inverse_undoes_itself():
+    pose, cov = pin.SE3.Random(), np.diag([1.0, 2, 3, 4, 5, 6])
+    there = poses.inverse_covariance_frame(pose, cov)
+    np.testing.assert_allclose(poses.inverse_covariance_frame(pose.inverse(), there), cov, atol=1e-9)
+
+
+def test_a_points_covariance_includes_its_poses():
+    pose = pin.SE3.Random()
+    point, delta = np.array([[0.1, -0.2, 0.5]]), 1e-6
+    for k in range(6):
+        d = np.zeros(6)
+        d[k] = delta
+        moved = (poses.transform(poses.perturbed(pose, d), point) - poses.transform(pose, point))[0]
+        cov = poses.point_covariances(pose, np.outer(d, d), point, np.zeros((1, 3, 3)))[0]
+        np.testing.assert_allclose(cov, np.outer(moved, moved), atol=1e-17)
