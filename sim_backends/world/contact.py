@@ -1,0 +1,124 @@
+"""The part and what it touches: held by the claw, pressed onto the surface, released and resting there.
+
+The part's underside is the nominal surface itself. Contact is a penalty: each sample point of the underside below
+the true surface pushes back along the surface's normal. Friction and the part's weight are left out.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.world import nominal
+from sim_backends.world.surfaces import HALF_X, HALF_Y, Surface
+
+Pose = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+STIFFNESS = 20e3
+"""Vertical stiffness of a flat contact over the whole underside, N/m."""
+GRIP_REACH = 0.005
+"""How far, m, the claw may be from the part's place in it and still grip it."""
+_NEAR = 0.020
+
+
+class PartContact:
+    """Where the part is and what forces act on it; safe between threads.
+
+    At the start the claw holds the part at `flange_from_part`. The table reaches 0.25 m around the surface's origin.
+    """
+
+    def __init__(self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose) -> None:
+        self._surface = surface
+        self._surface_from_world = np.linalg.inv(world_from_surface)
+        self._world_from_surface = world_from_surface
+        self._flange_from_part = flange_from_part
+        self._world_from_part: Pose | None = None
+        self._claw_closed = True
+        self._lock = threading.Lock()
+        # A margin keeps the points off the border, where the height field falls to the table.
+        x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, 25) * 0.98, np.linspace(-HALF_Y, HALF_Y, 13) * 0.97)
+        x, y = x.ravel(), y.ravel()
+        self._underside = np.stack([x, y, surface.height(x, y)], axis=-1)
+
+    @property
+    def held(self) -> bool:
+        """Whether the claw holds the part; the claw's grip feedback."""
+        return self._world_from_part is None
+
+    def part_pose(self, world_from_flange: Pose) -> Pose:
+        """World_from_part (4, 4) when the flange is at `world_from_flange`."""
+        with self._lock:
+            return self._pose(world_from_flange)
+
+    def _pose(self, world_from_flange: Pose) -> Pose:
+        if self._world_from_part is None:
+            return world_from_flange @ self._flange_from_part
+        return self._world_from_part.copy()
+
+    def set_claw(self, closed: bool, world_from_flange: Pose) -> None:
+        """Follow the claw's output: opening releases the part, closing within reach of it grips it."""
+        with self._lock:
+            if closed == self._claw_closed:
+                return
+            self._claw_closed = closed
+            if closed:
+                self._grip(world_from_flange)
+            elif self._world_from_part is None:
+                self._world_from_part = self._rest(self._pose(world_from_flange))
+
+    def _grip(self, world_from_flange: Pose) -> None:
+        if self._world_from_part is None:
+            return
+        found = np.linalg.inv(world_from_flange) @ self._world_from_part
+        if np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3]) <= GRIP_REACH:
+            self._flange_from_part = found
+            self._world_from_part = None
+
+    def _rest(self, world_from_part: Pose) -> Pose:
+        """The part after it fell straight down (or sprang back up) to its first contact, its orientation kept."""
+        rest = world_from_part.copy()
+        for _ in range(20):
+            depth, _, _ = self._penetration(rest)
+            # Depth counts along z_S, the fall is along world z: repeated, because the table may lean a little.
+            step = float(depth.max())
+            rest[2, 3] += step
+            if abs(step) < 1e-8:
+                break
+        return rest
+
+    def _penetration(self, world_from_part: Pose) -> tuple[Vector, Vector, Vector]:
+        """Depth (n,) below the surface along z_S, unit normals (n, 3) in W and the points (n, 3) in W."""
+        points = self._underside @ world_from_part[:3, :3].T + world_from_part[:3, 3]
+        return *self._below(points), points
+
+    def _below(self, points: Vector) -> tuple[Vector, Vector]:
+        local = points @ self._surface_from_world[:3, :3].T + self._surface_from_world[:3, 3]
+        on_table = (np.abs(local[:, 0]) <= nominal.TABLE_HALF) & (np.abs(local[:, 1]) <= nominal.TABLE_HALF)
+        ground = np.where(on_table, self._surface.height(local[:, 0], local[:, 1]), -nominal.TABLE_HEIGHT)
+        depth = ground - local[:, 2]
+        return depth, self._surface.normals(local[:, 0], local[:, 1]) @ self._world_from_surface[:3, :3].T
+
+    def wrench(self, world_from_flange: Pose) -> Vector:
+        """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
+        origin = world_from_flange[:3, 3]
+        wrench = np.zeros(6)
+        lowest = float(world_from_flange[2, 3] + nominal.FLANGE_FROM_PART[2, 3] * world_from_flange[2, 2])
+        if lowest > self._world_from_surface[2, 3] + _NEAR + HALF_X:
+            return wrench
+        with self._lock:
+            held = self._world_from_part is None
+            pose = self._pose(world_from_flange)
+        fingers = nominal.FLANGE_FINGERTIPS @ world_from_flange[:3, :3].T + origin
+        touching = [(*self._below(fingers), fingers)]
+        if held:
+            touching.append(self._penetration(pose))
+        for depth, normals, points in touching:
+            # The normal's part of a vertical depth; the whole underside together has the stiffness of the table.
+            push = STIFFNESS / len(depth) * np.maximum(depth, 0.0) * normals[:, 2]
+            forces = push[:, None] * normals
+            wrench[:3] += forces.sum(axis=0)
+            wrench[3:] += np.cross(points - origin, forces).sum(axis=0)
+        return wrench

@@ -1,0 +1,200 @@
+"""The true world of one seed and level: every deviation drawn once, before anything moves.
+
+Each quantity has its own random stream, named after it, so that a new quantity leaves all others as they were.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.world import nominal
+from sim_backends.world.levels import CUT, Deviations, deviations
+
+Pose = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """The random stream of the quantity `name` in the world of `seed`, independent of every other one."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def rotation(vector: Vector) -> Pose:
+    """The rotation (3, 3) about `vector` (3,) by its length, rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    made: Pose = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return made
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole with distortion: focal lengths and principal point, px; OpenCV's k1, k2, p1, p2, k3."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    dist: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class CameraClock:
+    """A camera's own clock: relative drift, epoch (world s at its zero) and exposure latency, s."""
+
+    drift: float
+    epoch: float
+    latency: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `nominal`."""
+
+    seed: int
+    level: str
+    deviations: Deviations
+    world_from_vehicle_start: Pose
+    vehicle_from_base: Pose
+    world_from_surface: Pose
+    world_from_board: Pose
+    base_from_fine_board: Pose
+    base_from_deck_board: Pose
+    flange_from_scan_camera: Pose
+    flange_from_target_camera: Pose
+    flange_from_part: Pose
+    scan_lens: Lens
+    target_lens: Lens
+    light_plane_normal: Vector
+    light_plane_distance: float
+    laser_origin: Vector
+    rail_direction: Vector
+    rail_lead_error: float
+    rail_periodic_amplitude: float
+    rail_periodic_phase: float
+    rail_backlash: float
+    dh_error: Pose
+    odometry_scale: float
+    odometry_yaw: float
+    suspension: Vector
+    scan_clock: CameraClock
+    target_clock: CameraClock
+
+
+class _Draws:
+    """Cut Gaussian draws, one stream a name."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def vector(self, name: str, sigma: float, size: int = 3) -> Vector:
+        drawn = stream(self._seed, name).standard_normal(size)
+        return sigma * np.clip(drawn, -CUT, CUT)
+
+    def scalar(self, name: str, sigma: float) -> float:
+        return float(self.vector(name, sigma, 1)[0])
+
+    def moved(self, name: str, at: Pose, translation: float, turn: float, about: Sequence[float] = (0, 0, 0)) -> Pose:
+        """`at`, moved and turned about the point `about` of its own frame."""
+        made = np.eye(4)
+        made[:3, :3] = rotation(self.vector(name + ".rotation", turn))
+        made[:3, 3] = np.array(about) - made[:3, :3] @ about + self.vector(name + ".translation", translation)
+        return at @ made
+
+
+def draw(seed: int, level: str) -> Scene:
+    """Draw the world of `seed` at `level`. Raises ValueError for an unknown level or a negative seed."""
+    sigma = deviations(level)
+    if seed < 0:
+        raise ValueError(f"seed {seed} must be 0 or greater")
+    d = _Draws(seed)
+    normal, distance, origin = _light_plane(d, sigma)
+    start = nominal.WORLD_FROM_VEHICLE_START.copy()
+    start[:2, 3] += d.vector("start.translation", sigma.start_translation, 2)
+    start[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar("start.rotation", sigma.start_rotation)]))
+    return Scene(
+        seed=seed,
+        level=level,
+        deviations=sigma,
+        world_from_vehicle_start=start,
+        vehicle_from_base=nominal.VEHICLE_FROM_BASE,
+        world_from_surface=d.moved(
+            "station", nominal.WORLD_FROM_PLACE, sigma.station_translation, sigma.station_rotation
+        ),
+        world_from_board=nominal.WORLD_FROM_PLACE @ nominal.PLACE_FROM_BOARD,
+        base_from_fine_board=d.moved(
+            "fine_board", nominal.BASE_FROM_FINE_BOARD, sigma.deck_board_translation, sigma.deck_board_rotation
+        ),
+        base_from_deck_board=d.moved(
+            "deck_board", nominal.BASE_FROM_DECK_BOARD, sigma.deck_board_translation, sigma.deck_board_rotation
+        ),
+        flange_from_scan_camera=d.moved(
+            "hand_eye", nominal.FLANGE_FROM_SCAN_CAMERA, sigma.hand_eye_translation, sigma.hand_eye_rotation
+        ),
+        flange_from_target_camera=d.moved(
+            "target_mount",
+            nominal.FLANGE_FROM_TARGET_CAMERA,
+            sigma.target_mount_translation,
+            sigma.target_mount_rotation,
+        ),
+        flange_from_part=d.moved("grasp", nominal.FLANGE_FROM_PART, sigma.grasp_translation, sigma.grasp_rotation),
+        scan_lens=_lens(d, "scan_lens", sigma, nominal.SCAN_SIZE),
+        target_lens=_lens(d, "target_lens", sigma, nominal.TARGET_SIZE),
+        light_plane_normal=normal,
+        light_plane_distance=distance,
+        laser_origin=origin,
+        rail_direction=rotation(d.vector("rail_direction", sigma.rail_direction)) @ nominal.RAIL_DIRECTION,
+        rail_lead_error=d.scalar("rail_lead", sigma.rail_lead),
+        rail_periodic_amplitude=abs(d.scalar("rail_periodic", sigma.rail_periodic)),
+        rail_periodic_phase=float(stream(seed, "rail_phase").uniform(0.0, 2.0 * np.pi)),
+        rail_backlash=abs(d.scalar("rail_backlash", sigma.rail_backlash)),
+        dh_error=_dh_error(d, sigma),
+        odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
+        odometry_yaw=d.scalar("odometry_yaw", sigma.odometry_yaw),
+        suspension=np.abs(d.vector("suspension", sigma.suspension, 2)),
+        scan_clock=_clock(d, "scan_clock", sigma),
+        target_clock=_clock(d, "target_clock", sigma),
+    )
+
+
+def _light_plane(d: _Draws, sigma: Deviations) -> tuple[Vector, float, Vector]:
+    """Unit normal, distance and exit point, in C: nominally X = −l + Z cot θ (theory sheet, part 1)."""
+    plain = np.array([1.0, 0.0, -1.0 / nominal.LASER_TAN_THETA])
+    normal = rotation(d.vector("light_plane.tilt", sigma.light_plane_tilt)) @ (plain / np.linalg.norm(plain))
+    origin = nominal.LASER_ORIGIN + d.vector("light_plane.offset", sigma.light_plane_offset)
+    return normal, float(normal @ origin), origin
+
+
+def _lens(d: _Draws, name: str, sigma: Deviations, size: tuple[int, int]) -> Lens:
+    focal = nominal.FOCAL_LENGTH / nominal.PIXEL * (1.0 + d.scalar(name + ".focal", sigma.focal_length))
+    # The two focal lengths differ by what pixels that are not quite square give.
+    aspect = 1.0 + 0.04 * d.scalar(name + ".aspect", sigma.focal_length)
+    shift = d.vector(name + ".principal", sigma.principal_point, 2)
+    k1, k2 = d.vector(name + ".distortion", sigma.distortion_k1, 2)
+    p1, p2 = d.vector(name + ".tangential", 0.02 * sigma.distortion_k1, 2)
+    cx, cy = (size[0] - 1) / 2.0 + float(shift[0]), (size[1] - 1) / 2.0 + float(shift[1])
+    return Lens(focal, focal * aspect, cx, cy, (float(k1), 0.5 * float(k2), float(p1), float(p2), 0.0))
+
+
+def _dh_error(d: _Draws, sigma: Deviations) -> Pose:
+    """Errors (6, 4) of a and d in m, alpha (exact) and joint offset in rad, one row per joint."""
+    error = np.zeros((6, 4))
+    error[:, 0] = d.vector("dh.a", sigma.arm_dh_length, 6)
+    error[:, 1] = d.vector("dh.d", sigma.arm_dh_length, 6)
+    error[:, 3] = d.vector("dh.offset", sigma.arm_dh_angle, 6)
+    return error
+
+
+def _clock(d: _Draws, name: str, sigma: Deviations) -> CameraClock:
+    drift = d.scalar(name + ".drift", sigma.camera_clock_drift)
+    latency = abs(d.scalar(name + ".latency", sigma.exposure_latency))
+    epoch = -abs(d.scalar(name + ".epoch", 1000.0))
+    return CameraClock(drift, epoch, latency)

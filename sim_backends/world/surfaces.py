@@ -1,0 +1,166 @@
+"""The placement surfaces: closed-form height fields z = h(x, y) in the surface frame S, and meshes of them.
+
+`pot` is a free-form relief without symmetry, `seat` a curved seat with a ledge, a step and a recess whose flanks are
+steep but finite. Both cover |x| ≤ 35 mm, |y| ≤ 18 mm; around them lies the table, z = 0.
+`python -m sim_backends.world.surfaces pot pot.stl` writes the nominal surface as binary STL in metres.
+"""
+
+from __future__ import annotations
+
+import argparse
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+HALF_X = 0.035
+"""Half the footprint along x_S, the sweep direction, m."""
+HALF_Y = 0.018
+"""Half the footprint along y_S, the direction of the stripe, m."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of a surface: vertices (n, 3), m, frame S; triangles (m, 3), counter-clockwise from outside."""
+
+    vertices: Floats
+    triangles: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A height field over the footprint; `relief(x, y)` gives height, ∂h/∂x and ∂h/∂y in m and m/m."""
+
+    name: str
+    relief: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+
+    def height(self, x: Floats, y: Floats) -> Floats:
+        """Height (n,), m, of the surface at x, y (n,) in S; outside the footprint that of the table, 0."""
+        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
+        return np.where(inside, self.relief(x, y)[0], 0.0)
+
+    def normals(self, x: Floats, y: Floats) -> Floats:
+        """Unit normals (n, 3), pointing up, at x, y (n,) in S; outside the footprint those of the table."""
+        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
+        _, gx, gy = self.relief(x, y)
+        normal = np.stack([np.where(inside, -gx, 0.0), np.where(inside, -gy, 0.0), np.ones_like(gx)], axis=-1)
+        unit: Floats = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        return unit
+
+
+# Wave vectors (rad/m), phases (rad) and amplitudes (m) of the pot's relief; no two vectors are parallel, so that no
+# slide or turn of the surface maps it onto itself.
+_WAVES = np.array(
+    [
+        [150.0, 70.0, 0.40, 0.0014],
+        [-90.0, 230.0, 1.30, 0.0011],
+        [240.0, -110.0, 2.50, 0.0008],
+        [60.0, 310.0, 4.10, 0.0006],
+    ]
+)
+_POT_FLOOR = 0.0055
+
+
+def _pot(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    kx, ky, phase, amplitude = _WAVES.T
+    angle = np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase
+    rise = amplitude * np.cos(angle)
+    return _POT_FLOOR + (amplitude * np.sin(angle)).sum(-1), (rise * kx).sum(-1), (rise * ky).sum(-1)
+
+
+_FLANK = 0.0008
+
+
+def _step(along: Floats, rise: float) -> tuple[Floats, Floats]:
+    """A rise of `rise` m where `along` (m, signed distance) passes zero, with its slope."""
+    s = np.tanh(along / _FLANK)
+    return 0.5 * rise * (1.0 + s), 0.5 * rise * (1.0 - s * s) / _FLANK
+
+
+def _seat(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    h = 0.0045 + 3.0 * x * x + 6.0 * y * y + 0.05 * x - 0.03 * y + 2.0 * x * y
+    gx = 6.0 * x + 0.05 + 2.0 * y
+    gy = 12.0 * y - 0.03 + 2.0 * x
+    for nx, ny, offset, rise in ((0.970, -0.243, 0.013, 0.0026), (-0.148, 0.989, 0.006, -0.0022)):
+        up, slope = _step(nx * x + ny * y - offset, rise)
+        h, gx, gy = h + up, gx + slope * nx, gy + slope * ny
+    dx, dy = x + 0.016, y + 0.006
+    radius = np.sqrt(dx * dx + dy * dy + 1e-12)
+    up, slope = _step(radius - 0.007, 0.0020)
+    return h + up - 0.0020, gx + slope * dx / radius, gy + slope * dy / radius
+
+
+SURFACES = {"pot": Surface("pot", _pot), "seat": Surface("seat", _seat)}
+
+
+def surface(name: str) -> Surface:
+    """The surface called `name`. Raises ValueError that lists the names."""
+    if name not in SURFACES:
+        raise ValueError(f"unknown surface {name!r}: choose one of {', '.join(sorted(SURFACES))}")
+    return SURFACES[name]
+
+
+@cache
+def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> Mesh:
+    """A regular grid mesh of the surface `name` with about `triangles` triangles, in S.
+
+    `walls` adds the sides from the border down to the table, as seen by a camera. Raises ValueError for an unknown
+    name or fewer than 100 triangles.
+    """
+    field = surface(name)
+    if triangles < 100:
+        raise ValueError(f"a surface mesh of {triangles} triangles is too coarse: ask for 100 or more")
+    cell = np.sqrt(8.0 * HALF_X * HALF_Y / triangles)
+    nx, ny = (max(2, round(2.0 * half / cell) + 1) for half in (HALF_X, HALF_Y))
+    x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, nx), np.linspace(-HALF_Y, HALF_Y, ny), indexing="ij")
+    vertices = np.stack([x.ravel(), y.ravel(), field.height(x.ravel(), y.ravel())], axis=-1)
+    index = np.arange(nx * ny).reshape(nx, ny)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    if walls:
+        vertices, faces = _add_walls(vertices, faces, index)
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def _add_walls(vertices: Floats, faces: NDArray[np.intp], index: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
+    border = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    foot = vertices[border] * [1.0, 1.0, 0.0]
+    below = len(vertices) + np.arange(len(border))
+    upper, lower = np.roll(border, -1), np.roll(below, -1)
+    sides = np.concatenate([np.stack([border, below, lower], -1), np.stack([border, lower, upper], -1)])
+    return np.concatenate([vertices, foot]), np.concatenate([faces, sides])
+
+
+def write_stl(path: Path, surface_mesh: Mesh) -> None:
+    """Write `surface_mesh` as binary STL; coordinates in metres, frame S."""
+    corners = surface_mesh.vertices[surface_mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    records = np.zeros(len(corners), dtype=record)
+    records["normal"], records["corners"] = normals, corners
+    path.write_bytes(b"nominal surface, metres".ljust(80) + struct.pack("<I", len(records)) + records.tobytes())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Export the nominal mesh of a surface."""
+    parser = argparse.ArgumentParser(prog="surfaces", description="Write a surface as binary STL, in metres.")
+    parser.add_argument("name", choices=sorted(SURFACES))
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--triangles", type=int, default=80_000, help="about this many (default: %(default)s)")
+    parser.add_argument("--walls", action="store_true", help="with the sides down to the table")
+    options = parser.parse_args(argv)
+    written = mesh(options.name, options.triangles, options.walls)
+    write_stl(options.file, written)
+    print(f"{options.file}: {len(written.triangles)} triangles, metres")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
