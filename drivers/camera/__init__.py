@@ -1,1 +1,1 @@
-"""Placeholder."""
+"""Cameras: the frame stream over TCP, and a folder of recorded pictures."""

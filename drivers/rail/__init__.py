@@ -1,1 +1,1 @@
-"""Placeholder."""
+"""The linear axis that carries the scan head, on a TMCL stepper module."""
