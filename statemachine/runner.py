@@ -1,0 +1,292 @@
+"""Drives a sequence of steps to its end, whatever happens, and ends it safe.
+
+The work is done by the steps that are passed in, each in a thread of its own; the runner watches deadlines, requests
+and signals, repeats what the policy lets it repeat, and writes everything to the journal as it happens. It knows
+neither devices nor the cell: exceptions are judged by `classify`, the cell is brought to rest by `safe_stop`.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from statemachine.journal import Journal, JournalError
+from statemachine.policy import Ending, OnFailure, Outcome, Policy, Step
+from statemachine.sequence import STEPS, Sequence, SequenceError, State, Trigger
+from statemachine.step import Event, Observer, RunResult, StepCall, StepContext, StepOverrun, StepRecord, Summarised
+from statemachine.watch import Call, Clock, SignalWatch
+
+POLL_S = 0.02
+"""How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
+REQUEST_POLLS = 10
+"""The journal's requests are looked at every so many polls."""
+
+
+_END_TRIGGERS = {
+    Outcome.REFUSED: Trigger.REFUSE,
+    Outcome.FAULTED: Trigger.FAULT,
+    Outcome.ABORTED: Trigger.ABORT,
+}
+
+
+@dataclass
+class Runner:
+    """Runs one job. `run()` is called once; `abort`, `pause` and `resume` come from any thread.
+
+    `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
+    stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
+    a step is cut short, and exactly once more at the end of every run. `recover(error)` clears a recoverable fault.
+    """
+
+    sequence: Sequence
+    steps: Mapping[str, StepCall]
+    policy: Policy
+    journal: Journal
+    clock: Clock
+    classify: Callable[[BaseException], Ending]
+    safe_stop: Callable[[str], None]
+    observer: Observer | None = None
+    recover: Callable[[BaseException], None] | None = None
+    _asked: str | None = field(default=None, init=False)
+    _paused: threading.Event = field(default_factory=threading.Event, init=False)
+    _polls: int = field(default=0, init=False)
+    _signals: SignalWatch = field(default_factory=SignalWatch, init=False)
+    _records: dict[str, StepRecord] = field(default_factory=dict, init=False)
+    _results: dict[str, object] = field(default_factory=dict, init=False)
+    _error: BaseException | None = field(default=None, init=False)
+    _abandoned: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        missing = [step.value for step in STEPS if step.value not in self.steps]
+        if missing:
+            raise ValueError(f"no work was given for {', '.join(missing)}")
+        self._records = {step.value: StepRecord(step.value) for step in STEPS}
+
+    def abort(self, reason: str) -> None:
+        """End the run as aborted: what moves is stopped at once."""
+        if self._asked is None:
+            self._asked = reason
+
+    def pause(self) -> None:
+        """Hold the run before its next step."""
+        self._paused.set()
+
+    def resume(self) -> None:
+        """Let a held run go on."""
+        self._paused.clear()
+
+    def run(self, done: Mapping[str, object] | None = None) -> RunResult:
+        """Do the steps that are not in `done` (results of an earlier run by step name) and return how it ended.
+
+        Raises nothing: every exception of a step, of the journal or of the runner itself becomes an outcome, after
+        the safe stop.
+        """
+        for name, result in (done or {}).items():
+            self.sequence.facts.done.add(State(name))
+            self._results[name] = result
+            self._records[name] = StepRecord(name, "resumed")
+        self.sequence.on_change = self._on_change
+        with SignalWatch() as self._signals:
+            try:
+                end = self._drive()
+            except Exception as error:
+                self._error = error
+                end = Ending(Outcome.FAULTED, f"the run could not go on: {error}", "run.internal")
+            return self._finish(end)
+
+    # --- the walk through the sequence ---
+
+    def _drive(self) -> Ending:
+        if (end := self._ask()) is not None:
+            return end
+        self.sequence.fire(Trigger.START)
+        while (state := self.sequence.state) in STEPS:
+            end = self._hold() or self._perform(self.policy.of(state))
+            if end is not None:
+                return end
+            self.sequence.facts.done.add(state)
+            self.sequence.fire(Trigger.NEXT)
+        return Ending(Outcome.PLACED, "all steps done")
+
+    def _perform(self, step: Step) -> Ending | None:
+        """Do one step, with its repetitions; None when it has succeeded."""
+        attempt = 1
+        while (end := self._attempt(step, attempt)) is not None:
+            left = step.max_retries + 1 - attempt
+            error = self._error
+            if left == 0 or error is None or self._abandoned or end.outcome is Outcome.ABORTED:
+                return end
+            self.sequence.facts.retries_left = left
+            self.sequence.facts.recoverable = end.recoverable
+            if step.retries(error):
+                self._stop(f"before {step.name} is tried again")
+                self.sequence.fire(Trigger.RETRY)
+            elif end.recoverable and step.on_failure is OnFailure.RECOVER and self.recover is not None:
+                if (failed := self._recover(step, error, self.recover)) is not None:
+                    return failed
+            else:
+                return end
+            if (asked := self._hold()) is not None:
+                return asked
+            attempt += 1
+        return None
+
+    def _recover(self, step: Step, error: BaseException, recover: Callable[[BaseException], None]) -> Ending | None:
+        self.sequence.fire(Trigger.FAULT)
+        self._stop(f"fault in {step.name}")
+        self.sequence.fire(Trigger.RECOVER)
+        call = Call("recovery", lambda: recover(error))
+        end = self._watch(call, self.clock.now() + self.policy.recovery_deadline_s, "the recovery")
+        if end is None and call.error is not None:
+            self._error = call.error
+            judged = self._judge(call.error)
+            end = replace(judged, outcome=Outcome.FAULTED, reason=f"{error}; the recovery failed: {judged.reason}")
+        if end is None:
+            self.sequence.fire(Trigger.RECOVERED)
+        return end
+
+    def _attempt(self, step: Step, attempt: int) -> Ending | None:
+        """One try: None, or the end that it leads to unless it is repeated."""
+        started = self.clock.now()
+        deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
+        context = StepContext(step, attempt, deadline, dict(self._results), self.clock, self._tell)
+        key = self.journal.step_started(step.name, attempt)
+        self._tell(Event("step_started", step.name, {"attempt": attempt}))
+        self._error = None
+        call = Call(step.name, lambda: self.steps[step.name](context))
+        end = self._watch(call, deadline, step.name, context.cancel)
+        if end is None and call.error is not None:
+            self._error = call.error
+            end = self._ask() or self._judge(call.error)
+        duration = self.clock.now() - started
+        before = self._records[step.name].duration_s
+        state = "done" if end is None else "failed"
+        self._records[step.name] = StepRecord(step.name, state, before + duration, attempt - 1)
+        if end is not None:
+            self.journal.step_ended(key, duration, error=end.reason)
+            self._tell(Event("step_failed", step.name, {"attempt": attempt, "reason": end.reason}))
+            return end
+        summary = dict(call.result.summary()) if isinstance(call.result, Summarised) else {}
+        self._results[step.name] = call.result
+        self.journal.step_ended(key, duration, summary)
+        self._tell(Event("step_done", step.name, {"duration_s": duration, **summary}))
+        return None
+
+    # --- watching ---
+
+    def _watch(
+        self, call: Call, deadline: float, what: str, cancel: Callable[[str], None] | None = None
+    ) -> Ending | None:
+        """Wait for the end of `call`; on a request, a signal or the deadline stop the cell and say why."""
+        cause: Ending | None = None
+        while cause is None:
+            if self.clock.wait(call.done, POLL_S * self.clock.rate):
+                return None
+            try:
+                cause = self._ask()
+            except JournalError as error:
+                self._error = error
+                cause = Ending(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
+            if cause is None and self.clock.now() > deadline:
+                self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
+                cause = Ending(Outcome.FAULTED, str(self._error), "step.deadline")
+        if cancel is not None:
+            cancel(cause.reason)
+        trouble = self._halt(cause.reason)
+        if not self.clock.wait(call.done, self.policy.grace_s * self.clock.rate):
+            self._abandoned = True
+            text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
+            cause = replace(cause, reason=text)
+        self._tell(Event("safe_stop", None, {"reason": cause.reason, "trouble": trouble}))
+        return cause
+
+    def _ask(self) -> Ending | None:
+        """The end that somebody asked for, if any."""
+        self._polls += 1
+        if self._polls % REQUEST_POLLS == 1:
+            for request in self.journal.take_requests():
+                match request.kind:
+                    case "abort":
+                        self.abort(request.reason)
+                    case "pause":
+                        self.pause()
+                    case "resume":
+                        self.resume()
+        if self._signals.reason is not None:
+            return Ending(Outcome.ABORTED, self._signals.reason, "signal")
+        if self._asked is not None:
+            return Ending(Outcome.ABORTED, self._asked, "request")
+        return None
+
+    def _hold(self) -> Ending | None:
+        """Stay paused for as long as it is asked for."""
+        end = self._ask()
+        if end is None and self._paused.is_set():
+            self.sequence.fire(Trigger.PAUSE)
+            never = threading.Event()
+            while end is None and self._paused.is_set():
+                self.clock.wait(never, POLL_S * self.clock.rate)
+                end = self._ask()
+            if end is None:
+                self.sequence.fire(Trigger.RESUME)
+        return end
+
+    def _judge(self, error: BaseException) -> Ending:
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            return Ending(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
+        text = "".join(traceback.format_exception(error))
+        self.journal.event("traceback", self.sequence.state.value, {"text": text})
+        try:
+            return self.classify(error)
+        except Exception as second:
+            text = f"{type(error).__name__}: {error} (it could not be classified: {second})"
+            return Ending(Outcome.FAULTED, text, "run.internal")
+
+    # --- the end ---
+
+    def _halt(self, reason: str) -> str | None:
+        """Call `safe_stop` in a thread that no signal reaches; what went wrong with it, or None."""
+        call = Call("safe stop", lambda: self.safe_stop(reason))
+        if not self.clock.wait(call.done, self.policy.stop_deadline_s * self.clock.rate):
+            return f"it did not end within {self.policy.stop_deadline_s:g} s"
+        return None if call.error is None else f"{type(call.error).__name__}: {call.error}"
+
+    def _stop(self, reason: str) -> None:
+        trouble = self._halt(reason)
+        self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
+
+    def _finish(self, end: Ending) -> RunResult:
+        reason = f"end of the run ({end.outcome.value})"
+        trouble = self._halt(reason)
+        if trouble is not None:
+            end = Ending(Outcome.FAULTED, f"{end.reason}; the safe stop failed: {trouble}", "safe_stop")
+        try:
+            self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
+            if end.outcome is not Outcome.PLACED:
+                self.sequence.fire(_END_TRIGGERS[end.outcome])
+            self.journal.run_ended(end.outcome.value, end.reason)
+        except (JournalError, SequenceError) as error:
+            end = Ending(Outcome.FAULTED, f"{end.reason}; the end could not be recorded: {error}", "run.internal")
+        records = tuple(self._records[step.value] for step in STEPS)
+        results = dict(self._results)
+        return RunResult(end.outcome, end.reason, end.code, records, results, self._error, self._signals.number)
+
+    # --- telling ---
+
+    def _on_change(self, trigger: Trigger, source: State, target: State) -> None:
+        self._tell(Event("state", None, {"trigger": trigger.value, "from": source.value, "to": target.value}))
+
+    def _tell(self, event: Event) -> None:
+        """Write to the journal what is not in its steps table, and tell the observer; from any thread."""
+        if event.kind in ("state", "safe_stop", "note"):
+            self.journal.event(event.kind, event.step, event.data)
+        observer = self.observer
+        if observer is not None:
+            try:
+                observer(event)
+            # A display that fails must not end the job; it is told nothing more.
+            except Exception as error:
+                self.observer = None
+                self.journal.event("observer_failed", event.step, {"error": f"{type(error).__name__}: {error}"})

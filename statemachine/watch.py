@@ -1,0 +1,81 @@
+"""Small pieces that keep a run in hand: a call in its own thread, and signals that are noted instead of raised.
+
+A step runs in a thread of its own so that the thread that watches it can always act: on a deadline, a request to
+abort, or Ctrl-C, even while the step sits in a long computation.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """The cell's clock: seconds that run `rate` times as fast as the wall."""
+
+    rate: float
+
+    def now(self) -> float:
+        """Seconds."""
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Wait for `event`, at most `timeout` seconds of this clock; True when it was set."""
+
+
+class Call:
+    """`work()` in its own daemon thread; `done` is set when it has ended, with `result` or `error`."""
+
+    def __init__(self, name: str, work: Callable[[], object]) -> None:
+        self.done = threading.Event()
+        self.result: object = None
+        self.error: BaseException | None = None
+        self._work = work
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            self.result = self._work()
+        # Everything is handed to the thread that watches, which decides what it means.
+        except BaseException as error:
+            self.error = error
+        finally:
+            self.done.set()
+
+
+class SignalWatch:
+    """Inside this context SIGINT and SIGTERM are noted in `reason` and do not interrupt anything.
+
+    So neither the first Ctrl-C nor a second one, however often it is pressed, can cut a safe stop short. Nested
+    contexts see the signals of their own time. Does nothing outside the main thread, where Python allows no handlers.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._previous: dict[int, object] = {}
+
+    @property
+    def reason(self) -> str | None:
+        """What to tell the operator, or None if no signal came."""
+        if self.number is None:
+            return None
+        return "interrupted from the keyboard" if self.number == signal.SIGINT else "asked to terminate (SIGTERM)"
+
+    def __enter__(self) -> SignalWatch:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        # A plain attribute: taking a lock here could deadlock with the very thread that the signal broke into.
+        if self.number is None:
+            self.number = number
