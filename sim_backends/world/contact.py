@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.world import nominal
+from sim_backends.world.nominal import inverse
 from sim_backends.world.surfaces import HALF_X, HALF_Y, Surface
 
 Pose = NDArray[np.float64]
@@ -21,7 +22,8 @@ STIFFNESS = 20e3
 """Vertical stiffness of a flat contact over the whole underside, N/m."""
 GRIP_REACH = 0.005
 """How far, m, the claw may be from the part's place in it and still grip it."""
-_NEAR = 0.020
+_HIGHEST = 0.030
+"""No point of a leaning table's surface is higher than this, m, above its origin."""
 
 
 class PartContact:
@@ -32,15 +34,15 @@ class PartContact:
 
     def __init__(self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose) -> None:
         self._surface = surface
-        self._surface_from_world = np.linalg.inv(world_from_surface)
+        self._surface_from_world = inverse(world_from_surface)
         self._world_from_surface = world_from_surface
         self._flange_from_part = flange_from_part
         self._world_from_part: Pose | None = None
         self._claw_closed = True
         self._lock = threading.Lock()
         # A margin keeps the points off the border, where the height field falls to the table.
-        x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, 25) * 0.98, np.linspace(-HALF_Y, HALF_Y, 13) * 0.97)
-        x, y = x.ravel(), y.ravel()
+        grid = np.meshgrid(np.linspace(-HALF_X, HALF_X, 25) * 0.98, np.linspace(-HALF_Y, HALF_Y, 13) * 0.97)
+        x, y = (axis.ravel() for axis in grid)
         self._underside = np.stack([x, y, surface.height(x, y)], axis=-1)
 
     @property
@@ -72,7 +74,7 @@ class PartContact:
     def _grip(self, world_from_flange: Pose) -> None:
         if self._world_from_part is None:
             return
-        found = np.linalg.inv(world_from_flange) @ self._world_from_part
+        found = inverse(world_from_flange) @ self._world_from_part
         if np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3]) <= GRIP_REACH:
             self._flange_from_part = found
             self._world_from_part = None
@@ -81,7 +83,7 @@ class PartContact:
         """The part after it fell straight down (or sprang back up) to its first contact, its orientation kept."""
         rest = world_from_part.copy()
         for _ in range(20):
-            depth, _, _ = self._penetration(rest)
+            depth, _ = self._below(_moved(self._underside, rest))
             # Depth counts along z_S, the fall is along world z: repeated, because the table may lean a little.
             step = float(depth.max())
             rest[2, 3] += step
@@ -89,36 +91,34 @@ class PartContact:
                 break
         return rest
 
-    def _penetration(self, world_from_part: Pose) -> tuple[Vector, Vector, Vector]:
-        """Depth (n,) below the surface along z_S, unit normals (n, 3) in W and the points (n, 3) in W."""
-        points = self._underside @ world_from_part[:3, :3].T + world_from_part[:3, 3]
-        return *self._below(points), points
-
     def _below(self, points: Vector) -> tuple[Vector, Vector]:
-        local = points @ self._surface_from_world[:3, :3].T + self._surface_from_world[:3, 3]
-        on_table = (np.abs(local[:, 0]) <= nominal.TABLE_HALF) & (np.abs(local[:, 1]) <= nominal.TABLE_HALF)
-        ground = np.where(on_table, self._surface.height(local[:, 0], local[:, 1]), -nominal.TABLE_HEIGHT)
-        depth = ground - local[:, 2]
-        return depth, self._surface.normals(local[:, 0], local[:, 1]) @ self._world_from_surface[:3, :3].T
+        """Depth (n,), m, of world `points` (n, 3) below the ground along z_S, and the ground's normals (n, 3) in S."""
+        local = _moved(points, self._surface_from_world)
+        on_table = np.abs(local[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+        height, normals = self._surface.sample(local[:, 0], local[:, 1])
+        return np.where(on_table, height, -nominal.TABLE_HEIGHT) - local[:, 2], normals
 
     def wrench(self, world_from_flange: Pose) -> Vector:
         """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
-        origin = world_from_flange[:3, 3]
-        wrench = np.zeros(6)
-        lowest = float(world_from_flange[2, 3] + nominal.FLANGE_FROM_PART[2, 3] * world_from_flange[2, 2])
-        if lowest > self._world_from_surface[2, 3] + _NEAR + HALF_X:
-            return wrench
+        points = _moved(nominal.FLANGE_FINGERTIPS, world_from_flange)
         with self._lock:
-            held = self._world_from_part is None
-            pose = self._pose(world_from_flange)
-        fingers = nominal.FLANGE_FINGERTIPS @ world_from_flange[:3, :3].T + origin
-        touching = [(*self._below(fingers), fingers)]
-        if held:
-            touching.append(self._penetration(pose))
-        for depth, normals, points in touching:
-            # The normal's part of a vertical depth; the whole underside together has the stiffness of the table.
-            push = STIFFNESS / len(depth) * np.maximum(depth, 0.0) * normals[:, 2]
-            forces = push[:, None] * normals
-            wrench[:3] += forces.sum(axis=0)
-            wrench[3:] += np.cross(points - origin, forces).sum(axis=0)
+            if self._world_from_part is None:
+                points = np.concatenate([points, _moved(self._underside, self._pose(world_from_flange))])
+        wrench = np.zeros(6)
+        if points[:, 2].min() > self._world_from_surface[2, 3] + _HIGHEST:
+            return wrench
+        depth, normals = self._below(points)
+        if depth.max() <= 0.0:
+            return wrench
+        # The part of a vertical depth along the normal; the whole underside has STIFFNESS along z.
+        push = STIFFNESS / len(self._underside) * np.maximum(depth, 0.0) * normals[:, 2]
+        forces = (push[:, None] * normals) @ self._world_from_surface[:3, :3].T
+        wrench[:3] = forces.sum(axis=0)
+        wrench[3:] = np.cross(points - world_from_flange[:3, 3], forces).sum(axis=0)
         return wrench
+
+
+def _moved(points: Vector, a_from_b: Pose) -> Vector:
+    """Points (n, 3) of frame b in frame a."""
+    moved: Vector = points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return moved

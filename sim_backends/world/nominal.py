@@ -24,6 +24,14 @@ def pose(translation: Sequence[float], x_axis: Sequence[float], z_axis: Sequence
     return made
 
 
+def inverse(a_from_b: Pose) -> Pose:
+    """`b_from_a` (4, 4) of a rigid transformation."""
+    made = np.eye(4)
+    made[:3, :3] = a_from_b[:3, :3].T
+    made[:3, 3] = -made[:3, :3] @ a_from_b[:3, 3]
+    return made
+
+
 def board_pose(
     centre: Sequence[float], x_axis: Sequence[float], z_axis: Sequence[float], size: Sequence[float]
 ) -> Pose:

@@ -40,18 +40,16 @@ class Surface:
     name: str
     relief: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
 
+    def sample(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Heights (n,), m, and upward unit normals (n, 3) at x, y (n,) in S; outside the footprint the table's."""
+        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
+        h, gx, gy = (np.where(inside, value, 0.0) for value in self.relief(x, y))
+        steepness = np.sqrt(1.0 + gx * gx + gy * gy)
+        return h, np.stack([-gx / steepness, -gy / steepness, 1.0 / steepness], axis=-1)
+
     def height(self, x: Floats, y: Floats) -> Floats:
         """Height (n,), m, of the surface at x, y (n,) in S; outside the footprint that of the table, 0."""
-        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
-        return np.where(inside, self.relief(x, y)[0], 0.0)
-
-    def normals(self, x: Floats, y: Floats) -> Floats:
-        """Unit normals (n, 3), pointing up, at x, y (n,) in S; outside the footprint those of the table."""
-        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
-        _, gx, gy = self.relief(x, y)
-        normal = np.stack([np.where(inside, -gx, 0.0), np.where(inside, -gy, 0.0), np.ones_like(gx)], axis=-1)
-        unit: Floats = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        return unit
+        return self.sample(x, y)[0]
 
 
 # Wave vectors (rad/m), phases (rad) and amplitudes (m) of the pot's relief; no two vectors are parallel, so that no

@@ -1,0 +1,101 @@
+"""The placement surfaces: what a registration and a scan may rely on."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_backends.world import surfaces
+from sim_backends.world.surfaces import HALF_X, HALF_Y, SURFACES, mesh, surface
+
+NAMES = sorted(SURFACES)
+
+
+def grid(margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(
+        np.linspace(margin - HALF_X, HALF_X - margin, 141), np.linspace(margin - HALF_Y, HALF_Y - margin, 73)
+    )
+    return x.ravel(), y.ravel()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_slopes_are_the_derivatives_of_the_height(name: str) -> None:
+    x, y = grid(0.001)
+    _, gx, gy = surface(name).relief(x, y)
+    step = 1e-7
+    by_x = (surface(name).height(x + step, y) - surface(name).height(x - step, y)) / (2 * step)
+    by_y = (surface(name).height(x, y + step) - surface(name).height(x, y - step)) / (2 * step)
+    assert np.abs(gx - by_x).max() < 1e-7
+    assert np.abs(gy - by_y).max() < 1e-7
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_relief_stays_between_the_table_and_15_mm(name: str) -> None:
+    h = surface(name).height(*grid())
+    assert h.min() > 0.001
+    assert h.max() < 0.015
+    assert np.ptp(h) <= 0.012
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seen_up_to_y", [HALF_Y, HALF_Y - 0.008])
+def test_every_direction_is_observable(name: str, seen_up_to_y: float) -> None:
+    """Smallest eigenvalue of the normalised information matrix (theory sheet, part 5), also when the view is cut."""
+    x, y = grid()
+    seen = y <= seen_up_to_y
+    heights, normals = surface(name).sample(x[seen], y[seen])
+    points = np.column_stack([x[seen], y[seen], heights])
+    points -= points.mean(axis=0)
+    radius = np.sqrt((points**2).sum(axis=1).mean())
+    jacobian = np.hstack([np.cross(points, normals) / radius, normals])
+    assert np.linalg.eigvalsh(jacobian.T @ jacobian / len(points))[0] > 5e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_flank_hides_from_camera_or_laser(name: str) -> None:
+    """The laser comes in 16° off the camera's axis: a flank of less than 74° towards it is lit."""
+    _, gx, gy = surface(name).relief(*grid())
+    assert np.degrees(np.arctan(np.hypot(gx, gy).max())) < 70.0
+
+
+def test_the_seat_has_edges_and_the_pot_has_none() -> None:
+    steepest = {n: np.degrees(np.arctan(np.hypot(*surface(n).relief(*grid())[1:]))).max() for n in NAMES}
+    assert steepest["pot"] < 35.0
+    assert steepest["seat"] > 50.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mesh_lies_on_the_closed_form_and_closes_down_to_the_table(name: str) -> None:
+    made = mesh(name)
+    x, y, z = made.vertices.T
+    top = z > 0
+    assert abs(len(made.triangles) - 80_000) < 3_000
+    assert np.abs(z[top] - surface(name).height(x[top], y[top])).max() < 1e-12
+    corners = made.vertices[made.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals[(corners[:, :, 2] > 0).all(axis=1) & (np.abs(normals[:, 2]) > 1e-12), 2] > 0).all()
+    # A closed surface but for its bottom, whose vector area is the footprint's.
+    assert normals.sum(axis=0) / 2 == pytest.approx([0.0, 0.0, 4 * HALF_X * HALF_Y], abs=1e-12)
+
+
+def test_exported_stl_is_the_mesh_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "pot.stl"
+    assert surfaces.main(["pot", str(file), "--triangles", "5000"]) == 0
+    assert "metres" in capsys.readouterr().out
+    data = file.read_bytes()
+    (count,) = struct.unpack_from("<I", data, 80)
+    expected = mesh("pot", 5000, walls=False)
+    assert count == len(expected.triangles)
+    assert len(data) == 84 + 50 * count
+    first = np.frombuffer(data, dtype="<f4", count=12, offset=84)
+    assert first[3:].reshape(3, 3) == pytest.approx(expected.vertices[expected.triangles[0]], abs=1e-8)
+
+
+def test_unknown_names_and_coarse_meshes_are_refused() -> None:
+    with pytest.raises(ValueError, match="pot, seat"):
+        surface("vase")
+    with pytest.raises(ValueError, match="100 or more"):
+        mesh("pot", 10)
