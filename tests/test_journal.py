@@ -1,0 +1,130 @@
+"""The journal: what was written is there, whatever happened to the writer."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from statemachine.journal import FILE_NAME, Journal, JournalError, read, request
+
+WRITER = """
+import sys
+from pathlib import Path
+from statemachine.journal import Journal
+journal = Journal(Path(sys.argv[1]), "r1", {"seed": 7})
+key = journal.step_started("board_photo", 1)
+journal.step_ended(key, 1.5, {"residual_px": 0.08})
+journal.step_started("laser_sweep", 1)
+count = 0
+while True:
+    count += 1
+    journal.event("note", "laser_sweep", {"line": count})
+    print(count, flush=True)
+"""
+
+
+def test_what_was_written_can_be_read_while_the_run_goes_on(tmp_path):
+    journal = Journal(tmp_path, "r1", {"seed": 7, "level": "nominal"})
+    failed = journal.step_started("board_photo", 1)
+    journal.step_ended(failed, 0.5, error="no frame came")
+    again = journal.step_started("board_photo", 2)
+    journal.step_ended(again, 0.25, {"residual_px": 0.08})
+    journal.event("note", "board_photo", {"views": 3})
+    record = read(tmp_path)
+    assert record.run.info == {"seed": 7, "level": "nominal"}
+    assert not record.finished
+    assert [(row.name, row.attempt, row.state, row.duration_s, row.error) for row in record.steps] == [
+        ("board_photo", 1, "failed", 0.5, "no frame came"),
+        ("board_photo", 2, "done", 0.25, None),
+    ]
+    assert record.done == {"board_photo": {"residual_px": 0.08}}
+    assert record.events[0].data == {"views": 3}
+    journal.run_ended("placed", "all steps done")
+    assert read(tmp_path).run.outcome == "placed"
+    journal.close()
+
+
+def test_every_row_that_a_killed_writer_reported_is_there(tmp_path):
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert writer.stdout is not None
+    reported = 0
+    while reported < 50:
+        reported = int(writer.stdout.readline())
+    writer.send_signal(signal.SIGKILL)
+    rest, _ = writer.communicate(timeout=10)
+    complete = [int(line) for line in rest.split("\n")[:-1]]
+    reported = max([reported, *complete])
+    record = read(tmp_path)
+    assert [row.data["line"] for row in record.events][:reported] == list(range(1, reported + 1))
+    assert len(record.events) <= reported + 1
+    assert record.done == {"board_photo": {"residual_px": 0.08}}
+    assert record.steps[-1].state == "running"
+    assert not record.finished
+    base = sqlite3.connect(tmp_path / FILE_NAME)
+    assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    base.close()
+
+
+def test_rows_are_synced_to_the_disk_one_by_one(tmp_path):
+    journal = Journal(tmp_path, "r1")
+    assert journal._base.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    assert journal._base.execute("PRAGMA synchronous").fetchone() == (2,)
+    assert journal._base.isolation_level is None
+    journal.close()
+
+
+def test_requests_of_other_processes_are_taken_once_and_in_order(tmp_path):
+    journal = Journal(tmp_path, "r1")
+    request(tmp_path, "pause", "coffee")
+    request(tmp_path, "abort", "cell abort by ann")
+    assert [(r.kind, r.reason) for r in journal.take_requests()] == [
+        ("pause", "coffee"),
+        ("abort", "cell abort by ann"),
+    ]
+    assert journal.take_requests() == []
+    with pytest.raises(ValueError, match="abort, pause, resume"):
+        request(tmp_path, "explode", "")
+    journal.close()
+
+
+def test_several_threads_can_write(tmp_path):
+    journal = Journal(tmp_path, "r1")
+    threads = [
+        threading.Thread(target=lambda: [journal.event("note", None, {"i": i}) for i in range(20)]) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert len(read(tmp_path).events) == 80
+    journal.close()
+
+
+def test_a_resumed_run_is_read_as_the_newest(tmp_path):
+    first = Journal(tmp_path, "r1")
+    first.step_ended(first.step_started("board_photo", 1), 1.0)
+    first.close()
+    second = Journal(tmp_path, "r2")
+    record = read(tmp_path)
+    assert [run.id for run in record.runs] == ["r1", "r2"]
+    assert record.steps == ()
+    second.close()
+
+
+def test_a_missing_or_foreign_file_is_a_clear_error(tmp_path):
+    with pytest.raises(JournalError, match="there is no journal"):
+        read(tmp_path)
+    with pytest.raises(JournalError, match="there is no journal"):
+        request(tmp_path, "abort", "x")
+    (tmp_path / FILE_NAME).write_text("not a data base at all" * 100)
+    with pytest.raises(JournalError, match="cannot be used"):
+        read(tmp_path)
+    with pytest.raises(JournalError, match="cannot be opened"):
+        Journal(tmp_path / "nowhere", "r1")

@@ -1,0 +1,367 @@
+"""The runner: every run ends safe, with the outcome that its steps deserve, and everything is in the journal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from drivers.clock import Clock
+from statemachine.journal import Journal, read, request
+from statemachine.policy import Ending, OnFailure, Outcome, Policy, Step
+from statemachine.runner import Runner
+from statemachine.sequence import STEPS, Sequence, State
+
+NAMES = [step.value for step in STEPS]
+
+
+class Bench:
+    """A runner on a journal in a folder, whose steps are set by the test; it notes what happened, in order."""
+
+    def __init__(self, folder, **steps):
+        self.folder = folder
+        self.log = []
+        self.stopped = threading.Event()
+        self.events = []
+        work = {name: self._step(name, steps.get(name)) for name in NAMES}
+        self.runner = Runner(
+            sequence=Sequence(),
+            steps=work,
+            policy=Policy(grace_s=1.0, stop_deadline_s=1.0),
+            journal=Journal(folder, "r1"),
+            clock=Clock(),
+            classify=self.classify,
+            safe_stop=self.safe_stop,
+            observer=self.events.append,
+        )
+
+    def _step(self, name, work):
+        def step(context):
+            self.log.append(name)
+            return work(context) if work is not None else f"made by {name}"
+
+        return step
+
+    def classify(self, error):
+        if isinstance(error, ValueError):
+            return Ending(Outcome.REFUSED, str(error), "refused")
+        return Ending(Outcome.FAULTED, str(error), "fault", recoverable=isinstance(error, ConnectionError))
+
+    def safe_stop(self, reason):
+        self.log.append(f"stop: {reason}")
+        self.stopped.set()
+
+    def policy(self, *args, **values):
+        self.runner.policy = self.runner.policy.with_step(Step(*args, **values))
+        return self
+
+    def run(self, done=None):
+        result = self.runner.run(done)
+        self.record = read(self.folder)
+        assert self.log[-1].startswith("stop: end of the run"), "the last thing is always the safe stop"
+        assert sum(line.startswith("stop: end of the run") for line in self.log) == 1
+        assert self.record.run.outcome == result.outcome.value
+        assert self.runner.sequence.state.value == result.outcome.value
+        return result
+
+
+def failing(*errors):
+    """A step that raises the errors one after the other and then succeeds."""
+    left = list(errors)
+
+    def work(context):
+        if left:
+            raise left.pop(0)
+        return f"made in attempt {context.attempt}"
+
+    return work
+
+
+def test_all_steps_run_in_order_and_the_run_ends_placed(tmp_path):
+    bench = Bench(tmp_path)
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    assert bench.log[:-1] == NAMES
+    assert [(record.name, record.state, record.retries) for record in result.steps] == [(n, "done", 0) for n in NAMES]
+    assert bench.record.finished
+    assert list(bench.record.done) == NAMES
+
+
+def test_a_step_sees_what_the_earlier_ones_made(tmp_path):
+    seen = {}
+    bench = Bench(tmp_path, laser_sweep=lambda context: seen.update(context.results))
+    bench.run()
+    assert seen == {
+        "drive_to_target": "made by drive_to_target",
+        "board_photo": "made by board_photo",
+    }
+
+
+def test_the_summary_of_a_result_is_in_the_journal(tmp_path):
+    class Photo:
+        def summary(self):
+            return {"residual_px": 0.08}
+
+    bench = Bench(tmp_path, board_photo=lambda context: Photo())
+    bench.run()
+    assert bench.record.done["board_photo"] == {"residual_px": 0.08}
+
+
+def test_a_refusal_ends_the_run_with_its_reason(tmp_path):
+    bench = Bench(tmp_path, invert_pose=failing(ValueError("rotation about z is not known well enough")))
+    result = bench.run()
+    assert result.outcome is Outcome.REFUSED
+    assert result.reason == "rotation about z is not known well enough"
+    assert "place" not in bench.log
+    assert [record.state for record in result.steps] == ["done"] * 4 + ["failed", "open"]
+
+
+def test_an_unexpected_exception_is_a_fault_and_its_traceback_is_kept(tmp_path):
+    bench = Bench(tmp_path, reconstruct=failing(ZeroDivisionError("division by zero")))
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert isinstance(result.error, ZeroDivisionError)
+    (trace,) = [event for event in bench.record.events if event.kind == "traceback"]
+    assert "ZeroDivisionError" in trace.data["text"]
+    assert trace.step == "reconstruct"
+
+
+def test_a_named_exception_is_retried_from_a_cell_at_rest(tmp_path):
+    bench = Bench(tmp_path, board_photo=failing(TimeoutError("no frame"), TimeoutError("no frame")))
+    bench.policy("board_photo", 10.0, 2, ("TimeoutError",))
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    assert result.results["board_photo"] == "made in attempt 3"
+    assert result.steps[1].retries == 2
+    start = bench.log.index("board_photo")
+    again = "stop: before board_photo is tried again"
+    assert bench.log[start : start + 5] == ["board_photo", again, "board_photo", again, "board_photo"]
+    assert [row.state for row in bench.record.steps if row.name == "board_photo"] == ["failed", "failed", "done"]
+
+
+def test_retries_run_out(tmp_path):
+    bench = Bench(tmp_path, board_photo=failing(*[TimeoutError("no frame")] * 5))
+    bench.policy("board_photo", 10.0, 2, ("TimeoutError",))
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert bench.log.count("board_photo") == 3
+
+
+def test_an_exception_that_is_not_named_is_not_retried(tmp_path):
+    bench = Bench(tmp_path, board_photo=failing(OSError("broken")))
+    bench.policy("board_photo", 10.0, 2, ("TimeoutError",))
+    assert bench.run().outcome is Outcome.FAULTED
+    assert bench.log.count("board_photo") == 1
+
+
+def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = lambda error: bench.log.append(f"recover: {error}")
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    start = bench.log.index("laser_sweep")
+    assert bench.log[start : start + 4] == [
+        "laser_sweep", "stop: fault in laser_sweep", "recover: protective stop", "laser_sweep",
+    ]  # fmt: skip
+    changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
+    assert changes[3:6] == [
+        ("laser_sweep", "faulted"), ("faulted", "recovering"), ("recovering", "laser_sweep"),
+    ]  # fmt: skip
+
+
+def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
+    def recover(error):
+        raise OSError("the link is gone")
+
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = recover
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "protective stop" in result.reason
+    assert "the link is gone" in result.reason
+
+
+def test_a_step_whose_policy_is_to_stop_is_not_recovered(tmp_path):
+    bench = Bench(tmp_path, place=failing(ConnectionError("protective stop")))
+    bench.policy("place", 10.0, 1, on_failure=OnFailure.STOP)
+    bench.runner.recover = lambda error: bench.log.append("recover")
+    assert bench.run().outcome is Outcome.FAULTED
+    assert "recover" not in bench.log
+
+
+def test_a_step_that_overruns_is_stopped_and_named(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
+    bench.policy("laser_sweep", 0.05)
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "laser_sweep did not end within its deadline" in result.reason
+    assert result.code == "step.deadline"
+
+
+def test_an_overrun_can_be_retried(tmp_path):
+    def work(context):
+        if context.attempt == 1:
+            while True:
+                context.check()
+        return
+
+    bench = Bench(tmp_path, laser_sweep=work).policy("laser_sweep", 0.05, 1, ("StepOverrun",))
+    assert bench.run().outcome is Outcome.PLACED
+
+
+def test_a_step_that_does_not_end_even_after_the_stop_is_left_behind_and_not_repeated(tmp_path):
+    release = threading.Event()
+    bench = Bench(tmp_path, laser_sweep=lambda context: release.wait(20))
+    bench.policy("laser_sweep", 0.05, 3, ("StepOverrun",))
+    bench.runner.policy = Policy(bench.runner.policy.steps, grace_s=0.1)
+    result = bench.run()
+    release.set()
+    assert result.outcome is Outcome.FAULTED
+    assert "still busy 0.1 s after the stop" in result.reason
+    assert bench.log.count("laser_sweep") == 1
+
+
+def test_a_computing_step_has_its_deadline_on_the_wall(tmp_path):
+    left = {}
+    bench = Bench(
+        tmp_path,
+        laser_sweep=lambda context: left.update(moving=context.remaining()),
+        reconstruct=lambda context: left.update(computing=context.remaining()),
+    )
+    bench.runner.clock = Clock(rate=10)
+    bench.policy("laser_sweep", 60.0).policy("reconstruct", 60.0, on_wall=True)
+    bench.run()
+    assert left["moving"] == pytest.approx(60, abs=10)
+    assert left["computing"] == pytest.approx(600, abs=10)
+
+
+def test_an_abort_from_another_thread_stops_the_moving_step(tmp_path):
+    def work(context):
+        bench.runner.abort("the operator has seen enough")
+        assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
+        raise OSError("the motion was stopped")
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    result = bench.run()
+    assert result.outcome is Outcome.ABORTED
+    assert result.reason == "the operator has seen enough"
+    assert "reconstruct" not in bench.log
+
+
+def test_another_process_can_abort_through_the_journal(tmp_path):
+    def work(context):
+        request(tmp_path, "abort", "cell abort")
+        bench.stopped.wait(5)
+
+    bench = Bench(tmp_path, board_photo=work)
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.ABORTED, "cell abort")
+
+
+def test_a_paused_run_waits_before_its_next_step_and_goes_on(tmp_path):
+    def observe(event):
+        if event.kind == "state" and event.data["to"] == "paused":
+            bench.log.append("paused")
+            request(tmp_path, "resume", "")
+
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.pause())
+    bench.runner.observer = observe
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.log[:4] == ["drive_to_target", "board_photo", "paused", "laser_sweep"]
+
+
+def test_a_paused_run_can_be_aborted(tmp_path):
+    def observe(event):
+        if event.kind == "state" and event.data["to"] == "paused":
+            bench.runner.abort("enough")
+
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.pause())
+    bench.runner.observer = observe
+    assert bench.run().outcome is Outcome.ABORTED
+
+
+def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):
+    def work(context):
+        os.kill(os.getpid(), signal.SIGINT)
+        bench.stopped.wait(5)
+
+    def safe_stop(reason):
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+        bench.safe_stop(reason)
+
+    before = signal.getsignal(signal.SIGINT)
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.runner.safe_stop = safe_stop
+    result = bench.run()
+    assert result.outcome is Outcome.ABORTED
+    assert result.reason == "interrupted from the keyboard"
+    assert result.signal == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_safe_stop_that_fails_makes_the_run_faulted(tmp_path):
+    def safe_stop(reason):
+        bench.safe_stop(reason)
+        raise OSError("the laser is still on")
+
+    bench = Bench(tmp_path)
+    bench.runner.safe_stop = safe_stop
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "the laser is still on" in result.reason
+
+
+def test_a_resumed_run_does_only_what_is_open(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=lambda context: context.results["board_photo"] + "!")
+    result = bench.run(done={"drive_to_target": None, "board_photo": "stored"})
+    assert bench.log[0] == "laser_sweep"
+    assert result.results["laser_sweep"] == "stored!"
+    assert [record.state for record in result.steps[:3]] == ["resumed", "resumed", "done"]
+
+
+def test_a_journal_that_fails_ends_the_run_safe(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.runner.journal.close())
+    result = bench.runner.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "journal" in result.reason
+    assert bench.log[-1].startswith("stop: end of the run")
+    assert "reconstruct" not in bench.log
+
+
+def test_an_observer_that_fails_does_not_end_the_job(tmp_path):
+    def observe(event):
+        raise OSError("the terminal is gone")
+
+    bench = Bench(tmp_path)
+    bench.runner.observer = observe
+    assert bench.run().outcome is Outcome.PLACED
+    assert any(event.kind == "observer_failed" for event in bench.record.events)
+
+
+def test_progress_and_notes_reach_the_observer_and_only_notes_the_journal(tmp_path):
+    def work(context):
+        context.progress(0.5, "half")
+        context.note(lost_frames=2)
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.run()
+    told = [(event.kind, dict(event.data)) for event in bench.events if event.step == "laser_sweep"]
+    assert ("progress", {"fraction": 0.5, "text": "half"}) in told
+    assert ("note", {"lost_frames": 2}) in told
+    kinds = {event.kind for event in bench.record.events}
+    assert "note" in kinds
+    assert "progress" not in kinds
+
+
+def test_a_runner_without_work_for_a_step_is_refused(tmp_path):
+    bench = Bench(tmp_path)
+    with pytest.raises(ValueError, match="no work was given for place"):
+        Runner(
+            Sequence(), {name: print for name in NAMES if name != State.PLACE.value}, Policy(),
+            bench.runner.journal, Clock(), bench.classify, bench.safe_stop,
+        )  # fmt: skip
