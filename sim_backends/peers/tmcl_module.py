@@ -1,0 +1,293 @@
+"""A stepper module as seen through TMCL: axis and global parameters, motion commands, status codes.
+
+Modelled on the TMCM-1260 (velocities in pps). One request of nine bytes gives one reply; no transport here. The
+module's serial number stands in user variable 0 (bank 2), where it is written when a module is put into service.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+import threading
+from collections.abc import Callable
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.rail import RailModel, RailSettings
+
+OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED, NOT_AVAILABLE = 100, 1, 2, 3, 4, 5, 6
+MODEL = 1260
+SERIAL_BANK, SERIAL_VARIABLE = 2, 0
+
+_SETTINGS: dict[int, tuple[str, int, int]] = {
+    4: ("max_velocity", 0, 7_999_774),
+    5: ("max_acceleration", 0, 7_629_278),
+    12: ("right_stop", 0, 1),
+    13: ("left_stop", 0, 1),
+    26: ("soft_stop", 0, 1),
+    140: ("microsteps", 0, 8),
+    193: ("search_mode", 1, 8),
+    194: ("search_speed", 1, 7_999_774),
+    195: ("switch_speed", 1, 7_999_774),
+}
+"""Axis parameters that set the motion: number → (setting, smallest, largest value)."""
+
+_SEARCH_MODES = (1, 2, 5, 7)
+
+_PLAIN: dict[int, tuple[int, int, int]] = {
+    6: (128, 0, 255),
+    7: (8, 0, 255),
+    14: (0, 0, 1),
+    24: (0, 0, 1),
+    25: (0, 0, 1),
+    31: (0, 0, 65535),
+    153: (0, 0, 13),
+    154: (3, 0, 13),
+    181: (0, 0, 7_999_774),
+    204: (0, 0, 65535),
+    214: (200, 0, 65535),
+    251: (0, 0, 0),
+    254: (0, 0, 0),
+    255: (1, 1, 1),
+}
+"""Axis parameters that are only remembered: number → (value at power-on, smallest, largest value)."""
+
+_GLOBALS: dict[int, tuple[int, int, int]] = {
+    65: (0, 0, 11),
+    66: (1, 1, 255),
+    68: (0, 0, 65535),
+    69: (8, 2, 8),
+    70: (2, 0, 2047),
+    71: (1, 0, 2047),
+    73: (0, 0, 2**31 - 1),
+    75: (0, 0, 255),
+    76: (2, 0, 255),
+    77: (0, 0, 1),
+}
+"""Global parameters of bank 0: number → (value at power-on, smallest, largest value)."""
+
+_UNLOCK, _LOCK = 4321, 1234
+_USER_VARIABLES = 256
+_INPUTS = 4
+
+
+class Refused(Exception):
+    """A request is answered with the status code `status` instead of 100."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(f"TMCL status {status}")
+        self.status = status
+
+
+class TmclModule:
+    """One module with one axis; `handle` may be called from several threads."""
+
+    def __init__(self, rail: RailModel, clock: WorldClock) -> None:
+        self.rail = rail
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._axis = {number: value for number, (value, _, _) in _PLAIN.items()}
+        self._globals = {number: value for number, (value, _, _) in _GLOBALS.items()}
+        self._variables = [0] * _USER_VARIABLES
+        self._variables[SERIAL_VARIABLE] = rail.params.serial
+        self._stored: dict[int, int] = {}
+        self._outputs = [0, 0]
+        self._locked = False
+        self._commands: dict[int, Callable[[int, int, int], int]] = {
+            1: lambda kind, motor, value: self._rotate(kind, motor, value),
+            2: lambda kind, motor, value: self._rotate(kind, motor, -value),
+            3: lambda kind, motor, value: self._rotate(kind, motor, 0),
+            4: self._move,
+            5: self._set_axis,
+            6: self._get_axis,
+            7: self._store_axis,
+            8: self._restore_axis,
+            9: self._set_global,
+            10: self._get_global,
+            11: self._store_global,
+            12: self._get_global,
+            13: self._search,
+            14: self._set_output,
+            15: self._get_input,
+        }
+
+    def handle(self, request: bytes) -> bytes | None:
+        """The reply to nine bytes, or None when they are addressed to another module."""
+        address, command, kind, motor, value, checksum = struct.unpack(">BBBBiB", request)
+        with self._lock:
+            if sum(request[:8]) & 0xFF != checksum:
+                return self._reply(BAD_CHECKSUM, command, 0)
+            if address != self._globals[66]:
+                return None
+            if command == 136 and kind == 0:
+                major, minor = self.rail.params.firmware
+                return bytes([self._globals[76]]) + f"{MODEL:04d}V{major:01d}{minor:02d}".encode("ascii")
+            try:
+                return self._reply(OK, command, self._run(command, kind, motor, value))
+            except Refused as refusal:
+                return self._reply(refusal.status, command, 0)
+
+    def _reply(self, status: int, command: int, value: int) -> bytes:
+        body = struct.pack(">BBBBi", self._globals[76], self._globals[66], status, command, value)
+        return body + bytes([sum(body) & 0xFF])
+
+    def _run(self, command: int, kind: int, motor: int, value: int) -> int:
+        if command == 136:
+            if kind != 1:
+                raise Refused(BAD_TYPE)
+            major, minor = self.rail.params.firmware
+            return MODEL << 16 | major << 8 | minor
+        if command not in self._commands:
+            raise Refused(BAD_COMMAND)
+        if 1 <= command <= 8 or command == 13:
+            _check(motor, 0, 0)
+        return self._commands[command](kind, motor, value)
+
+    # --- motion ---
+
+    def _rotate(self, kind: int, motor: int, value: int) -> int:
+        _check(abs(value), 0, _SETTINGS[4][2])
+        self.rail.rotate(self._clock.now(), value)
+        return value
+
+    def _move(self, kind: int, motor: int, value: int) -> int:
+        if kind not in (0, 1):
+            raise Refused(BAD_TYPE)
+        t = self._clock.now()
+        target = value if kind == 0 else self._base(t) + value
+        _check(target, -(2**31), 2**31 - 1)
+        self.rail.move_to(t, target)
+        return target
+
+    def _base(self, t: float) -> int:
+        return self.rail.position(t) if self._axis.get(127, 0) else self.rail.target()
+
+    def _search(self, kind: int, motor: int, value: int) -> int:
+        t = self._clock.now()
+        if kind == 0:
+            self.rail.search(t)
+        elif kind == 1:
+            self.rail.stop_search(t)
+        elif kind == 2:
+            return int(self.rail.searching(t))
+        else:
+            raise Refused(BAD_TYPE)
+        return 0
+
+    # --- axis parameters ---
+
+    def _get_axis(self, kind: int, motor: int, value: int) -> int:
+        rail, t = self.rail, self._clock.now()
+        if kind in _SETTINGS:
+            setting = int(getattr(rail.settings, _SETTINGS[kind][0]))
+            return 1 - setting if kind in (12, 13) else setting
+        if kind in self._axis:
+            return self._axis[kind]
+        if kind == 207:
+            stalled = int(rail.stalled(t))
+            rail.clear_stall()
+            return stalled
+        readings: dict[int, Callable[[], int]] = {
+            0: rail.target,
+            1: lambda: rail.position(t),
+            2: rail.target_velocity,
+            3: lambda: rail.velocity(t),
+            8: lambda: int(rail.reached(t)),
+            9: lambda: int(rail.home_switch(t)),
+            10: lambda: int(rail.right_switch(t)),
+            11: lambda: int(rail.left_switch(t)),
+            29: lambda: rail.velocity(t),
+            196: rail.switch_distance,
+            202: lambda: rail.params.steps_per_turn,
+            206: lambda: 0,
+            208: lambda: int(rail.stalled(t)) | (int(rail.velocity(t) == 0) << 7),
+        }
+        if kind not in readings:
+            raise Refused(BAD_TYPE)
+        return readings[kind]()
+
+    def _set_axis(self, kind: int, motor: int, value: int) -> int:
+        t = self._clock.now()
+        if kind in _SETTINGS:
+            name, low, high = _SETTINGS[kind]
+            _check(value, low, high)
+            if kind == 193 and value not in _SEARCH_MODES:
+                raise Refused(BAD_VALUE)
+            setting = type(getattr(RailSettings, name))(1 - value if kind in (12, 13) else value)
+            self.rail.configure(t, dataclasses.replace(self.rail.settings, **{name: setting}))
+        elif kind in _PLAIN:
+            _check(value, *_PLAIN[kind][1:])
+            self._axis[kind] = value
+        elif kind == 0:
+            self.rail.move_to(t, value)
+        elif kind == 1:
+            self.rail.set_position(t, value)
+        elif kind == 2:
+            self._rotate(0, motor, value)
+        else:
+            raise Refused(BAD_TYPE)
+        return value
+
+    def _store_axis(self, kind: int, motor: int, value: int) -> int:
+        if self._locked:
+            raise Refused(LOCKED)
+        if kind not in _SETTINGS and kind not in _PLAIN:
+            raise Refused(BAD_TYPE)
+        self._stored[kind] = self._get_axis(kind, motor, 0)
+        return self._stored[kind]
+
+    def _restore_axis(self, kind: int, motor: int, value: int) -> int:
+        if kind not in self._stored:
+            raise Refused(BAD_TYPE)
+        return self._set_axis(kind, motor, self._stored[kind])
+
+    # --- global parameters ---
+
+    def _get_global(self, kind: int, bank: int, value: int) -> int:
+        if bank == 0 and kind in self._globals:
+            return self._globals[kind]
+        if bank == 0 and kind == 132:
+            return int(self._clock.now() * 1000.0) & 0x7FFFFFFF
+        if bank == 2:
+            return self._variables[kind]
+        raise Refused(BAD_TYPE if bank == 0 else BAD_VALUE)
+
+    def _set_global(self, kind: int, bank: int, value: int) -> int:
+        if bank == 2:
+            self._variables[kind] = value
+        elif bank == 0 and kind in self._globals:
+            _check(value, *_GLOBALS[kind][1:])
+            self._globals[kind] = value
+            if kind == 73 and value in (_LOCK, _UNLOCK):
+                self._locked = value == _LOCK
+        else:
+            raise Refused(BAD_TYPE if bank == 0 else BAD_VALUE)
+        return value
+
+    def _store_global(self, kind: int, bank: int, value: int) -> int:
+        if self._locked:
+            raise Refused(LOCKED)
+        return self._get_global(kind, bank, 0)
+
+    # --- inputs and outputs ---
+
+    def _set_output(self, kind: int, bank: int, value: int) -> int:
+        _check(bank, 2, 2)
+        if kind >= len(self._outputs):
+            raise Refused(BAD_TYPE)
+        _check(value, 0, 1)
+        self._outputs[kind] = value
+        return value
+
+    def _get_input(self, kind: int, bank: int, value: int) -> int:
+        if bank == 0 and kind < _INPUTS:
+            return 0
+        if bank == 1 and kind in (0, 8, 9):
+            return {0: 0, 8: 240, 9: 31}[kind]
+        if bank == 2 and kind < len(self._outputs):
+            return self._outputs[kind]
+        raise Refused(BAD_TYPE if bank in (0, 1, 2) else BAD_VALUE)
+
+
+def _check(value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise Refused(BAD_VALUE)
