@@ -1,1 +1,1 @@
-"""Placeholder."""
+"""Kinematics, collisions, trajectories and paths of the arm."""

@@ -1,0 +1,107 @@
+"""The solids that must not touch: capsules of the arm, boxes of the tool, the part, the vehicle and the station.
+
+Each body hangs on the arm's base (fixed), on one of the six joints or on the flange. Sizes are generous on purpose;
+poses come from the configuration, the job and the measured pose of the board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+BASE = 0
+"""Parent of what stands still: poses are in the arm's base frame."""
+FLANGE = 7
+"""Parent of what the flange carries: poses are in the flange frame. 1 … 6 are the frames that turn with a joint."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A box (`size` x, y, z) or, when `radius` is given, a capsule along its z axis with a core of length `size[2]`."""
+
+    name: str
+    parent: int
+    placement: pin.SE3
+    size: tuple[float, float, float]
+    radius: float | None = None
+
+
+def box(name: str, parent: int, placement: pin.SE3, size: Sequence[float]) -> Body:
+    """A box centred at `placement` with edge lengths `size` (3), m."""
+    if len(size) != 3 or not all(s > 0 for s in size):
+        raise ValueError(f"size of the box {name!r} is {tuple(size)} m; three lengths greater than 0 are needed")
+    return Body(name, parent, placement, (float(size[0]), float(size[1]), float(size[2])))
+
+
+def block(name: str, parent: int, low: Sequence[float], high: Sequence[float]) -> Body:
+    """A box with edges along its parent's axes from corner `low` to corner `high` (3), m."""
+    lower, upper = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    return box(name, parent, pin.SE3(np.eye(3), (lower + upper) / 2), [float(v) for v in upper - lower])
+
+
+def capsule(name: str, parent: int, start: Sequence[float], end: Sequence[float], radius: float) -> Body:
+    """A capsule around the segment from `start` to `end` (3), m."""
+    p, q = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    length = float(np.linalg.norm(q - p))
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (q - p) / length)
+    return Body(name, parent, pin.SE3(turn.toRotationMatrix(), (p + q) / 2), (0.0, 0.0, length), radius)
+
+
+def arm_bodies() -> list[Body]:
+    """Capsules around the links of a UR10e, in the frames that turn with its joints (z along the joint's axis)."""
+    return [
+        capsule("base", BASE, (0, 0, 0.08), (0, 0, 0.17), 0.08),
+        capsule("shoulder", 1, (0, 0, 0.17), (0, -0.12, 0.18), 0.08),
+        capsule("upper arm", 2, (0, 0, 0.176), (-0.6127, 0, 0.176), 0.075),
+        capsule("elbow", 3, (0, 0, 0.06), (0, 0, 0.16), 0.065),
+        capsule("forearm", 3, (0, 0, 0.042), (-0.5716, 0, 0.042), 0.06),
+        capsule("wrist 1", 4, (0, 0, 0.05), (0, 0, 0.16), 0.05),
+        capsule("wrist 2", 5, (0, 0, 0), (0, 0, 0.11), 0.05),
+        capsule("wrist 3", 6, (0, 0, 0.03), (0, 0, 0.07), 0.045),
+    ]
+
+
+def tool_bodies(part_size: Sequence[float] | None = None, flange_from_part: pin.SE3 | None = None) -> list[Body]:
+    """Claw, rail with the scan head over its whole travel, target camera, and the part when it is held.
+
+    The part's frame has its origin in the mating face, z into the part; `part_size` is its extent along its x, y, z.
+    """
+    bodies = [
+        block("claw", FLANGE, (-0.03, -0.03, 0.0), (0.03, 0.03, 0.145)),
+        block("scan head", FLANGE, (0.065, -0.11, 0.02), (0.115, 0.08, 0.09)),
+        block("target camera", FLANGE, (-0.125, -0.025, -0.03), (-0.075, 0.025, 0.05)),
+    ]
+    if part_size is not None:
+        x, y, z = part_size
+        placement = (flange_from_part or pin.SE3.Identity()) * pin.SE3(np.eye(3), np.array([0.0, 0.0, z / 2]))
+        bodies.append(box("part", FLANGE, placement, (x, y, z)))
+    return bodies
+
+
+def vehicle_bodies(plates: Sequence[tuple[str, pin.SE3, Sequence[float]]] = ()) -> list[Body]:
+    """The vehicle's deck below the arm and the calibration plates on it: name, base_from_centre, size (x, y, z)."""
+    deck = block("deck", BASE, (-0.80, -0.40, -0.30), (0.20, 0.40, -0.005))
+    return [deck, *(box(name, BASE, pose, size) for name, pose, size in plates)]
+
+
+def station_bodies(
+    base_from_place: pin.SE3, place_from_board_centre: pin.SE3, surface_size: Sequence[float] = (0.070, 0.036, 0.015)
+) -> list[Body]:
+    """Table, nominal surface, board and its post, placed by the measured pose of the place frame in the arm base."""
+
+    def placed(name: str, low: Sequence[float], high: Sequence[float]) -> Body:
+        local = block(name, BASE, low, high)
+        return box(name, BASE, base_from_place * local.placement, local.size)
+
+    x, y, z = surface_size
+    cx, cy, cz = place_from_board_centre.translation
+    board = base_from_place * place_from_board_centre * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.006]))
+    return [
+        placed("table", (-0.35, -0.50, -0.60), (0.45, 0.50, -0.002)),
+        placed("surface", (-x / 2, -y / 2, -0.002), (x / 2, y / 2, z)),
+        placed("board post", (cx, cy - 0.02, -0.002), (cx + 0.04, cy + 0.02, cz)),
+        box("board", BASE, board, (0.21, 0.17, 0.01)),
+    ]

@@ -1,0 +1,211 @@
+"""Forward and inverse kinematics of the six-axis arm.
+
+The model is built in code from the maker's Denavit–Hartenberg table; the closed form of an arm with three parallel
+axes lists the branches, and Gauss–Newton on Pinocchio's model makes each of them exact. Collisions and time are not
+known here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from drivers.errors import RefusedError
+
+Joints = NDArray[np.float64]
+"""Joint angles of shape (6,), rad."""
+
+TURN = 2.0 * np.pi
+
+
+class Unreachable(RefusedError):
+    """No joint angles within the limits bring the flange to the pose; the text says how far it stays away."""
+
+
+@dataclass(frozen=True)
+class DenavitHartenberg:
+    """Table of an arm, one entry per joint: d and a in m, alpha in rad. Default: UR10e (protocol sheet, part 5)."""
+
+    d: tuple[float, ...] = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)
+    a: tuple[float, ...] = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)
+    alpha: tuple[float, ...] = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+
+    def link(self, joint: int) -> pin.SE3:
+        """Transformation from the frame that turns with joint 0 … 5 to the next joint's frame (the flange for 5)."""
+        rotation = pin.utils.rotate("x", self.alpha[joint])
+        return pin.SE3(rotation, np.array([self.a[joint], 0.0, self.d[joint]]))
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Ranges in rad, speeds in rad/s, accelerations in rad/s², jerks in rad/s³, each for six joints."""
+
+    lower: tuple[float, ...] = (-TURN, -TURN, -np.pi, -TURN, -TURN, -TURN)
+    upper: tuple[float, ...] = (TURN, TURN, np.pi, TURN, TURN, TURN)
+    speed: tuple[float, ...] = (1.6, 1.6, 2.0, 2.6, 2.6, 2.6)
+    acceleration: tuple[float, ...] = (3.0, 3.0, 4.0, 6.0, 6.0, 6.0)
+    jerk: tuple[float, ...] = (20.0, 20.0, 25.0, 40.0, 40.0, 40.0)
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration", "jerk"):
+            values = getattr(self, name)
+            if len(values) != 6 or not all(0.0 < v < np.inf for v in values):
+                raise ValueError(f"joint {name} limits {values} must be six finite values greater than 0")
+        if len(self.lower) != 6 or len(self.upper) != 6 or not all(np.less(self.lower, self.upper)):
+            raise ValueError(f"joint ranges {self.lower} … {self.upper} rad must be six pairs with lower < upper")
+
+    def inside(self, joints: Joints) -> bool:
+        """True when every angle lies in its range."""
+        return bool(np.all(joints >= self.lower) and np.all(joints <= self.upper))
+
+    def scaled(self, fraction: float) -> JointLimits:
+        """The same ranges at a fraction (0 … 1] of the speed; times stretch by 1/fraction."""
+        if not 0.0 < fraction <= 1.0:
+            raise ValueError(f"speed fraction {fraction} must lie in (0, 1]")
+        powers = {"speed": 1, "acceleration": 2, "jerk": 3}
+        slower = {name: tuple(v * fraction**p for v in getattr(self, name)) for name, p in powers.items()}
+        return JointLimits(self.lower, self.upper, **slower)
+
+
+class ArmKinematics:
+    """The arm from its base to its flange. An instance holds work space: use one per thread."""
+
+    def __init__(self, table: DenavitHartenberg | None = None, limits: JointLimits | None = None) -> None:
+        self.table = table or DenavitHartenberg()
+        self.limits = limits or JointLimits()
+        self.model = pin.Model()
+        parent, placement = 0, pin.SE3.Identity()
+        for joint in range(6):
+            parent = self.model.addJoint(parent, pin.JointModelRZ(), placement, f"joint_{joint + 1}")
+            placement = self.table.link(joint)
+        self.joint6_from_flange = placement
+        self._flange = self.model.addFrame(pin.Frame("flange", parent, placement, pin.FrameType.OP_FRAME))
+        self._data = self.model.createData()
+
+    def fk(self, joints: Joints) -> pin.SE3:
+        """base_from_flange at the joint angles (6,), rad."""
+        pin.forwardKinematics(self.model, self._data, np.asarray(joints, dtype=np.float64))
+        return pin.updateFramePlacement(self.model, self._data, self._flange).copy()
+
+    def jacobian(self, joints: Joints) -> NDArray[np.float64]:
+        """(6, 6) flange velocity (linear, then angular, in flange axes) per joint speed."""
+        jacobian: NDArray[np.float64] = pin.computeFrameJacobian(
+            self.model, self._data, np.asarray(joints, dtype=np.float64), self._flange, pin.ReferenceFrame.LOCAL
+        )
+        return jacobian
+
+    def refine(self, base_from_flange: pin.SE3, seed: Joints, steps: int = 40) -> tuple[Joints, float]:
+        """Damped Gauss–Newton from `seed`: the angles found and the remaining error (m, with 1 rad taken as 1 m)."""
+        joints = np.array(seed, dtype=np.float64)
+        error = _error(self.fk(joints), base_from_flange)
+        damping = 1e-8
+        for _ in range(steps):
+            if np.linalg.norm(error) < 1e-11:
+                break
+            jacobian = self.jacobian(joints)
+            step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(6), jacobian.T @ error)
+            trial = joints + step * min(1.0, 0.5 / max(1e-12, float(np.abs(step).max())))
+            trial_error = _error(self.fk(trial), base_from_flange)
+            if trial_error @ trial_error < error @ error:
+                joints, error, damping = trial, trial_error, max(damping / 10, 1e-12)
+            else:
+                damping *= 20
+            if damping > 1e3:
+                break
+        return joints, float(np.linalg.norm(error))
+
+    def solutions(self, base_from_flange: pin.SE3, seed: Joints) -> list[Joints]:
+        """All branches within the limits, each turned by whole turns next to `seed`, the nearest to `seed` first."""
+        found: list[Joints] = []
+        for start in [np.asarray(seed, dtype=np.float64), *self._branches(base_from_flange, seed)]:
+            joints, error = self.refine(base_from_flange, start)
+            joints = self._unwound(joints, seed)
+            if (
+                error < 1e-7
+                and self.limits.inside(joints)
+                and not any(np.allclose(joints, f, atol=1e-4) for f in found)
+            ):
+                found.append(joints)
+        return sorted(found, key=lambda q: float(np.sum((q - seed) ** 2)))
+
+    def ik(self, base_from_flange: pin.SE3, seed: Joints) -> Joints:
+        """The joint angles nearest to `seed` that reach the pose; `Unreachable` when there are none."""
+        found = self.solutions(base_from_flange, seed)
+        if found:
+            return found[0]
+        starts = [np.asarray(seed, dtype=np.float64), *self._branches(base_from_flange, seed)]
+        best, _ = min((self.refine(base_from_flange, s) for s in starts), key=lambda pair: pair[1])
+        gap = _error(self.fk(best), base_from_flange)
+        x, y, z = base_from_flange.translation
+        why = "the joint limits are in the way" if np.linalg.norm(gap) < 1e-6 else "it is out of reach"
+        raise Unreachable(
+            f"flange pose ({x:.3f}, {y:.3f}, {z:.3f}) m in the arm base cannot be reached: {why}; the nearest pose "
+            f"found stays {1e3 * float(np.linalg.norm(gap[:3])):.1f} mm and "
+            f"{np.degrees(np.linalg.norm(gap[3:])):.2f} deg away. "
+            "Bring the vehicle nearer or change the pose in the job"
+        )
+
+    def track(self, base_from_flange: pin.SE3, previous: Joints) -> Joints:
+        """The angles on the same branch as `previous`, for a pose close by; `Unreachable` when it cannot follow."""
+        joints, error = self.refine(base_from_flange, previous, steps=15)
+        if error > 1e-7 or not self.limits.inside(joints):
+            x, y, z = base_from_flange.translation
+            raise Unreachable(
+                f"the arm cannot follow the line past ({x:.3f}, {y:.3f}, {z:.3f}) m: "
+                "its reach or a joint limit ends there"
+            )
+        return joints
+
+    def manipulability(self, joints: Joints) -> float:
+        """Smallest singular value of the Jacobian, with 1 m taken as 1 rad; 0 in a singularity."""
+        return float(np.linalg.svd(self.jacobian(joints), compute_uv=False)[-1])
+
+    def _unwound(self, joints: Joints, seed: Joints) -> Joints:
+        lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
+        near = joints + TURN * np.round((np.asarray(seed) - joints) / TURN)
+        near = np.where(near > upper, near - TURN, near)
+        return np.where(near < lower, near + TURN, near)
+
+    def _branches(self, base_from_flange: pin.SE3, seed: Joints) -> list[Joints]:
+        """Up to eight closed-form solutions for three parallel axes; out of reach they end at the nearest stretch."""
+        d, a, table = self.table.d, self.table.a, self.table
+        rotation = base_from_flange.rotation
+        wrist = base_from_flange.translation - d[5] * rotation[:, 2]
+        reach = float(np.hypot(wrist[0], wrist[1]))
+        swing = np.arccos(np.clip(d[3] / max(reach, 1e-9), -1.0, 1.0))
+        found = []
+        for shoulder, flip, elbow in product((1.0, -1.0), repeat=3):
+            q1 = np.arctan2(wrist[1], wrist[0]) + shoulder * swing + np.pi / 2
+            s1, c1 = np.sin(q1), np.cos(q1)
+            x, y, _ = base_from_flange.translation
+            q5 = flip * np.arccos(np.clip((x * s1 - y * c1 - d[3]) / d[5], -1.0, 1.0))
+            s5 = np.sin(q5)
+            q6 = float(seed[5])
+            if abs(s5) > 1e-6:
+                q6 = np.arctan2(
+                    (-rotation[0, 1] * s1 + rotation[1, 1] * c1) / s5, (rotation[0, 0] * s1 - rotation[1, 0] * c1) / s5
+                )
+            last = _turn(q5) * table.link(4) * _turn(q6) * table.link(5)
+            first = _turn(q1) * table.link(0)
+            middle = first.inverse() * base_from_flange * last.inverse() * table.link(3).inverse()
+            px, py = middle.translation[:2]
+            span = max(float(np.hypot(px, py)), 1e-9)
+            cosine = np.clip((span**2 - a[1] ** 2 - a[2] ** 2) / (2 * a[1] * a[2]), -1.0, 1.0)
+            q3 = elbow * np.arccos(cosine)
+            q2 = np.arctan2(py, px) - np.arctan2(a[2] * np.sin(q3), a[1] + a[2] * np.cos(q3))
+            q4 = np.arctan2(middle.rotation[1, 0], middle.rotation[0, 0]) - q2 - q3
+            found.append(np.array([q1, q2, q3, q4, q5, q6]))
+        return found
+
+
+def _turn(angle: float) -> pin.SE3:
+    return pin.SE3(pin.utils.rotate("z", angle), np.zeros(3))
+
+
+def _error(pose: pin.SE3, target: pin.SE3) -> NDArray[np.float64]:
+    error: NDArray[np.float64] = pin.log6(pose.actInv(target)).vector
+    return error

@@ -1,0 +1,275 @@
+"""The arm reaches what it should, touches nothing it must not, and moves within its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.motion import bodies
+from cell.motion.collision import CollisionError, CollisionModel
+from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints, Unreachable
+from cell.motion.planning import Planner
+from cell.motion.trajectory import LineLimits, SingularLine, Trajectory, join, plan_joint, plan_line
+from drivers.errors import RefusedError
+
+WORKING = np.array([2.8, -1.25, 2.0, -2.3, -1.57, 2.8])
+"""Posture over the placement area: tool down, elbow up."""
+DOWN = np.column_stack([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Rotation of a tool that points down with its y axis along the base's x axis."""
+BASE_FROM_PLACE = pin.SE3(np.eye(3), np.array([0.75, 0.0, 0.05]))
+_C = np.sqrt(0.5)
+PLACE_FROM_BOARD_CENTRE = pin.SE3(
+    np.column_stack([[0.0, -1.0, 0.0], [-_C, 0.0, -_C], [_C, 0.0, -_C]]), np.array([0.10, 0.32, 0.12])
+)
+FLANGE_FROM_PART = pin.SE3(DOWN, np.array([0.0, 0.0, 0.17]))
+FLANGE_FROM_TARGET = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([-0.10, 0.0, 0.03]))
+FLANGE_FROM_SCAN_MIDDLE = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([0.09, 0.0, 0.08]))
+RESTING = [("part", "surface"), ("part", "table")]
+
+
+def down(x: float, y: float, z: float) -> pin.SE3:
+    return pin.SE3(DOWN, np.array([x, y, z]))
+
+
+def independent_fk(joints: Joints) -> np.ndarray:
+    """The maker's table multiplied out with plain matrices, without Pinocchio."""
+    table, pose = DenavitHartenberg(), np.eye(4)
+    for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
+        c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+        pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+    return pose
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmKinematics:
+    return ArmKinematics()
+
+
+@pytest.fixture(scope="module")
+def planner(arm: ArmKinematics) -> Planner:
+    solids = bodies.arm_bodies() + bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
+    face_up = np.diag([1.0, -1.0, -1.0])
+    plates = [
+        ("fine plate", pin.SE3(face_up, np.array([-0.55, 0.25, 0.01])), (0.042, 0.036, 0.02)),
+        ("large plate", pin.SE3(face_up, np.array([-0.60, -0.25, 0.01])), (0.21, 0.17, 0.02)),
+    ]
+    solids += bodies.vehicle_bodies(plates) + bodies.station_bodies(BASE_FROM_PLACE, PLACE_FROM_BOARD_CENTRE)
+    return Planner(arm, CollisionModel(arm, solids))
+
+
+# --- kinematics ---
+
+
+def test_forward_kinematics_is_the_makers_table(arm: ArmKinematics) -> None:
+    rng = np.random.default_rng(1)
+    for joints in rng.uniform(-np.pi, np.pi, (50, 6)):
+        assert np.allclose(arm.fk(joints).homogeneous, independent_fk(joints), atol=1e-12)
+
+
+def test_every_reachable_pose_is_reached_exactly_and_on_the_branch_asked_for(arm: ArmKinematics) -> None:
+    rng = np.random.default_rng(2)
+    for joints in rng.uniform(-2.9, 2.9, (60, 6)):
+        pose = arm.fk(joints)
+        near = arm.ik(pose, joints + rng.normal(0, 0.02, 6))
+        assert np.allclose(independent_fk(near), pose.homogeneous, atol=1e-9)
+        if arm.manipulability(joints) > 0.05:
+            assert np.allclose(near, joints, atol=1e-6)
+
+
+def test_all_eight_branches_over_the_placement_area_are_found(arm: ArmKinematics) -> None:
+    found = arm.solutions(down(0.75, 0.0, 0.22), WORKING)
+    assert len(found) == 8
+    assert [float(np.sum((q - WORKING) ** 2)) for q in found] == sorted(
+        float(np.sum((q - WORKING) ** 2)) for q in found
+    )
+
+
+def test_an_arm_whose_links_deviate_from_the_table_is_still_solved_exactly() -> None:
+    table = DenavitHartenberg()
+    off = DenavitHartenberg(
+        d=(0.1812, 0.0003, -0.0002, 0.1738, 0.1201, 0.1163),
+        a=(0.0002, -0.6131, -0.5711, 0.0003, 0.0, 0.0),
+        alpha=(table.alpha[0] + 5e-4, 3e-4, -4e-4, table.alpha[3] - 6e-4, table.alpha[4] + 2e-4, 0.0),
+    )
+    arm = ArmKinematics(off)
+    pose = down(0.75, 0.1, 0.25)
+    assert np.linalg.norm(pin.log6(arm.fk(arm.ik(pose, WORKING)).actInv(pose)).vector) < 1e-7
+
+
+def test_a_pose_out_of_reach_is_refused_with_the_distance(arm: ArmKinematics) -> None:
+    with pytest.raises(Unreachable, match=r"out of reach.*stays \d{2,4}\.\d mm"):
+        arm.ik(down(1.9, 0.0, 0.3), WORKING)
+
+
+def test_joint_ranges_are_kept(arm: ArmKinematics) -> None:
+    tight = ArmKinematics(limits=JointLimits(lower=(-np.pi,) * 6, upper=(np.pi,) * 6))
+    for joints in tight.solutions(down(0.75, 0.0, 0.22), np.full(6, 3.1)):
+        assert np.all(np.abs(joints) <= np.pi)
+
+
+@pytest.mark.parametrize("bad", [{"speed": (0.0,) * 6}, {"jerk": (1.0,) * 5}, {"lower": (7.0,) * 6}])
+def test_limits_that_make_no_sense_are_refused(bad: dict[str, tuple[float, ...]]) -> None:
+    with pytest.raises(ValueError, match="joint"):
+        JointLimits(**bad)
+
+
+# --- the cell's layout ---
+
+
+def test_scan_place_and_photo_postures_are_free(planner: Planner) -> None:
+    board = BASE_FROM_PLACE * PLACE_FROM_BOARD_CENTRE
+    photo = pin.SE3(board.rotation, board.translation - 0.95 * board.rotation[:, 2]) * FLANGE_FROM_TARGET.inverse()
+    for name, pose in {"scan": down(0.75, -0.09, 0.26), "above": down(0.75, 0, 0.30), "photo": photo}.items():
+        joints = planner.reach(pose, WORKING, name)
+        assert planner.kinematics.manipulability(joints) > 0.1
+
+
+def test_calibration_postures_over_the_fine_plate_are_free(planner: Planner) -> None:
+    face_up = np.diag([1.0, -1.0, -1.0])
+    for tilt_x, tilt_y in [(0, 0), (20, 0), (-20, 0), (0, 20), (0, -20)]:
+        tilt = pin.utils.rotate("x", np.radians(tilt_x)) @ pin.utils.rotate("y", np.radians(tilt_y))
+        rotation = face_up @ tilt
+        camera = pin.SE3(rotation, np.array([-0.55, 0.25, 0.02]) - 0.13 * rotation[:, 2])
+        planner.reach(camera * FLANGE_FROM_SCAN_MIDDLE.inverse(), WORKING, f"tilt {tilt_x}, {tilt_y}")
+
+
+def test_a_posture_in_the_table_names_what_touches(planner: Planner) -> None:
+    with pytest.raises(CollisionError, match=r"deep: .*table"):
+        planner.reach(down(0.75, 0.2, 0.10), WORKING, "deep")
+
+
+def test_the_part_may_touch_the_surface_only_where_allowed(planner: Planner) -> None:
+    resting = planner.kinematics.ik(down(0.75, 0.0, 0.222), WORKING)
+    assert ("part", "surface") in planner.collisions.touching(resting)
+    assert planner.collisions.touching(resting, RESTING) == []
+
+
+def test_distance_to_the_table_is_the_height_above_it(planner: Planner) -> None:
+    joints = planner.kinematics.ik(down(0.75, -0.3, 0.05 + 0.17 + 0.012), WORKING)
+    distance, pair = planner.collisions.distance(joints)
+    assert set(pair) == {"part", "table"}
+    assert distance == pytest.approx(0.014, abs=1e-6)
+
+
+# --- trajectories ---
+
+
+def assert_within(trajectory: Trajectory, limits: JointLimits) -> None:
+    """Finite differences of the samples against the limits."""
+    dt = np.diff(trajectory.times)[:, None]
+    speed = np.diff(trajectory.joints, axis=0) / dt
+    acceleration = np.diff(speed, axis=0) / dt[1:]
+    jerk = np.diff(acceleration, axis=0) / dt[2:]
+    for name, values in {"speed": speed, "acceleration": acceleration, "jerk": jerk}.items():
+        assert np.all(np.abs(values).max(axis=0) <= np.array(getattr(limits, name)) * 1.001), name
+
+
+def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
+    limits, start, end = JointLimits(), np.zeros(6), np.array([1.5, -1.0, 0.5, -2.0, 0.1, 0.0])
+    motion = plan_joint(start, end, limits, period=0.002)
+    assert_within(motion, limits)
+    assert np.array_equal(motion.start, start)
+    assert np.array_equal(motion.end, end)
+    assert np.abs(motion.speeds()[[0, -1]]).max() < 1e-3
+
+
+def test_half_the_speed_takes_twice_as_long() -> None:
+    end = np.array([2.0, 0, 0, 0, 0, 0])
+    full, half = (plan_joint(np.zeros(6), end, JointLimits().scaled(f)).duration for f in (1.0, 0.5))
+    assert half == pytest.approx(2 * full, rel=1e-6)
+
+
+def test_a_move_to_where_the_arm_stands_is_a_motion_of_one_period() -> None:
+    motion = plan_joint(WORKING, WORKING, JointLimits())
+    assert motion.duration > 0
+    assert np.array_equal(motion.start, motion.end)
+
+
+def test_a_joint_move_out_of_range_is_refused() -> None:
+    with pytest.raises(RefusedError, match="outside the ranges"):
+        plan_joint(np.zeros(6), np.array([0, 0, 4.0, 0, 0, 0]), JointLimits())
+
+
+def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
+    start = arm.ik(down(0.70, -0.1, 0.35), WORKING)
+    a = arm.fk(start)
+    b = pin.SE3(DOWN @ pin.utils.rotate("z", 0.3), np.array([0.80, 0.10, 0.25]))
+    motion = plan_line(arm, start, b, LineLimits(speed=0.2))
+    way = b.translation - a.translation
+    for joints in motion.joints[::5]:
+        pose = independent_fk(joints)
+        s = float((pose[:3, 3] - a.translation) @ way / (way @ way))
+        assert np.linalg.norm(pose[:3, 3] - a.translation - s * way) < 1e-8
+        assert np.linalg.norm(pin.log3(a.rotation.T @ pose[:3, :3])) == pytest.approx(0.3 * s, abs=1e-6)
+    flange = np.array([independent_fk(q)[:3, 3] for q in motion.joints])
+    assert np.linalg.norm(np.diff(flange, axis=0), axis=1).max() / 0.008 <= 0.2 * 1.001
+    assert np.all(np.abs(motion.speeds()) <= np.array(arm.limits.speed))
+
+
+def test_a_line_through_a_singular_posture_is_refused(arm: ArmKinematics) -> None:
+    start = np.array([0.0, -1.2, 1.8, -2.1, -0.3, 0.0])
+    end = np.array([0.0, -1.2, 1.8, -2.1, 0.3, 0.0])
+    with pytest.raises((SingularLine, Unreachable)):
+        plan_line(arm, start, arm.fk(end))
+
+
+def test_motions_join_only_where_they_meet() -> None:
+    a = plan_joint(np.zeros(6), np.full(6, 0.1), JointLimits())
+    b = plan_joint(np.full(6, 0.1), np.full(6, -0.1), JointLimits())
+    both = join([a, b])
+    assert both.duration == pytest.approx(a.duration + b.duration)
+    assert np.all(np.diff(both.times) > 0)
+    with pytest.raises(ValueError, match="starts"):
+        join([b, b])
+
+
+# --- planning ---
+
+
+def test_the_job_is_planned_without_touching_anything(planner: Planner) -> None:
+    scan = planner.reach(down(0.75, -0.09, 0.26), WORKING, "scan")
+    above = planner.reach(down(0.75, 0.0, 0.27), scan, "above the place")
+    for motion in (planner.free(scan, above), planner.line(above, down(0.75, 0, 0.221), LineLimits(0.04), RESTING)):
+        assert all(planner.collisions.free(q, RESTING) for q in motion.joints)
+    with pytest.raises(CollisionError, match="part and surface"):
+        planner.line(above, down(0.75, 0, 0.221), LineLimits(0.04))
+
+
+def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
+    wall = bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
+    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), wall])
+    planner = Planner(arm, model)
+    left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
+    assert not all(model.free(q) for q in plan_joint(left, right, arm.limits).joints)
+    motion = planner.free(left, right)
+    assert all(model.free(q) for q in motion.joints)
+    assert_within(motion, arm.limits)
+    again = planner.free(left, right)
+    assert np.array_equal(motion.joints, again.joints)
+
+
+def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics) -> None:
+    solids = [
+        bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45)),
+        bodies.block("roof", bodies.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80)),
+    ]
+    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), *solids])
+    planner = Planner(arm, model)
+    left, right = (planner.reach(down(0.6, y, 0.25), WORKING, "beside") for y in (0.30, -0.30))
+    motion = planner.free(left, right)
+    assert all(model.free(q) for q in motion.joints)
+
+
+def test_an_end_that_touches_is_refused_by_name(planner: Planner) -> None:
+    deep = planner.kinematics.ik(down(0.75, 0.2, 0.10), WORKING)
+    with pytest.raises(CollisionError, match="the end of the motion"):
+        planner.free(WORKING, deep)
+
+
+def test_bodies_need_names_and_sizes() -> None:
+    with pytest.raises(ValueError, match="three lengths"):
+        bodies.box("flat", bodies.BASE, pin.SE3.Identity(), (1.0, 0.0, 1.0))
+    solid = bodies.block("twin", bodies.BASE, (0, 0, 0), (1, 1, 1))
+    with pytest.raises(ValueError, match="names of their own"):
+        CollisionModel(ArmKinematics(), [solid, solid])
