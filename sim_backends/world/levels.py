@@ -57,7 +57,7 @@ class Deviations:
     exposure_latency: float = _of("s", "start of the exposure after its time stamp")
     read_noise: float = _of("DN", "camera's read noise")
     speckle_contrast: float = _of("1", "correlated along the stripe")
-    ambient: float = _of("DN", "brightness of a white surface in ambient light that is not the cell's own")
+    ambient: float = _of("1", "relative deviation of the ambient light's level and its gradient across the image")
 
     def assumed_noise(self) -> dict[str, dict[str, float | str]]:
         """Every σ with its unit and meaning, for reports that state what was assumed."""
@@ -102,7 +102,7 @@ NOMINAL = Deviations(
     exposure_latency=20e-6,
     read_noise=0.4,
     speckle_contrast=0.15,
-    ambient=8.0,
+    ambient=0.06,
 )
 IDEAL = Deviations(**{f.name: 0.0 for f in dataclasses.fields(Deviations)} | {"read_noise": 0.1})
 HARSH = Deviations(**{f.name: 2.5 * getattr(NOMINAL, f.name) for f in dataclasses.fields(Deviations)})

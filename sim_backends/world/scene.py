@@ -85,6 +85,8 @@ class Scene:
     odometry_scale: float
     odometry_yaw: float
     suspension: Vector
+    light_level: float
+    light_gradient: Vector
     scan_clock: CameraClock
     target_clock: CameraClock
 
@@ -160,6 +162,8 @@ def draw(seed: int, level: str) -> Scene:
         odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
         odometry_yaw=d.scalar("odometry_yaw", sigma.odometry_yaw),
         suspension=np.abs(d.vector("suspension", sigma.suspension, 2)),
+        light_level=1.0 + d.scalar("light_level", sigma.ambient),
+        light_gradient=d.vector("light_gradient", sigma.ambient, 2),
         scan_clock=_clock(d, "scan_clock", sigma),
         target_clock=_clock(d, "target_clock", sigma),
     )

@@ -1,0 +1,258 @@
+"""The seeded world: what its levels promise, what a seed fixes, and how the part behaves on the surface."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim_backends.clock import WorldClock
+from sim_backends.history import History, interpolate
+from sim_backends.world import nominal
+from sim_backends.world.contact import STIFFNESS, PartContact
+from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
+from sim_backends.world.scene import draw, rotation, stream
+from sim_backends.world.surfaces import HALF_X, HALF_Y, surface
+
+
+def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(np.array(vector))
+    pose[:3, 3] = at
+    return pose
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(2.0))
+
+
+# --- clock and history ---
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_clock_refuses_a_speed_that_does_not_advance(speed: float) -> None:
+    with pytest.raises(ValueError, match="greater than 0"):
+        WorldClock(speed)
+
+
+def test_a_fast_clock_reaches_a_time_that_many_times_sooner() -> None:
+    slow, fast = WorldClock(1.0), WorldClock(50.0)
+    fast.sleep_until(1.0)
+    assert fast.now() >= 1.0
+    assert slow.now() == pytest.approx(fast.now() / 50.0, rel=0.2)
+
+
+def test_history_interpolates_a_screw_motion_and_holds_its_ends() -> None:
+    history = History()
+    for t in np.arange(0.0, 2.0, 0.1):
+        history.append(t, turned((0.0, 0.0, 0.5 * t), (t, 0.0, 0.0)))
+    expected = turned((0.0, 0.0, 0.5 * 1.234), (1.234, 0.0, 0.0))
+    assert history.at(1.234) == pytest.approx(expected, abs=1e-12)
+    assert history.at(-1.0) == pytest.approx(history.at(0.0))
+    assert history.at(99.0) == pytest.approx(history.at(1.9))
+
+
+def test_history_forgets_what_is_older_than_it_keeps() -> None:
+    history = History(keep=1.0)
+    for t in np.arange(0.0, 5.0, 0.01):
+        history.append(t, turned((0, 0, 0), (t, 0, 0)))
+    assert history.at(0.0)[0, 3] == pytest.approx(4.0, abs=0.02)
+    assert history.at(4.005)[0, 3] == pytest.approx(4.005)
+    assert history.at(4.985)[0, 3] == pytest.approx(4.985)
+
+
+def test_an_empty_history_says_so() -> None:
+    with pytest.raises(LookupError, match="empty"):
+        History().at(0.0)
+
+
+def test_interpolation_stays_a_rotation_for_large_turns() -> None:
+    halfway = interpolate(turned((0, 0, 0)), turned((1.0, -1.2, 0.3)), 0.5)
+    assert halfway == pytest.approx(turned((0.5, -0.6, 0.15)), abs=1e-12)
+
+
+# --- levels and scene ---
+
+
+def test_ideal_deviates_in_nothing_but_read_noise() -> None:
+    values = dataclasses.asdict(IDEAL)
+    assert 0 < values.pop("read_noise") <= 0.2
+    assert set(values.values()) == {0.0}
+
+
+def test_harsh_is_two_and_a_half_times_nominal() -> None:
+    for name, value in dataclasses.asdict(NOMINAL).items():
+        assert getattr(HARSH, name) == pytest.approx(2.5 * value), name
+
+
+def test_assumed_noise_states_value_unit_and_meaning_of_everything() -> None:
+    table = NOMINAL.assumed_noise()
+    assert set(table) == set(dataclasses.asdict(NOMINAL))
+    assert table["arm_repeatability"] == {
+        "sigma": 0.04e-3,
+        "unit": "m",
+        "of": "radial, anew each time the arm settles",
+    }
+    assert all(entry["unit"] and entry["of"] for entry in table.values())
+
+
+def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
+    with pytest.raises(ValueError, match="ideal, nominal, harsh"):
+        deviations("rough")
+    with pytest.raises(ValueError, match="0 or greater"):
+        draw(-1, "nominal")
+
+
+def flat(value: object) -> np.ndarray:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return np.concatenate([flat(getattr(value, f.name)) for f in dataclasses.fields(value)])
+    if isinstance(value, str):
+        return np.zeros(0)
+    return np.asarray(value, dtype=float).ravel()
+
+
+def test_a_seed_fixes_the_whole_world_and_another_changes_it() -> None:
+    assert (flat(draw(7, "nominal")) == flat(draw(7, "nominal"))).all()
+    a, b = draw(7, "nominal"), draw(8, "nominal")
+    for name in ("world_from_surface", "flange_from_scan_camera", "light_plane_normal", "dh_error", "rail_direction"):
+        assert np.abs(getattr(a, name) - getattr(b, name)).max() > 0, name
+
+
+def test_each_quantity_has_a_stream_of_its_own() -> None:
+    a, b = stream(3, "light_plane.tilt"), stream(3, "light_plane.offset")
+    assert abs(np.corrcoef(a.standard_normal(2000), b.standard_normal(2000))[0, 1]) < 0.1
+
+
+def test_the_ideal_world_is_the_nominal_geometry() -> None:
+    scene = draw(11, "ideal")
+    assert scene.world_from_surface == pytest.approx(nominal.WORLD_FROM_PLACE)
+    assert scene.flange_from_scan_camera == pytest.approx(nominal.FLANGE_FROM_SCAN_CAMERA)
+    assert scene.flange_from_part == pytest.approx(nominal.FLANGE_FROM_PART)
+    # Where the light plane meets the optical axis: l tan θ = 122.5 mm (theory sheet, equation 6).
+    assert scene.light_plane_distance / scene.light_plane_normal[2] == pytest.approx(0.1225)
+    assert scene.scan_lens.fx == pytest.approx(0.008 / 4.8e-6)
+    assert scene.scan_lens.dist == (0, 0, 0, 0, 0)
+
+
+def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
+    shifts, turns = [], []
+    for seed in range(200):
+        scene = draw(seed, "nominal")
+        moved = nominal.inverse(nominal.WORLD_FROM_PLACE) @ scene.world_from_surface
+        shifts.append(moved[:3, 3])
+        turns.append(angle(moved, np.eye(4)))
+    assert np.std(shifts) == pytest.approx(NOMINAL.station_translation, rel=0.1)
+    assert np.abs(shifts).max() <= CUT * NOMINAL.station_translation + 1e-12
+    assert np.sqrt(np.mean(np.square(turns)) / 3) == pytest.approx(NOMINAL.station_rotation, rel=0.1)
+
+
+def test_the_board_faces_the_vehicle_and_up_with_its_centre_where_the_drawing_says() -> None:
+    place_from_board = nominal.PLACE_FROM_BOARD
+    centre = place_from_board @ [0.08, 0.06, 0.0, 1.0]
+    assert centre[:3] == pytest.approx([0.10, 0.32, 0.12])
+    assert -place_from_board[:3, 2] == pytest.approx([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+    assert np.linalg.det(place_from_board[:3, :3]) == pytest.approx(1.0)
+
+
+# --- the part and the surface ---
+
+
+def contact(
+    name: str = "pot", lean: tuple[float, float, float] = (0.004, -0.006, 0.01)
+) -> tuple[PartContact, np.ndarray]:
+    world_from_surface = turned(lean, (0.01, -0.02, 0.6))
+    return PartContact(surface(name), world_from_surface, nominal.FLANGE_FROM_PART), world_from_surface
+
+
+def flange_for(world_from_part: np.ndarray) -> np.ndarray:
+    return world_from_part @ nominal.inverse(nominal.FLANGE_FROM_PART)
+
+
+def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
+    made = pose.copy()
+    made[0, 3] += dx
+    made[2, 3] += dz
+    return made
+
+
+@pytest.mark.parametrize("name", ["pot", "seat"])
+def test_no_force_before_contact_and_stiffness_times_depth_after(name: str) -> None:
+    part, target = contact(name, lean=(0.0, 0.0, 0.0))
+    assert not part.wrench(flange_for(raised(target, dz=1e-4))).any()
+    at_depth = [part.wrench(flange_for(raised(target, dz=-depth)))[2] for depth in (1e-4, 2e-4)]
+    assert at_depth[1] == pytest.approx(2 * at_depth[0], rel=1e-3)
+    # Slopes lower the vertical stiffness by cos² of the slope, averaged over the underside.
+    assert 0.7 * STIFFNESS < at_depth[0] / 1e-4 < STIFFNESS
+
+
+def test_contact_pushes_against_the_side_that_it_runs_into() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    tilted = target @ turned((0.0, 0.02, 0.0))
+    wrench = part.wrench(flange_for(raised(tilted, dz=0.0)))
+    # Turned about +y, the side at +x is low; the force there, at +x of the flange, turns back about −y.
+    assert wrench[2] > 0
+    assert wrench[4] < 0
+
+
+def test_released_on_the_surface_the_part_stays_where_it_was_placed() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(target))
+    assert not part.held
+    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-8)
+
+
+def test_released_above_the_surface_the_part_falls_straight_down_onto_it() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(raised(target, dz=0.008)))
+    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-7)
+
+
+def test_a_part_that_was_pressed_in_springs_back_to_touch_the_surface() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(raised(target, dz=-0.0004)))
+    assert part.part_pose(np.eye(4))[2, 3] == pytest.approx(target[2, 3], abs=5e-6)
+
+
+def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(raised(target, dx=0.002, dz=0.002)))
+    rest = part.part_pose(np.eye(4))
+    assert rest[:2, 3] == pytest.approx(target[:2, 3] + [0.002, 0.0])
+    x, y = (
+        a.ravel() for a in np.meshgrid(np.linspace(-HALF_X, HALF_X, 21) * 0.9, np.linspace(-HALF_Y, HALF_Y, 11) * 0.9)
+    )
+    underside = np.column_stack([x, y, surface("pot").height(x, y), np.ones_like(x)])
+    seen = (nominal.inverse(target) @ rest @ underside.T).T
+    gap = seen[:, 2] - surface("pot").height(seen[:, 0], seen[:, 1])
+    assert 0 < rest[2, 3] - target[2, 3] < 0.002
+    assert gap.min() > -2e-5
+    assert gap.min() < 2e-4
+
+
+def test_dropped_beside_the_table_the_part_falls_to_the_floor() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(raised(target, dx=-0.5)))
+    assert part.part_pose(np.eye(4))[2, 3] < 0.01
+
+
+def test_the_claw_grips_again_only_within_its_reach() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(target))
+    part.set_claw(True, flange_for(raised(target, dz=0.02)))
+    assert not part.held
+    part.set_claw(False, flange_for(raised(target, dz=0.02)))
+    part.set_claw(True, flange_for(raised(target, dz=0.003)))
+    assert part.held
+    lifted = part.part_pose(flange_for(raised(target, dz=0.103)))
+    assert lifted == pytest.approx(raised(target, dz=0.1), abs=1e-9)
+
+
+def test_an_empty_claw_feels_the_table_with_its_fingers() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(target))
+    beside = raised(target, dx=0.1)
+    tips_on_the_table = flange_for(beside)
+    tips_on_the_table[2, 3] = target[2, 3] + 0.155
+    assert not part.wrench(raised(tips_on_the_table, dz=1e-4)).any()
+    assert part.wrench(raised(tips_on_the_table, dz=-0.01))[2] > 0
