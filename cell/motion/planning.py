@@ -17,8 +17,8 @@ from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints, Unreachable
 from cell.motion.trajectory import LineLimits, Trajectory, join, plan_joint, plan_line
 
-STEP = 0.03
-"""Largest joint step in rad between two checks of a path."""
+STEPS = (0.02, 0.004)
+"""Largest joint step in rad between two checks of a path; the finer one when bodies graze between the coarser steps."""
 REACH = 0.6
 """Longest branch in rad that the tree search adds at once."""
 NODES = 1500
@@ -54,8 +54,11 @@ class Planner:
         start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
         self.collisions.require_free(start, "where the arm stands", allowed)
         self.collisions.require_free(end, "the end of the motion", allowed)
-        path = self._path(start, end, allowed)
-        motion = join([plan_joint(a, b, self.limits) for a, b in itertools.pairwise(path)])
+        for step in STEPS:
+            path = self._path(start, end, allowed, step)
+            motion = join([plan_joint(a, b, self.limits) for a, b in itertools.pairwise(path)])
+            if all(self.collisions.free(joints, allowed) for joints in motion.joints):
+                return motion
         self.require_clear(motion, "the motion", allowed)
         return motion
 
@@ -73,21 +76,21 @@ class Planner:
             if not self.collisions.free(joints, allowed):
                 self.collisions.require_free(joints, f"{what} at {time:.2f} s", allowed)
 
-    def _clear(self, start: Joints, end: Joints, allowed: Sequence[Pair]) -> bool:
+    def _clear(self, start: Joints, end: Joints, allowed: Sequence[Pair], step: float) -> bool:
         """True when nothing touches along the straight joint path, checked from the middle outwards."""
-        count = max(2, int(np.ceil(np.abs(end - start).max() / STEP)) + 1)
+        count = max(2, int(np.ceil(np.abs(end - start).max() / step)) + 1)
         fractions = np.linspace(0.0, 1.0, count)
         order = np.argsort(np.abs(fractions - 0.5), kind="stable")
         return all(self.collisions.free(start + f * (end - start), allowed) for f in fractions[order])
 
-    def _path(self, start: Joints, end: Joints, allowed: Sequence[Pair]) -> list[Joints]:
-        if self._clear(start, end, allowed):
+    def _path(self, start: Joints, end: Joints, allowed: Sequence[Pair], step: float) -> list[Joints]:
+        if self._clear(start, end, allowed, step):
             return [start, end]
         candidates = [[start, *via, end] for via in self._vias(start, end)]
-        clear = [p for p in candidates if all(self._clear(a, b, allowed) for a, b in itertools.pairwise(p))]
+        clear = [p for p in candidates if all(self._clear(a, b, allowed, step) for a, b in itertools.pairwise(p))]
         if clear:
             return min(clear, key=_length)
-        return self._shortened(self._search(start, end, allowed), allowed)
+        return self._shortened(self._search(start, end, allowed, step), allowed, step)
 
     def _vias(self, start: Joints, end: Joints) -> list[list[Joints]]:
         """Deterministic detours: raised above the start, the end or both, and the pan turned before or after."""
@@ -112,7 +115,7 @@ class Planner:
         except Unreachable:
             return None
 
-    def _search(self, start: Joints, end: Joints, allowed: Sequence[Pair]) -> list[Joints]:
+    def _search(self, start: Joints, end: Joints, allowed: Sequence[Pair], step: float) -> list[Joints]:
         """RRT-connect between the two postures with a fixed seed (Kuffner and LaValle, 2000)."""
         rng = np.random.default_rng(0)
         middle, spread = (start + end) / 2, np.abs(end - start) / 2 + 1.2
@@ -121,11 +124,11 @@ class Planner:
         trees: list[_Tree] = [_Tree(start), _Tree(end)]
         while min(len(t.parents) for t in trees) < NODES:
             tree, other = trees
-            grown = self._grow(tree, rng.uniform(low, high), allowed)
+            grown = self._grow(tree, rng.uniform(low, high), allowed, step)
             if grown is not None:
-                goal, met = tree.nodes[grown], self._grow(other, tree.nodes[grown], allowed)
+                goal, met = tree.nodes[grown], self._grow(other, tree.nodes[grown], allowed, step)
                 while met is not None and not np.allclose(other.nodes[met], goal, atol=1e-9):
-                    met = self._grow(other, goal, allowed)
+                    met = self._grow(other, goal, allowed, step)
                 if met is not None:
                     path = tree.trace(grown)[::-1] + other.trace(met)[1:]
                     return path if np.allclose(path[0], start) else path[::-1]
@@ -135,19 +138,21 @@ class Planner:
             f"{np.degrees(end).round(1).tolist()} deg. Move the arm to a freer posture with `cell jog` first"
         )
 
-    def _grow(self, tree: _Tree, target: Joints, allowed: Sequence[Pair]) -> int | None:
+    def _grow(self, tree: _Tree, target: Joints, allowed: Sequence[Pair], step: float) -> int | None:
         """Add a node at most `REACH` towards `target`; its index, or None when something is in the way."""
         nearest = tree.nearest(target)
         origin = tree.nodes[nearest]
         gap = target - origin
         node = origin + gap * min(1.0, REACH / max(float(np.linalg.norm(gap)), 1e-12))
-        return tree.add(node, nearest) if self._clear(origin, node, allowed) else None
+        return tree.add(node, nearest) if self._clear(origin, node, allowed, step) else None
 
-    def _shortened(self, path: list[Joints], allowed: Sequence[Pair]) -> list[Joints]:
+    def _shortened(self, path: list[Joints], allowed: Sequence[Pair], step: float) -> list[Joints]:
         """The path without the nodes that a free straight path can skip."""
         short, i = [path[0]], 0
         while i < len(path) - 1:
-            i = next(j for j in range(len(path) - 1, i, -1) if j == i + 1 or self._clear(path[i], path[j], allowed))
+            i = next(
+                j for j in range(len(path) - 1, i, -1) if j == i + 1 or self._clear(path[i], path[j], allowed, step)
+            )
             short.append(path[i])
         return short
 

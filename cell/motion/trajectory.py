@@ -91,9 +91,10 @@ def join(parts: Sequence[Trajectory]) -> Trajectory:
 
 
 def plan_joint(start: Joints, end: Joints, limits: JointLimits, period: float = PERIOD) -> Trajectory:
-    """The fastest synchronised joint move from rest at `start` to rest at `end` within speed, acceleration and jerk.
+    """The fastest straight joint move from rest at `start` to rest at `end` within speed, acceleration and jerk.
 
-    Raises `RefusedError` when an end lies outside the joint ranges.
+    Straight in joint space, so that a path checked for collisions is the path that is driven. Raises `RefusedError`
+    when an end lies outside the joint ranges.
     """
     start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
     for name, joints in (("start", start), ("end", end)):
@@ -102,9 +103,17 @@ def plan_joint(start: Joints, end: Joints, limits: JointLimits, period: float = 
                 f"{name} of the joint move {np.degrees(joints).round(1).tolist()} deg is outside the ranges "
                 f"{np.degrees(limits.lower).round(1).tolist()} … {np.degrees(limits.upper).round(1).tolist()} deg"
             )
-    if np.abs(end - start).max() < 1e-9:
+    way = np.abs(end - start)
+    if way.max() < 1e-9:
         return Trajectory(np.array([0.0, period]), np.stack([start, end]))
-    return _profile(start, end, limits.speed, limits.acceleration, limits.jerk, period)
+    way = np.maximum(way, 1e-12)
+    speed, acceleration, jerk = (
+        float(np.min(np.array(getattr(limits, name)) / way)) for name in ("speed", "acceleration", "jerk")
+    )
+    times, fraction = _profile(speed, acceleration, jerk, period)
+    joints = start + fraction[:, None] * (end - start)
+    joints[-1] = end
+    return Trajectory(times, joints)
 
 
 def plan_line(
@@ -131,13 +140,13 @@ def plan_line(
     scale = speed / line.speed
     limit = np.array(kinematics.limits.speed)
     for _ in range(6):
-        path = _profile(np.zeros(1), np.ones(1), (speed,), (line.acceleration * scale,), (line.jerk * scale,), period)
-        joints = np.empty((len(path.times), 6))
+        times, fraction = _profile(speed, line.acceleration * scale, line.jerk * scale, period)
+        joints = np.empty((len(times), 6))
         joints[0] = start
-        for i, s in enumerate(path.joints[1:, 0], start=1):
+        for i, s in enumerate(fraction[1:], start=1):
             pose = pin.SE3(base_from_start.rotation @ pin.exp3(s * screw), base_from_start.translation + s * shift)
             joints[i] = kinematics.track(pose, joints[i - 1])
-        trajectory = Trajectory(path.times, joints)
+        trajectory = Trajectory(times, joints)
         _refuse_singular(kinematics, trajectory)
         excess = float((np.abs(trajectory.speeds()) / limit).max())
         if excess <= 1.0:
@@ -157,26 +166,21 @@ def _refuse_singular(kinematics: ArmKinematics, trajectory: Trajectory) -> None:
 
 
 def _profile(
-    start: Joints,
-    end: Joints,
-    speed: Sequence[float],
-    acceleration: Sequence[float],
-    jerk: Sequence[float],
-    period: float,
-) -> Trajectory:
-    """Ruckig's time-optimal profile from rest to rest, sampled every `period` s and at its end."""
-    if not (min(*speed, np.inf) > 0 and min(*acceleration, np.inf) > 0 and min(*jerk, np.inf) > 0 and period > 0):
-        raise ValueError(f"speed {speed}, acceleration {acceleration}, jerk {jerk}, period {period} must be > 0")
-    freedom = len(start)
-    request = ruckig.InputParameter(freedom)
-    request.current_position, request.target_position = list(start), list(end)
-    request.max_velocity, request.max_acceleration, request.max_jerk = list(speed), list(acceleration), list(jerk)
-    profile = ruckig.Trajectory(freedom)
-    result = ruckig.Ruckig(freedom).calculate(request, profile)
+    speed: float, acceleration: float, jerk: float, period: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ruckig's time-optimal way from 0 to 1, from rest to rest: times in s, about `period` apart, and positions."""
+    for name, value in {"speed": speed, "acceleration": acceleration, "jerk": jerk, "period": period}.items():
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"{name} {value} must be finite and greater than 0")
+    request = ruckig.InputParameter(1)
+    request.current_position, request.target_position = [0.0], [1.0]
+    request.max_velocity, request.max_acceleration, request.max_jerk = [speed], [acceleration], [jerk]
+    profile = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(request, profile)
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-        raise RefusedError(f"no motion within the limits: Ruckig reports {result} for {request}")
-    steps = max(1, int(np.ceil(profile.duration / period - 1e-9)))
-    times = np.linspace(0.0, profile.duration, steps + 1)
-    joints = np.array([np.atleast_1d(profile.at_time(t)[0]) for t in times])
-    joints[0], joints[-1] = start, end
-    return Trajectory(times, joints)
+        raise RefusedError(
+            f"no motion within speed {speed:g}, acceleration {acceleration:g} and jerk {jerk:g} (ways per s, s², s³): "
+            f"Ruckig reports {result}"
+        )
+    times = np.linspace(0.0, profile.duration, max(1, int(np.ceil(profile.duration / period - 1e-9))) + 1)
+    return times, np.array([profile.at_time(t)[0][0] for t in times])
