@@ -1,0 +1,231 @@
+"""A triangle mesh with a box tree, for the light plane's section and for shadow rays.
+
+Triangles are put in Morton order of their centres; the tree over them is complete and implicit (children of node i are
+2i+1 and 2i+2), so it is built by plain array operations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.optics.compiled import compiled
+
+Vector = NDArray[np.float64]
+LEAF = 8
+"""Triangles in a leaf."""
+
+
+class Mesh:
+    """Triangles: `vertices` (n, 3) in m, `triangles` (m, 3) vertex numbers. Orientation does not matter.
+
+    `corners` (m, 3, 3) are the triangles' vertices in tree order, `low`, `high` (nodes, 3) the tree's boxes;
+    `leaf_centres`, `leaf_normals` (k, 3) and `leaf_sizes` (k,) describe the leaves for coarse shading.
+    """
+
+    def __init__(self, vertices: Vector, triangles: NDArray[np.integer]) -> None:
+        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        self.triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.isfinite(self.vertices).all():
+            raise ValueError(f"vertices of shape {self.vertices.shape}: need a finite (n, 3) array in m")
+        if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or not len(self.triangles):
+            raise ValueError(f"triangles of shape {self.triangles.shape}: need an (m, 3) array with m above 0")
+        if self.triangles.min() < 0 or self.triangles.max() >= len(self.vertices):
+            raise ValueError(f"a triangle names a vertex outside 0…{len(self.vertices) - 1}")
+        corners = self.vertices[self.triangles]
+        order = np.argsort(_morton(corners.mean(axis=1)), kind="stable")
+        self.corners = np.ascontiguousarray(corners[order])
+        self.low, self.high = _tree(self.corners)
+        firsts = np.arange(0, len(self.corners), LEAF)
+        crosses = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        sums = np.add.reduceat(crosses, firsts)
+        self.leaf_normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+        leaves = slice(len(self.low) // 2, len(self.low) // 2 + len(firsts))
+        self.leaf_centres = (self.low[leaves] + self.high[leaves]) / 2
+        self.leaf_sizes = (self.high[leaves] - self.low[leaves]).max(axis=1)
+
+    def section(self, normal: Vector, distance: float) -> tuple[Vector, NDArray[np.int64]]:
+        """Cut by the plane normal·P = distance: segments (k, 2, 3) and the triangle (tree order) of each."""
+        capacity = 4096
+        while True:
+            segments = np.empty((capacity, 2, 3))
+            owners = np.empty(capacity, dtype=np.int64)
+            count = cut(self.corners, self.low, self.high, normal, distance, segments, owners)
+            if count <= capacity:
+                return segments[:count], owners[:count]
+            capacity = count
+
+    def normals(self, owners: NDArray[np.int64]) -> Vector:
+        """Unit normals (k, 3) of triangles given in tree order."""
+        corners = self.corners[owners]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray(normals / np.maximum(lengths, 1e-300))
+
+    def hides(self, points: Vector, eye: Vector, start: float) -> NDArray[np.bool_]:
+        """Whether the mesh stands between each of `points` (n, 3) and `eye` (3,), all in the mesh frame.
+
+        Hits nearer than `start` (m) to the point do not count; a negative `start` makes a touching mesh count.
+        """
+        hidden = np.zeros(len(points), dtype=np.bool_)
+        shadow(self.corners, self.low, self.high, np.ascontiguousarray(points), eye, start, hidden)
+        return hidden
+
+
+def _morton(points: Vector) -> NDArray[np.uint64]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    cells = ((points - low) / np.maximum(high - low, 1e-12).max() * 65535).astype(np.uint64)
+    code = np.zeros(len(points), dtype=np.uint64)
+    for bit in range(16):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
+
+
+def _tree(corners: Vector) -> tuple[Vector, Vector]:
+    leaves = 1
+    while leaves * LEAF < len(corners):
+        leaves *= 2
+    padded_low = np.full((leaves * LEAF, 3), np.inf)
+    padded_high = np.full((leaves * LEAF, 3), -np.inf)
+    padded_low[: len(corners)] = corners.min(axis=1)
+    padded_high[: len(corners)] = corners.max(axis=1)
+    lows = [padded_low.reshape(leaves, LEAF, 3).min(axis=1)]
+    highs = [padded_high.reshape(leaves, LEAF, 3).max(axis=1)]
+    while len(lows[0]) > 1:
+        lows.insert(0, lows[0].reshape(-1, 2, 3).min(axis=1))
+        highs.insert(0, highs[0].reshape(-1, 2, 3).max(axis=1))
+    return np.concatenate(lows), np.concatenate(highs)
+
+
+@compiled
+def cut(
+    corners: Vector,
+    low: Vector,
+    high: Vector,
+    normal: Vector,
+    distance: float,
+    segments: Vector,
+    owners: NDArray[np.int64],
+) -> int:
+    """Fill `segments` with the triangles' cuts; returns how many there are, also those beyond the capacity."""
+    first_leaf = low.shape[0] // 2
+    stack = np.empty(64, dtype=np.int64)
+    stack[0] = 0
+    depth = 1
+    count = 0
+    height = np.empty(3)
+    while depth > 0:
+        depth -= 1
+        node = stack[depth]
+        if low[node, 0] > high[node, 0]:
+            continue
+        near = -distance
+        far = -distance
+        for axis in range(3):
+            a = normal[axis] * low[node, axis]
+            b = normal[axis] * high[node, axis]
+            near += min(a, b)
+            far += max(a, b)
+        if near > 0.0 or far < 0.0:
+            continue
+        if node < first_leaf:
+            stack[depth] = 2 * node + 1
+            stack[depth + 1] = 2 * node + 2
+            depth += 2
+            continue
+        start = (node - first_leaf) * LEAF
+        for t in range(start, min(start + LEAF, corners.shape[0])):
+            for i in range(3):
+                height[i] = (
+                    normal[0] * corners[t, i, 0]
+                    + normal[1] * corners[t, i, 1]
+                    + normal[2] * corners[t, i, 2]
+                    - distance
+                )
+            found = 0
+            for i in range(3):
+                j = (i + 1) % 3
+                if (height[i] >= 0.0) != (height[j] >= 0.0):
+                    if count < segments.shape[0]:
+                        share = height[i] / (height[i] - height[j])
+                        for axis in range(3):
+                            segments[count, found, axis] = corners[t, i, axis] + share * (
+                                corners[t, j, axis] - corners[t, i, axis]
+                            )
+                    found += 1
+            if found == 2:
+                if count < segments.shape[0]:
+                    owners[count] = t
+                count += 1
+    return count
+
+
+@compiled
+def shadow(
+    corners: Vector,
+    low: Vector,
+    high: Vector,
+    points: Vector,
+    eye: Vector,
+    start: float,
+    hidden: NDArray[np.bool_],
+) -> None:
+    """Set `hidden[i]` where any triangle lies between `points[i]` and `eye` (Möller–Trumbore, any hit)."""
+    first_leaf = low.shape[0] // 2
+    stack = np.empty(64, dtype=np.int64)
+    for i in range(points.shape[0]):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy, dz = eye[0] - px, eye[1] - py, eye[2] - pz
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx / length, dy / length, dz / length
+        ix = 1.0 / (dx if abs(dx) > 1e-12 else 1e-12)
+        iy = 1.0 / (dy if abs(dy) > 1e-12 else 1e-12)
+        iz = 1.0 / (dz if abs(dz) > 1e-12 else 1e-12)
+        stack[0] = 0
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            node = stack[depth]
+            a = (low[node, 0] - px) * ix
+            b = (high[node, 0] - px) * ix
+            enter = min(a, b)
+            leave = max(a, b)
+            a = (low[node, 1] - py) * iy
+            b = (high[node, 1] - py) * iy
+            enter = max(enter, min(a, b))
+            leave = min(leave, max(a, b))
+            a = (low[node, 2] - pz) * iz
+            b = (high[node, 2] - pz) * iz
+            enter = max(enter, min(a, b))
+            leave = min(leave, max(a, b))
+            if not (leave >= enter - 1e-9 and leave >= start and enter <= length and low[node, 0] <= high[node, 0]):
+                continue
+            if node < first_leaf:
+                stack[depth] = 2 * node + 1
+                stack[depth + 1] = 2 * node + 2
+                depth += 2
+                continue
+            begin = (node - first_leaf) * LEAF
+            for t in range(begin, min(begin + LEAF, corners.shape[0])):
+                ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+                e1x, e1y, e1z = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
+                e2x, e2y, e2z = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
+                hx, hy, hz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
+                det = e1x * hx + e1y * hy + e1z * hz
+                if det == 0.0:
+                    continue
+                sx, sy, sz = px - ax, py - ay, pz - az
+                u = (sx * hx + sy * hy + sz * hz) / det
+                if u < 0.0 or u > 1.0:
+                    continue
+                qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
+                v = (dx * qx + dy * qy + dz * qz) / det
+                if v < 0.0 or u + v > 1.0:
+                    continue
+                distance = (e2x * qx + e2y * qy + e2z * qz) / det
+                if start < distance < length - 1e-6:
+                    hidden[i] = True
+                    break
+            if hidden[i]:
+                break

@@ -1,0 +1,67 @@
+"""One picture of a scene: ambient light on boards, planes and meshes, the laser stripe with speckle, the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.optics.boards import ambient_dn, fill_background, gain_parameters, render_rectangle
+from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.scene import BoardInstance, LaserOptics, Light, MeshInstance, PlaneInstance, SceneObject
+from sim_backends.optics.sensor import sensor
+from sim_backends.optics.shading import render_mesh
+from sim_backends.optics.speckle import add_speckled
+from sim_backends.optics.stripe import render_stripe
+
+Image = NDArray[np.float32]
+
+
+def render(
+    optics: CameraOptics,
+    scene: Sequence[SceneObject],
+    laser: LaserOptics | None,
+    exposure: float,
+    rng: np.random.Generator,
+    light: Light | None = None,
+) -> NDArray[np.uint8]:
+    """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off."""
+    return sensor(expected_image(optics, scene, laser, exposure, rng, light), optics, rng)
+
+
+def expected_image(
+    optics: CameraOptics,
+    scene: Sequence[SceneObject],
+    laser: LaserOptics | None,
+    exposure: float,
+    rng: np.random.Generator,
+    light: Light | None = None,
+) -> Image:
+    """The light that `render` puts on the sensor, (height, width) float32 in DN, before noise and saturation.
+
+    Planes lie behind everything else, then the farther object is drawn first. `rng` draws the speckle only.
+    """
+    if not exposure > 0:
+        raise ValueError(f"exposure {exposure} s: must be above 0 s")
+    light = Light() if light is None else light
+    image = np.empty((optics.height, optics.width), dtype=np.float32)
+    fill_background(image, ambient_dn(optics, light, exposure) * light.surroundings, gain_parameters(optics, light))
+    for instance in sorted(scene, key=_order):
+        if isinstance(instance, MeshInstance):
+            render_mesh(image, optics, instance, light, exposure)
+        else:
+            render_rectangle(image, optics, instance, light, exposure)
+    if laser is not None:
+        stripe = np.zeros_like(image)
+        touched = render_stripe(stripe, optics, laser, list(scene), exposure)
+        add_speckled(image, stripe, touched, laser.speckle_contrast, laser.speckle_px, rng)
+    return image
+
+
+def _order(instance: SceneObject) -> tuple[bool, float]:
+    if isinstance(instance, PlaneInstance):
+        return False, -float(np.linalg.norm(instance.camera_from_plane[:3, 3]))
+    if isinstance(instance, BoardInstance):
+        return True, -float(np.linalg.norm(instance.camera_from_board[:3, 3]))
+    return True, -float(np.linalg.norm(instance.camera_from_mesh[:3, 3]))
