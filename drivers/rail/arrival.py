@@ -1,0 +1,100 @@
+"""Tells whether the rail has arrived at its target, and names the reason when it never will."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeviceFault
+from drivers.quantities import shown
+from drivers.rail.motion import patience
+from drivers.rail.tmcl_codec import Axis
+from drivers.rail.tmcl_link import TmclLink
+
+STANDSTILL_S = 0.5
+"""A motor that has not moved for this long before its target has stalled."""
+_STALL_FLAG = 1
+_DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
+
+Samples = list[tuple[float, float, float]]
+"""Host time in s, position in m, round trip in s of each reading."""
+
+
+class Arrival:
+    """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
+
+    `issued` is the count of stops it was commanded under. `lost_position` is called when the count can no longer be
+    trusted. Called again and again: True at the target; raises `Aborted` after a stop and `DeviceFault` for
+    rail.limit_switch, rail.missed_target and rail.stalled.
+    """
+
+    def __init__(
+        self,
+        link: TmclLink,
+        clock: Clock,
+        *,
+        target: int,
+        counts: float,
+        issued: int,
+        samples: Samples,
+        lost_position: Callable[[], None],
+    ) -> None:
+        self._link = link
+        self._target = target
+        self._counts = counts
+        self._issued = issued
+        self._samples = samples
+        self._lost_position = lost_position
+        self._standstill = patience(clock, STANDSTILL_S)
+        self._last: int | None = None
+        self._moved = clock.now()
+
+    def __call__(self) -> bool:
+        """Read the position once and judge it."""
+        position, stamp, round_trip = self._link.get_stamped(Axis.POSITION)
+        self._samples.append((stamp, position / self._counts, round_trip))
+        if self._link.stops != self._issued:
+            raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
+        if position == self._target and self._link.get(Axis.POSITION_REACHED):
+            return True
+        if position != self._last:
+            self._last, self._moved = position, stamp
+        elif stamp - self._moved > self._standstill and self._link.get(Axis.VELOCITY) == 0:
+            raise self._failure(position)
+        return False
+
+    def _failure(self, position: int) -> DeviceFault:
+        link = self._link
+        short = (
+            f"stands at {shown(position / self._counts, 'm')}, its target is {shown(self._target / self._counts, 'm')}"
+        )
+        side, switch = ("right", Axis.RIGHT_SWITCH) if self._target > position else ("left", Axis.LEFT_SWITCH)
+        if link.get(switch):
+            self._lost_position()
+            return DeviceFault(
+                link.name,
+                "rail.limit_switch",
+                f"{short}: the {side} limit switch is hit",
+                recoverable=True,
+                hint="Home the rail again and check the configured travel.",
+            )
+        if link.get(Axis.TARGET_POSITION) != self._target:
+            return DeviceFault(
+                link.name,
+                "rail.missed_target",
+                f"{short}: somebody else changed the module's target",
+                recoverable=True,
+                hint="See what else commands this module.",
+            )
+        self._lost_position()
+        flags = link.get(Axis.DRIVER_ERRORS)
+        reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]
+        if link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG:
+            reasons.append("stall detected")
+        return DeviceFault(
+            link.name,
+            "rail.stalled",
+            f"{short}: the motor does not move" + (f" ({', '.join(reasons)})" if reasons else ""),
+            recoverable=True,
+            hint="See whether the carriage is blocked and the motor has current, then home again.",
+        )

@@ -1,0 +1,124 @@
+"""Motions of the rail: how far and how long a ramp is, and the watch over a motion until it has ended.
+
+A motion is watched by its own thread, which always ends: on arrival, on a fault, on a stop, or when the motion has
+taken far longer than its ramp allows.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError
+
+SWEEP_MARGIN_M = 0.5e-3
+"""Added to a sweep's ramp: takes up backlash and the rounding of the module's ramp."""
+POLL_S = 0.010
+POLL_WALL_S = 0.004
+WALL_FLOOR_S = 0.5
+"""No patience with the device is shorter than this on the wall, however fast the clock runs."""
+
+
+def run_up_distance(speed: float, acceleration: float) -> float:
+    """Distance in m in which a constant `acceleration` (m/s²) reaches `speed` (m/s) from rest: v² / 2a."""
+    return speed * speed / (2.0 * acceleration)
+
+
+def move_duration(distance: float, speed: float, acceleration: float) -> float:
+    """Seconds of a trapezoidal move over `distance` m from rest to rest; triangular when too short for `speed`."""
+    distance = abs(distance)
+    if distance < 2.0 * run_up_distance(speed, acceleration):
+        return 2.0 * math.sqrt(distance / acceleration)
+    return distance / speed + speed / acceleration
+
+
+def patience(clock: Clock, seconds: float) -> float:
+    """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
+    return max(seconds, WALL_FLOOR_S * clock.rate)
+
+
+class RailMotion:
+    """A running motion of the rail `name`.
+
+    `arrived` is asked again and again: True ends the motion well, a `CellError` ends it with that error. `halt` stops
+    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        *,
+        arrived: Callable[[], bool],
+        halt: Callable[[], None],
+        duration: float,
+    ) -> None:
+        self._name = name
+        self._clock = clock
+        self._arrived = arrived
+        self._halt = halt
+        self._limit = clock.now() + patience(clock, 2.0 * duration + 2.0)
+        self._duration = duration
+        self._error: CellError | None = None
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name=f"{name} motion", daemon=True)
+        self._thread.start()
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+        return self._ended.is_set()
+
+    @property
+    def error(self) -> CellError | None:
+        """Why the motion failed, or None while it runs and when it arrived."""
+        return self._error
+
+    def wait(self, timeout: float) -> None:
+        """Block until the motion has arrived; see `drivers.interfaces.Motion`."""
+        if not self._clock.wait(self._ended, patience(self._clock, timeout)):
+            self._halt()
+            raise DeadlineError(
+                self._name,
+                f"the motion has not ended within {timeout:.3g} s and was stopped; it should take "
+                f"{self._duration:.3g} s. Check that the rail runs freely, or allow more time",
+            )
+        if self._error is not None:
+            raise self._error
+
+    def join(self, seconds: float) -> None:
+        """Wait for the end of the watch, at most `seconds` on the wall, whatever the outcome."""
+        self._thread.join(seconds)
+
+    def _watch(self) -> None:
+        period = max(POLL_S, POLL_WALL_S * self._clock.rate)
+        try:
+            due = self._clock.now()
+            while not self._arrived():
+                if self._clock.now() > self._limit:
+                    raise DeviceFault(
+                        self._name,
+                        "rail.missed_target",
+                        f"the motion should take {self._duration:.3g} s and has not ended after twice that",
+                        recoverable=True,
+                        hint="Check that the rail runs freely and that speed and acceleration suit the module.",
+                    )
+                due = max(due + period, self._clock.now())
+                self._clock.sleep_until(due)
+        except (Aborted, NotConnectedError) as error:
+            self._error = error
+        except CellError as error:
+            self._error = error
+            with suppress(CellError):
+                self._halt()
+        except Exception as error:
+            self._error = DeviceFault(
+                self._name, "rail.driver", f"{error!r}", recoverable=False, hint="Please report this as a defect."
+            )
+            with suppress(CellError):
+                self._halt()
+        finally:
+            self._ended.set()

@@ -1,0 +1,122 @@
+"""A constant-velocity sweep and its position at any host time.
+
+The module's counter runs uniformly between the ramps, so a straight line through the samples of that stretch gives
+the position between them. A sample's time is only known within its round trip; its weight says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, InterlockError
+from drivers.interfaces import Vector
+from drivers.rail.motion import RailMotion
+
+_MIN_SAMPLES = 5
+_SPEED_TOLERANCE = 0.05
+
+
+def fit_line(times: Vector, positions: Vector, round_trips: Vector) -> tuple[float, float]:
+    """Least-squares line through (n,) samples: position in m at time 0 s and velocity in m/s.
+
+    The counter held at some instant within the round trip, taken as uniformly distributed, so a sample's weight is
+    1 / round trip²: one late sample hardly counts. Round trips are floored at a fifth of their median, because a very
+    short one does not make the counter's last digit any finer.
+    """
+    weights = 1.0 / np.square(np.maximum(round_trips, 0.2 * np.median(round_trips) + 1e-9))
+    total = weights.sum()
+    centre = (weights * times).sum() / total
+    mean = (weights * positions).sum() / total
+    along = times - centre
+    velocity = float((weights * along * (positions - mean)).sum() / (weights * along * along).sum())
+    return float(mean - velocity * centre), velocity
+
+
+class RailSweep(RailMotion):
+    """A running sweep that is constant between `start` and `stop` (m) at `speed` (m/s)."""
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        *,
+        start: float,
+        stop: float,
+        speed: float,
+        record: list[tuple[float, float, float]],
+        arrived: Callable[[], bool],
+        halt: Callable[[], None],
+        duration: float,
+    ) -> None:
+        self._start = start
+        self._stop = stop
+        self._speed = speed
+        self._record = record
+        self._line: tuple[float, float] | None = None
+        super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration)
+
+    @property
+    def samples(self) -> Vector:
+        """Recorded (n, 2) array of host time in s and position in m, so far."""
+        return np.array([row[:2] for row in list(self._record)], dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Host times in s at which the rail was at `start` and at `stop`.
+
+        Raises `InterlockError` while the sweep runs, its own error if it failed, and `DeviceFault` (rail.velocity)
+        when the samples are too few or show another velocity than the commanded one.
+        """
+        origin, velocity = self._fitted()
+        return (self._start - origin) / velocity, (self._stop - origin) / velocity
+
+    def position_at(self, host_time: float) -> float:
+        """Position in m at a host time inside `window`; `ValueError` outside."""
+        begin, end = self.window
+        if not begin <= host_time <= end:
+            raise ValueError(
+                f"{self._name}: {host_time:.4f} s is outside the sweep's constant-velocity window, "
+                f"{begin:.4f} to {end:.4f} s"
+            )
+        origin, velocity = self._fitted()
+        return origin + velocity * host_time
+
+    def _fitted(self) -> tuple[float, float]:
+        if not self.done:
+            raise InterlockError(
+                self._name, "the sweep still runs; its window is known once it has ended. wait() first"
+            )
+        if self.error is not None:
+            raise self.error
+        if self._line is None:
+            self._line = self._fit()
+        return self._line
+
+    def _fit(self) -> tuple[float, float]:
+        rows = np.array(self._record, dtype=np.float64).reshape(-1, 3)
+        low, high = sorted((self._start, self._stop))
+        inside = rows[(rows[:, 1] >= low) & (rows[:, 1] <= high)]
+        if len(inside) < _MIN_SAMPLES:
+            raise self._fault(
+                f"only {len(inside)} positions were read between start and stop, at least {_MIN_SAMPLES} are needed"
+            )
+        origin, velocity = fit_line(inside[:, 0], inside[:, 1], inside[:, 2])
+        expected = np.copysign(self._speed, self._stop - self._start)
+        if not abs(velocity - expected) <= _SPEED_TOLERANCE * self._speed:
+            raise self._fault(
+                f"the rail ran at {velocity * 1e3:.3f} mm/s instead of {expected * 1e3:.3f} mm/s "
+                f"(allowed ±{_SPEED_TOLERANCE:.0%})"
+            )
+        return origin, velocity
+
+    def _fault(self, message: str) -> DeviceFault:
+        return DeviceFault(
+            self._name,
+            "rail.velocity",
+            message,
+            recoverable=True,
+            hint="Sweep more slowly or farther; check lead, microsteps and that nothing else drives the rail.",
+        )

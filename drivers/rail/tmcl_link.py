@@ -1,0 +1,203 @@
+"""The serial line to a TMCL module: the one place through which every telegram passes.
+
+One telegram at a time; a reply belongs to its request or is thrown away; what may be said twice is tried twice. A stop
+overtakes: commands that were issued before it and have not been sent yet are refused.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import serial
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
+from drivers.interfaces import LinkStatistics
+from drivers.rail.tmcl_codec import (
+    STATUS_OK,
+    STATUS_TEXT,
+    TELEGRAM_BYTES,
+    Axis,
+    Command,
+    Reference,
+    Reply,
+    Request,
+    TelegramError,
+    decode_firmware,
+    decode_reply,
+)
+
+REPLY_TIMEOUT_S = 0.5
+"""Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
+_QUIET_S = 0.05
+_ATTEMPTS = 2
+_USER_BANK = 2
+
+Answer = TypeVar("Answer")
+
+
+class TmclLink:
+    """A serial port (device path or pyserial URL) with one module at `address` on it.
+
+    Raises `NotConnectedError` when the port cannot be opened.
+    """
+
+    def __init__(
+        self, name: str, url: str, *, address: int, motor: int, baud: int, clock: Clock, statistics: LinkStatistics
+    ) -> None:
+        self.name = name
+        self.url = url
+        self._address = address
+        self._motor = motor
+        self._clock = clock
+        self._statistics = statistics
+        self._lock = threading.Lock()
+        self._stops = 0
+        self._closed = False
+        try:
+            self._port = serial.serial_for_url(url, baudrate=baud, timeout=REPLY_TIMEOUT_S)
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise NotConnectedError(
+                name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
+            ) from error
+
+    @property
+    def stops(self) -> int:
+        """How many stops were asked for: a command is only sent if none came since the caller read this."""
+        return self._stops
+
+    def get(self, axis: Axis) -> int:
+        """Read an axis parameter."""
+        return self._command(Command.GET_AXIS, axis).value
+
+    def get_stamped(self, axis: Axis) -> tuple[int, float, float]:
+        """Read an axis parameter: value, host time of the middle of the round trip, round trip; in clock seconds."""
+        request = Request(self._address, Command.GET_AXIS, axis, self._motor)
+        return self._exchange(request, lambda data: self._checked(data, request).value, issued=None)
+
+    def set(self, axis: Axis, value: int, *, issued: int | None = None) -> None:
+        """Write an axis parameter."""
+        self._command(Command.SET_AXIS, axis, value, issued=issued)
+
+    def move_to(self, microsteps: int, *, issued: int) -> None:
+        """Start a move to an absolute position, unless a stop came after `issued`."""
+        self._command(Command.MOVE_TO, 0, microsteps, issued=issued)
+
+    def reference_search(self, kind: int, *, issued: int | None = None) -> int:
+        """Start, stop or query the reference search; the query's value is 0 once it is done."""
+        return self._command(Command.REFERENCE_SEARCH, kind, issued=issued).value
+
+    def stop(self, *, searching: bool) -> None:
+        """Stop the motor, and the reference search if it is `searching`; commands issued earlier are refused."""
+        self._stops += 1
+        try:
+            if searching:
+                self.reference_search(Reference.STOP)
+        finally:
+            self._command(Command.MOTOR_STOP, 0)
+
+    def firmware(self) -> str:
+        """The module's firmware text, like 1241V123."""
+        request = Request(self._address, Command.FIRMWARE, 0, self._motor)
+        return self._exchange(request, decode_firmware, issued=None)[0]
+
+    def user_variable(self, index: int) -> int:
+        """The module's user variable `index` (global parameter bank 2)."""
+        request = Request(self._address, Command.GET_GLOBAL, index, _USER_BANK)
+        return self._exchange(request, lambda data: self._checked(data, request).value, issued=None)[0]
+
+    @property
+    def closed(self) -> bool:
+        """True once `close` was called."""
+        return self._closed
+
+    def close(self) -> None:
+        """Close the port; every later call raises `NotConnectedError`."""
+        with self._lock:
+            self._closed = True
+            self._port.close()
+
+    def _command(self, command: Command, kind: int, value: int = 0, *, issued: int | None = None) -> Reply:
+        request = Request(self._address, command, kind, self._motor, value)
+        return self._exchange(request, lambda data: self._checked(data, request), issued=issued)[0]
+
+    def _checked(self, data: bytes, request: Request) -> Reply:
+        reply = decode_reply(data, request)
+        if reply.status != STATUS_OK:
+            reason = STATUS_TEXT.get(reply.status, f"status {reply.status}")
+            raise DeviceFault(
+                self.name,
+                "tmcl.refused",
+                f"the module refused command {request.command}, type {request.type}, value {request.value}: {reason}",
+                recoverable=False,
+                hint="Check that the module takes velocities in pulses per second and has this axis.",
+            )
+        return reply
+
+    def _exchange(
+        self, request: Request, decode: Callable[[bytes], Answer], *, issued: int | None
+    ) -> tuple[Answer, float, float]:
+        """The choke point: send `request`, return the decoded reply, the middle of the round trip and its length.
+
+        Everything this driver sends means the same when it is heard twice, so a lost or damaged reply is asked for
+        once more. `issued` is the count of stops when the caller decided to move.
+        """
+        for attempt in range(_ATTEMPTS):
+            with self._lock:
+                if self._closed:
+                    raise NotConnectedError(self.name, "the rail was closed. Open it again")
+                if issued is not None and issued != self._stops:
+                    raise Aborted(f"{self.name}: stopped before the command was sent")
+                try:
+                    return self._once(request, decode)
+                except TelegramError as error:
+                    failure = error
+                    self._drain()
+                except (serial.SerialException, OSError) as error:
+                    self._statistics.count("link_lost")
+                    raise DeviceFault(
+                        self.name,
+                        "rail.link_lost",
+                        f"the port {self.url} failed: {error}",
+                        recoverable=False,
+                        hint="Check the cable and the module's supply, then open the cell again.",
+                    ) from error
+            if attempt + 1 < _ATTEMPTS:
+                self._statistics.count("retries")
+        raise DeadlineError(
+            self.name,
+            f"no valid reply to command {request.command} type {request.type} within {REPLY_TIMEOUT_S} s, "
+            f"{_ATTEMPTS} attempts ({failure}). Check module address {self._address} and the wiring",
+        ) from failure
+
+    def _once(self, request: Request, decode: Callable[[bytes], Answer]) -> tuple[Answer, float, float]:
+        if self._port.in_waiting:
+            self._statistics.count("stale_input")
+            self._drain()
+        before = self._clock.now()
+        self._port.write(request.encode())
+        data = self._port.read(TELEGRAM_BYTES)
+        after = self._clock.now()
+        if len(data) < TELEGRAM_BYTES:
+            self._statistics.count("timeouts")
+            raise TelegramError(f"{len(data)} of {TELEGRAM_BYTES} bytes came")
+        try:
+            answer = decode(data)
+        except TelegramError:
+            self._statistics.count("bad_replies")
+            raise
+        self._statistics.add_round_trip(self._clock.wall(after - before))
+        return answer, 0.5 * (before + after), after - before
+
+    def _drain(self) -> None:
+        """Throw away what still comes in, until the line was quiet, so that a late reply answers nothing else."""
+        end = time.monotonic() + REPLY_TIMEOUT_S
+        self._port.timeout = _QUIET_S
+        try:
+            while self._port.read(TELEGRAM_BYTES) and time.monotonic() < end:
+                pass
+        finally:
+            self._port.timeout = REPLY_TIMEOUT_S
