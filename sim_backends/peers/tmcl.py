@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel
-from sim_backends.peers.tcp import TcpServer
+from sim_backends.peers.server import TcpServer
 from sim_backends.peers.tmcl_module import TmclModule
 
 FAULTS = ("rail.drop_reply",)

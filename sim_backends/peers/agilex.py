@@ -1,0 +1,188 @@
+"""The vehicle on its CAN bus: AgileX protocol v2, 500 kbit/s, Motorola byte order.
+
+Encoded here from the protocol's description, independently of any DBC. Feedback keeps its cycles in world time; in a
+fast world a frame is sent at most once per `_FAST` or `_SLOW` of wall time, with the newest values.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
+from sim_backends.models.vehicle import Feedback, Mode, VehicleModel, VehicleParams
+from sim_backends.peers.slcan import CanFrame, SlcanBus
+
+FAULTS = ("can.bus_off", *VEHICLE_FAULTS)
+
+MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
+SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY, VERSION = 0x211, 0x221, 0x291, 0x311, 0x361, 0x4A1
+MOTOR_MOTION, MOTOR_DRIVER = 0x251, 0x261
+
+_TICK = 0.005
+_FAST, _SLOW = 0.005, 0.020
+_SIDES = (1, -1, -1, 1)
+"""Motors 1…4 are right front, left front, left rear, right rear: +1 right, −1 left."""
+
+_Encoder = Callable[[Feedback, VehicleParams, int], bytes]
+
+
+class AgilexPeer:
+    """Serves the bus as slcan adapters at `channel` and lets the vehicle's time pass.
+
+    Open it with python-can: `Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0)`.
+    """
+
+    interface = "slcan"
+
+    def __init__(self, model: VehicleModel, clock: WorldClock) -> None:
+        self.model = model
+        self._clock = clock
+        self._bus = SlcanBus("vehicle", self._receive)
+        self.channel = self._bus.channel
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+        self._count = 0
+        self._schedule = [_Cyclic(identifier, *entry) for identifier, entry in _CYCLES.items()]
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._bus.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._bus.stop()
+
+    def fault(self, name: str) -> None:
+        """`can.bus_off`: the adapters drop out and have to be opened again; the others are the vehicle's own.
+
+        Raises ValueError for a name that is not in `FAULTS`.
+        """
+        if name == "can.bus_off":
+            self._bus.drop()
+        elif name in VEHICLE_FAULTS:
+            self.model.fault(name, self._clock.now())
+        else:
+            raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(FAULTS)}")
+
+    def clear(self) -> None:
+        """Take away the vehicle's faults."""
+        self.model.clear(self._clock.now())
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            due = max(due + _TICK, time.monotonic())
+            t = self._clock.now()
+            self.model.tick(t)
+            feedback = self.model.feedback(t)
+            frames = []
+            for cyclic in self._schedule:
+                if cyclic.due(t, time.monotonic()):
+                    self._count = (self._count + 1) & 0xFF
+                    frames.append(CanFrame(cyclic.id, cyclic.encode(feedback, self.model.params, self._count)))
+            if frames:
+                self._bus.send(frames)
+
+    def _receive(self, frame: CanFrame) -> None:
+        if frame.extended or frame.remote or not frame.data:
+            return
+        t, model, first = self._clock.now(), self.model, frame.data[0]
+        if frame.id == MOTION_COMMAND and len(frame.data) >= 4:
+            speed, yaw_rate = struct.unpack_from(">hh", frame.data)
+            model.command(t, speed / 1000.0, yaw_rate / 1000.0)
+        elif frame.id == MODE and first in tuple(Mode):
+            model.set_mode(t, Mode(first))
+        elif frame.id == BRAKE and first in (0, 1):
+            model.set_brake(t, first == 1)
+        elif frame.id == MOTION_MODE:
+            model.set_motion_mode(t, first)
+        elif frame.id == CLEAR:
+            model.clear_errors(t)
+        elif frame.id == VERSION_REQUEST and first == 1:
+            self._bus.send([CanFrame(VERSION, struct.pack(">4H", *model.params.versions))])
+
+
+class _Cyclic:
+    """A feedback frame with its cycle in world seconds and its shortest interval in wall seconds."""
+
+    def __init__(self, identifier: int, cycle: float, interval: float, encode: _Encoder) -> None:
+        self.id = identifier
+        self.encode = encode
+        self._cycle, self._interval = cycle, interval
+        self._next = self._next_wall = -math.inf
+
+    def due(self, t: float, wall: float) -> bool:
+        """True when it is time to send, which is then counted as done."""
+        if t < self._next or wall < self._next_wall:
+            return False
+        # Half a tick of slack, or a frame would wait for the next tick again and again.
+        self._next = max(self._next + self._cycle, t - 0.5 * self._cycle)
+        self._next_wall = wall + self._interval - 0.5 * _TICK
+        return True
+
+
+def _system_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return struct.pack(">BBHHxB", f.state, f.mode, round(f.volts * 10.0), f.errors, count)
+
+
+def _motion_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return struct.pack(">hhhh", _i16(f.speed * 1000.0), _i16(f.yaw_rate * 1000.0), 0, 0)
+
+
+def _motion_mode_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return bytes([f.motion_mode, 0])
+
+
+def _odometry(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return struct.pack(">ii", _i32(f.left * 1000.0), _i32(f.right * 1000.0))
+
+
+def _battery(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return struct.pack(">BBhhh", 87, 100, round(f.volts * 10.0), _i16(10.0 * _amperes(f.speed)), 250)
+
+
+def _motor_motion(side: int) -> _Encoder:
+    def encode(f: Feedback, p: VehicleParams, count: int) -> bytes:
+        rim = f.speed + side * 0.5 * p.track * f.yaw_rate
+        turns = (f.right if side > 0 else f.left) / (2.0 * math.pi * p.wheel_radius)
+        rpm = 60.0 * rim / (2.0 * math.pi * p.wheel_radius)
+        return struct.pack(">hhi", _i16(rpm), _i16(2.5 * _amperes(rim)), _i32(turns * p.pulses_per_turn))
+
+    return encode
+
+
+def _motor_driver(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    return struct.pack(">HhbBxx", round(f.volts * 10.0), 31, 33, 0)
+
+
+def _amperes(speed: float) -> float:
+    return 1.0 + 8.0 * abs(speed)
+
+
+def _i16(value: float) -> int:
+    return min(max(round(value), -(2**15)), 2**15 - 1)
+
+
+def _i32(value: float) -> int:
+    return (round(value) + 2**31) % 2**32 - 2**31
+
+
+_CYCLES: dict[int, tuple[float, float, _Encoder]] = {
+    SYSTEM_STATE: (0.100, _FAST, _system_state),
+    MOTION_STATE: (0.020, _FAST, _motion_state),
+    ODOMETRY: (0.020, _FAST, _odometry),
+    **{MOTOR_MOTION + i: (0.020, _SLOW, _motor_motion(side)) for i, side in enumerate(_SIDES)},
+    **{MOTOR_DRIVER + i: (0.100, _SLOW, _motor_driver) for i in range(len(_SIDES))},
+    MOTION_MODE_STATE: (0.100, _SLOW, _motion_mode_state),
+    BATTERY: (0.500, _SLOW, _battery),
+}
+"""Feedback frames: id → (cycle in world s, shortest interval in wall s, encoder)."""

@@ -1,0 +1,180 @@
+"""A CAN bus behind slcan adapters (LAWICEL ASCII protocol) on TCP: every client is an adapter on the same bus.
+
+What one client sends reaches the owner of the bus and all other clients; an adapter that is not open, is set to
+another bit rate or listens only takes no part in sending.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sim_backends.peers.server import TcpServer
+
+_OK, _ERROR = b"\r", b"\a"
+_BIT_RATES = "012345678"
+_BUS_RATE = "6"
+"""S6 is 500 kbit/s, the rate of this bus and of an adapter that was not told another."""
+_FIFO = 64 * 1024
+_FLAG_FIFO_FULL, _FLAG_WARNING, _FLAG_BUS_ERROR = 0x01, 0x04, 0x80
+
+
+@dataclass(frozen=True)
+class CanFrame:
+    """One data frame, or a remote request for `length` bytes."""
+
+    id: int
+    data: bytes = b""
+    extended: bool = False
+    remote: bool = False
+    length: int = 0
+
+
+class SlcanBus:
+    """The bus. `receive` is called with each frame that a client sends, in that client's thread."""
+
+    def __init__(self, name: str, receive: Callable[[CanFrame], None], serial: str = "SIM1") -> None:
+        self._receive = receive
+        self._serial = serial
+        self._lock = threading.Lock()
+        self._adapters: list[_Adapter] = []
+        self._server = TcpServer(name, self._serve)
+        self.channel = f"socket://{self._server.address}"
+
+    def start(self) -> None:
+        """Begin to accept adapters' hosts."""
+        self._server.start()
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
+        self._server.stop()
+
+    def drop(self) -> None:
+        """End all present connections."""
+        self._server.drop()
+
+    def send(self, frames: list[CanFrame], sender: _Adapter | None = None) -> None:
+        """Put frames on the bus: all adapters but `sender` get them."""
+        lines = b"".join(_encode(frame) for frame in frames)
+        with self._lock:
+            adapters = list(self._adapters)
+        for adapter in adapters:
+            if adapter is not sender:
+                adapter.deliver(lines)
+
+    def _serve(self, connection: socket.socket) -> None:
+        adapter = _Adapter(connection)
+        with self._lock:
+            self._adapters.append(adapter)
+        try:
+            pending = b""
+            while data := connection.recv(4096):
+                *lines, pending = (pending + data).split(b"\r")
+                for line in lines:
+                    self._command(adapter, line)
+                if len(pending) > 256:
+                    pending = b""
+        finally:
+            with self._lock:
+                self._adapters.remove(adapter)
+
+    def _command(self, adapter: _Adapter, line: bytes) -> None:
+        text = line.decode("ascii", "replace").strip("\n\0")
+        kind, rest = text[:1], text[1:]
+        if kind in ("t", "T", "r", "R"):
+            frame = _decode(text)
+            if frame is None or not adapter.open or adapter.listening:
+                adapter.answer(_ERROR)
+            elif adapter.rate != _BUS_RATE:
+                adapter.bus_error = True
+                adapter.answer(_ERROR)
+            else:
+                adapter.answer(b"z\r" if kind in "tr" else b"Z\r")
+                self.send([frame], sender=adapter)
+                self._receive(frame)
+        elif kind == "V":
+            adapter.answer(b"V1013\r")
+        elif kind == "N":
+            adapter.answer(f"N{self._serial[:4]}\r".encode("ascii"))
+        elif kind == "F":
+            adapter.answer(f"F{adapter.flags():02X}\r".encode("ascii"))
+        else:
+            adapter.answer(_OK if adapter.configure(kind, rest) else _ERROR)
+
+
+class _Adapter:
+    """One client: its channel's state, and what is still to be sent to it."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.rate = _BUS_RATE
+        self.open = False
+        self.listening = False
+        self.bus_error = False
+        self._overrun = False
+        self._connection = connection
+        self._lock = threading.Lock()
+        self._outgoing = bytearray()
+
+    def configure(self, kind: str, rest: str) -> bool:
+        """Carry out a command that changes the channel; False when it is not possible."""
+        if kind in ("O", "L") and not rest and not self.open:
+            self.open, self.listening, self.bus_error = True, kind == "L", False
+        elif kind == "C" and not rest:
+            self.open = False
+        elif kind == "S" and len(rest) == 1 and rest in _BIT_RATES and not self.open:
+            self.rate = rest
+        else:
+            return kind == "" or (kind == "Z" and rest == "0")
+        return True
+
+    def flags(self) -> int:
+        """Status flags since they were read last."""
+        flags = _FLAG_FIFO_FULL * self._overrun | (_FLAG_BUS_ERROR | _FLAG_WARNING) * self.bus_error
+        self._overrun = self.bus_error = False
+        return flags
+
+    def deliver(self, lines: bytes) -> None:
+        """Frames from the bus; lost when the channel is closed, wrongly set or its host does not read."""
+        if self.open and self.rate == _BUS_RATE:
+            self._put(lines)
+
+    def answer(self, line: bytes) -> None:
+        """The reply to a command."""
+        self._put(line)
+
+    def _put(self, data: bytes) -> None:
+        with self._lock:
+            if len(self._outgoing) + len(data) > _FIFO:
+                self._overrun = True
+            else:
+                self._outgoing += data
+            with contextlib.suppress(OSError):
+                while self._outgoing:
+                    sent = self._connection.send(self._outgoing, socket.MSG_DONTWAIT)
+                    del self._outgoing[:sent]
+
+
+def _encode(frame: CanFrame) -> bytes:
+    kind = "r" if frame.remote else "t"
+    head = f"{kind.upper()}{frame.id:08X}" if frame.extended else f"{kind}{frame.id:03X}"
+    length = frame.length if frame.remote else len(frame.data)
+    return f"{head}{length}{frame.data.hex().upper()}\r".encode("ascii")
+
+
+def _decode(text: str) -> CanFrame | None:
+    """The frame of a `t`, `T`, `r` or `R` line; None when it is malformed."""
+    extended, remote = text[0] in "TR", text[0] in "rR"
+    digits = 8 if extended else 3
+    identifier, length, data = text[1 : 1 + digits], text[1 + digits : 2 + digits], text[2 + digits :]
+    try:
+        number, count, payload = int(identifier, 16), int(length, 10), bytes.fromhex(data)
+    except ValueError:
+        return None
+    if len(identifier) < digits or count > 8 or number >= (1 << (29 if extended else 11)):
+        return None
+    if len(payload) != (0 if remote else count):
+        return None
+    return CanFrame(number, payload, extended, remote, count)
