@@ -1,0 +1,350 @@
+"""The simulated arm: joints, safety system, inputs and outputs, true and reported poses; physics only, no bytes.
+
+What the arm reports comes from its joint encoders and the nominal kinematics. Where the flange truly is differs by
+the errors of its Denavit-Hartenberg table and by a repeatability error that is drawn anew for every rest.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+import numpy as np
+
+from sim_backends.clock import WorldClock
+from sim_backends.history import History
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics, Matrix, Vector, rotation_matrix
+from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
+
+Contact = Callable[[Matrix], Vector]
+"""Wrench (6,) on the arm at the flange, base axes, N and N·m, for a true base_from_flange (4, 4)."""
+
+_BRAKE = 20.0
+_REST_SPEED = 1e-4
+_FINE_STEP = 0.004
+
+
+class Safety(Enum):
+    """State of the safety system."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    EMERGENCY_STOP = 7
+
+
+class Power(IntEnum):
+    """State of the joints' power and brakes, with the controller's numbers."""
+
+    OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+@dataclass(frozen=True)
+class ArmParams:
+    """What one particular arm is like.
+
+    `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad; the error is the true table less
+    the nominal one. `repeatability` holds standard deviations per axis in m and rad; `force_noise` in N and N·m;
+    `force_limit` in N is where a protective stop comes; `unlock_delay` in s is how long it cannot be unlocked.
+    """
+
+    dh: Matrix = field(default_factory=lambda: UR10E_DH.copy())
+    dh_error: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
+    repeatability: tuple[float, float] = (0.0, 0.0)
+    blend_time: float = 0.3
+    joint_limit: float = 2 * math.pi
+    speed_limits: Vector = field(default_factory=lambda: np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]))
+    tracking_lag: float = 0.02
+    initial_q: Vector = field(default_factory=lambda: np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0]))
+    force_noise: tuple[float, float] = (0.0, 0.0)
+    force_limit: float = 150.0
+    unlock_delay: float = 5.0
+    model: str = "UR10e"
+    serial: str = "20235500001"
+
+
+class ArmModel:
+    """A simulated six-axis arm; `tick` advances it, every other call may come from another thread."""
+
+    def __init__(self, params: ArmParams, rng: np.random.Generator, clock: WorldClock) -> None:
+        """Stands at `params.initial_q`, powered, brakes released, safety normal."""
+        self.params = params
+        self.kinematics = Kinematics(params.dh)
+        self.drive = Drive(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
+        self.power = Power.RUNNING
+        self.safety = Safety.NORMAL
+        self.fault_text = ""
+        self.contact: Contact | None = None
+        self.digital_outputs = 0
+        self.digital_inputs = 0
+        self.payload = (0.0, np.zeros(3))
+        self.wrench = np.zeros(6)
+        self.time = clock.now()
+        self._true_kinematics = Kinematics(params.dh + params.dh_error)
+        self._rng = rng
+        self._lock = threading.RLock()
+        self._queue: deque[Motion] = deque()
+        self._begun = False
+        self._suspended: list[Motion] = []
+        self._stopped_at = -math.inf
+        self._rest_since = self.time
+        self._force_zero = np.zeros(6)
+        self._error_from = self._draw_error()
+        self._error_to = self._error_from
+        self._error = self._error_from
+        self._blend = 1.0
+        self._true_q: Vector | None = None
+        self._history = History()
+        self._remember_true_pose()
+
+    # --- the world's side ---
+
+    def tick(self, t: float) -> None:
+        """Advance the arm to world time `t`; a time that is not later than the last one changes nothing."""
+        with self._lock:
+            dt = t - self.time
+            if dt <= 0:
+                return
+            self.time = t
+            if self.power is Power.RUNNING:
+                self._advance(dt)
+            self._wander(dt)
+            self._remember_true_pose()
+            self._feel()
+            noise = self.params.force_noise
+            if noise[0] or noise[1]:
+                scatter = self._rng.normal(size=6)
+                scatter[:3] *= noise[0]
+                scatter[3:] *= noise[1]
+                self.wrench = self.drive.wrench + scatter
+            else:
+                self.wrench = self.drive.wrench
+
+    def base_from_flange(self, t: float) -> Matrix:
+        """True flange pose (4, 4) in the base at world time `t` (the last 10 s are kept)."""
+        return self._history.at(t)
+
+    def reported_flange(self) -> Matrix:
+        """Flange pose (4, 4) in the base as the controller computes it from the encoders, now."""
+        return self.kinematics.forward(self.drive.q)
+
+    def set_digital_input(self, index: int, value: bool) -> None:
+        """Set what is wired to digital input `index` (0-7 standard, 8-15 configurable, 16-17 tool)."""
+        if not 0 <= index <= 17:
+            raise ValueError(f"digital input {index} must be within 0…17")
+        with self._lock:
+            self.digital_inputs = self.digital_inputs & ~(1 << index) | int(value) << index
+
+    def fault(self, name: str) -> None:
+        """Bring about a "protective_stop" or an "emergency_stop"; ValueError for any other name."""
+        if name == "protective_stop":
+            self.protective_stop("triggered from outside")
+        elif name == "emergency_stop":
+            with self._lock:
+                self.safety = Safety.EMERGENCY_STOP
+                self.fault_text = "emergency stop pressed"
+                self._suspended = []
+                self._replace(Stop(_BRAKE))
+        else:
+            raise ValueError(f"arm fault {name!r} is unknown: use 'protective_stop' or 'emergency_stop'")
+
+    def clear(self) -> None:
+        """Take away the cause: a protective stop ends at once; after an emergency stop the arm is left powered off."""
+        with self._lock:
+            if self.safety is Safety.EMERGENCY_STOP:
+                self.power = Power.OFF
+            self.safety = Safety.NORMAL
+            self.fault_text = ""
+
+    # --- the controller's side ---
+
+    @property
+    def ready(self) -> bool:
+        """True when a program may move the arm."""
+        return self.power is Power.RUNNING and self.safety is Safety.NORMAL
+
+    @property
+    def motion(self) -> Motion | None:
+        """The motion under way."""
+        return self._queue[0] if self._queue else None
+
+    @property
+    def idle(self) -> bool:
+        """True when no motion is under way."""
+        return not self._queue
+
+    @property
+    def moving(self) -> bool:
+        """True while a joint turns."""
+        return float(np.abs(self.drive.qd).max()) > _REST_SPEED
+
+    @property
+    def steady(self) -> bool:
+        """True once the arm has been at rest for 0.1 s."""
+        return self.time - self._rest_since > 0.1
+
+    @property
+    def felt(self) -> Vector:
+        """Wrench (6,) as reported: at the flange in base axes, with noise, less the wrench taken as zero."""
+        return self.wrench - self._force_zero
+
+    def start(self, motion: Motion) -> None:
+        """Begin `motion` in place of any other; one that begins from rest is preceded by a stop if need be."""
+        with self._lock:
+            self._replace(motion)
+
+    def suspend(self) -> None:
+        """Stop in such a way that `resume` continues the motion."""
+        with self._lock:
+            if not self._suspended:
+                self._suspended = [m for m in self._queue if not isinstance(m, Stop)]
+            self._replace(Stop(_BRAKE))
+
+    def resume(self) -> None:
+        """Continue the suspended motion, if there is one."""
+        with self._lock:
+            motions, self._suspended = self._suspended, []
+            if motions:
+                self._queue = deque(motions)
+                self._begun = False
+
+    def halt(self) -> None:
+        """Stop and forget every motion."""
+        with self._lock:
+            self._suspended = []
+            self._replace(Stop(_BRAKE))
+
+    def zero_force(self) -> None:
+        """Take the present wrench as zero."""
+        with self._lock:
+            self._force_zero = self.drive.wrench.copy()
+
+    def write_digital_outputs(self, mask: int, values: int) -> None:
+        """Set the outputs named by the bits of `mask` to those of `values` (bits 0-7, 8-15 and 16-17)."""
+        with self._lock:
+            self.digital_outputs = self.digital_outputs & ~mask | values & mask
+
+    def protective_stop(self, reason: str) -> None:
+        """Stop the arm for `reason` until the stop is unlocked; ignored while an emergency stop holds."""
+        with self._lock:
+            if self.safety is not Safety.NORMAL:
+                return
+            self.safety = Safety.PROTECTIVE_STOP
+            self.fault_text = reason
+            self._stopped_at = self.time
+            self.suspend()
+
+    def unlock(self) -> bool:
+        """Release a protective stop; False while it is younger than `unlock_delay`."""
+        with self._lock:
+            if self.safety is Safety.PROTECTIVE_STOP:
+                if self.time - self._stopped_at < self.params.unlock_delay:
+                    return False
+                self.safety = Safety.NORMAL
+                self.fault_text = ""
+            return True
+
+    def set_power(self, power: Power) -> bool:
+        """Switch the power; False when the safety system does not allow it."""
+        with self._lock:
+            if power is not Power.OFF and self.safety is not Safety.NORMAL:
+                return False
+            if power is not Power.RUNNING:
+                self._queue.clear()
+                self._suspended = []
+                self.drive.qd = np.zeros(6)
+            self.power = power
+            return True
+
+    # --- physics ---
+
+    def _replace(self, motion: Motion) -> None:
+        self._queue = deque([Stop(_BRAKE), motion] if motion.from_rest and self.moving else [motion])
+        self._begun = False
+
+    def _advance(self, dt: float) -> None:
+        if not self._queue:
+            return
+        steps = math.ceil(dt / _FINE_STEP) if self._queue[0].feels_force else 1
+        for _ in range(steps):
+            self._step(dt / steps)
+            if steps > 1:
+                self._remember_true_pose(keep=False)
+                self._feel()
+        if self.safety is Safety.EMERGENCY_STOP and not self._queue:
+            self.power = Power.OFF
+
+    def _step(self, dt: float) -> None:
+        if not self._queue:
+            return
+        before = self.drive.q
+        try:
+            if not self._begun:
+                self._queue[0].begin(self.drive)
+                self._begun = True
+            if self._queue[0].step(self.drive, dt):
+                self._queue.popleft()
+                self._begun = False
+        except MotionError as error:
+            self.protective_stop(str(error))
+            return
+        self._check_limits(before)
+
+    def _check_limits(self, before: Vector) -> None:
+        drive = self.drive
+        if (np.abs(drive.q) > self.params.joint_limit).any() or not np.isfinite(drive.q).all():
+            joint = int(np.argmax(np.abs(drive.q)))
+            drive.q = before
+            drive.qd = np.zeros(6)
+            self.protective_stop(f"joint {joint} at its limit of ±{math.degrees(self.params.joint_limit):.0f}°")
+        elif (np.abs(drive.qd) > 1.02 * self.params.speed_limits).any() and self.safety is Safety.NORMAL:
+            joint = int(np.argmax(np.abs(drive.qd) / self.params.speed_limits))
+            if isinstance(self._queue[0] if self._queue else None, Stop):
+                return
+            drive.q = before
+            drive.qd = np.clip(drive.qd, -self.params.speed_limits, self.params.speed_limits)
+            self.protective_stop(f"joint {joint} faster than its limit")
+
+    def _feel(self) -> None:
+        if self.contact is None:
+            return
+        self.drive.wrench = np.asarray(self.contact(self._true_pose), dtype=float)
+        force = math.hypot(*self.drive.wrench[:3])
+        if force > self.params.force_limit:
+            self.protective_stop(f"force of {force:.0f} N exceeds {self.params.force_limit:.0f} N")
+
+    def _draw_error(self) -> Vector:
+        error = self._rng.normal(size=6)
+        error[:3] *= self.params.repeatability[0]
+        error[3:] *= self.params.repeatability[1]
+        return error
+
+    def _wander(self, dt: float) -> None:
+        """Carry the repeatability error over from the last rest's to the next one's, its variance unchanged."""
+        if not self.moving:
+            return
+        if self._rest_since < math.inf:
+            self._error_from, self._error_to, self._blend = self._error, self._draw_error(), 0.0
+            self._rest_since = math.inf
+        if self._blend < 1.0:
+            self._blend = min(1.0, self._blend + dt / self.params.blend_time)
+            angle = 0.5 * math.pi * self._blend
+            self._error = math.cos(angle) * self._error_from + math.sin(angle) * self._error_to
+            self._true_q = None
+
+    def _remember_true_pose(self, keep: bool = True) -> None:
+        if self._rest_since == math.inf and not self.moving:
+            self._rest_since = self.time
+        if self._true_q is not self.drive.q:
+            pose = self._true_kinematics.forward(self.drive.q)
+            pose[:3, 3] += self._error[:3]
+            pose[:3, :3] = rotation_matrix(self._error[3:]).dot(pose[:3, :3])
+            self._true_pose = pose
+            self._true_q = self.drive.q
+        if keep:
+            self._history.append(self.time, self._true_pose)

@@ -1,0 +1,187 @@
+"""Kinematics of a six-axis arm from its Denavit-Hartenberg table: forward, Jacobian and numerical inverse.
+
+Angles are in rad, lengths in m. A pose is a (4, 4) matrix `base_from_flange` or the controller's 6-vector
+(x, y, z, rx, ry, rz) with a rotation vector. Sources: the maker's DH table (protocol sheet, section 5); damped
+least squares after Nakamura and Hanafusa 1986.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+UR10E_DH: Matrix = np.array(
+    [
+        [0.0, 0.1807, math.pi / 2, 0.0],
+        [-0.6127, 0.0, 0.0, 0.0],
+        [-0.57155, 0.0, 0.0, 0.0],
+        [0.0, 0.17415, math.pi / 2, 0.0],
+        [0.0, 0.11985, -math.pi / 2, 0.0],
+        [0.0, 0.11655, 0.0, 0.0],
+    ]
+)
+"""One row per joint: a in m, d in m, alpha in rad, joint offset in rad."""
+
+_MAX_STEP = 0.5
+_RESTARTS = (
+    (0.0,) * 6,
+    (0.0, -0.5, 0.8, -0.3, 0.2, 0.0),
+    (0.6, 0.4, -0.7, 0.5, -0.4, 0.3),
+    (-0.6, -0.9, 1.2, 0, 0.6, 0),
+)
+
+
+class Kinematics:
+    """Forward and inverse kinematics of one DH table of shape (6, 4): columns a, d, alpha, joint offset."""
+
+    def __init__(self, table: Matrix) -> None:
+        if table.shape != (6, 4) or not np.all(np.isfinite(table)):
+            raise ValueError(f"a DH table needs finite numbers in shape (6, 4), got shape {table.shape}")
+        a, d, alpha, offset = table.T
+        self._offset = offset.copy()
+        self._links = np.zeros((6, 4, 4))
+        for i in range(6):
+            ca, sa = math.cos(alpha[i]), math.sin(alpha[i])
+            self._links[i] = [[1, 0, 0, a[i]], [0, ca, -sa, 0], [0, sa, ca, d[i]], [0, 0, 0, 1]]
+
+    def forward(self, q: Vector) -> Matrix:
+        """base_from_flange (4, 4) at joint angles `q` (6,)."""
+        joints = self._joint_matrices(q)
+        pose: Matrix = joints[0]
+        for i in range(1, 6):
+            pose = pose.dot(joints[i])
+        return pose
+
+    def forward_with_jacobian(self, q: Vector) -> tuple[Matrix, Matrix]:
+        """base_from_flange (4, 4) and the Jacobian (6, 6) of flange velocity and rotation rate in base axes."""
+        joints = self._joint_matrices(q)
+        axes = np.empty((6, 3))
+        origins = np.empty((6, 3))
+        pose = np.eye(4)
+        for i in range(6):
+            axes[i] = pose[:3, 2]
+            origins[i] = pose[:3, 3]
+            pose = pose.dot(joints[i])
+        jacobian = np.empty((6, 6))
+        arm = pose[:3, 3] - origins
+        jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
+        jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
+        jacobian[2] = axes[:, 0] * arm[:, 1] - axes[:, 1] * arm[:, 0]
+        jacobian[3:] = axes.T
+        return pose, jacobian
+
+    def inverse(
+        self, target: Matrix, near: Vector, limit: float = 2 * math.pi, tolerance: float = 1e-9
+    ) -> Vector | None:
+        """Joint angles (6,) within ±`limit` that reach `target` (4, 4), next to `near`; None without any.
+
+        `tolerance` bounds the remaining position error in m and rotation error in rad.
+        """
+        for offset in _RESTARTS:
+            q = self._descend(target, near + np.asarray(offset), tolerance)
+            if q is not None:
+                q = near + np.mod(q - near + math.pi, 2 * math.pi) - math.pi
+                return np.where(q > limit, q - 2 * math.pi, np.where(q < -limit, q + 2 * math.pi, q))
+        return None
+
+    def refine(self, target: Matrix, q: Vector, tolerance: float = 1e-9) -> Vector | None:
+        """Joint angles (6,) for a `target` (4, 4) close to where `q` stands, without leaving its branch; else None."""
+        return self._descend(target, q, tolerance, iterations=8)
+
+    def _descend(self, target: Matrix, q: Vector, tolerance: float, iterations: int = 60) -> Vector | None:
+        for _ in range(iterations):
+            pose, jacobian = self.forward_with_jacobian(q)
+            error = pose_error(target, pose)
+            size = float(np.abs(error).max())
+            if size < tolerance:
+                return q
+            damping = 1e-3 * size + 1e-12
+            step = jacobian.T.dot(np.linalg.solve(jacobian.dot(jacobian.T) + damping * np.eye(6), error))
+            longest = float(np.abs(step).max())
+            q = q + step * min(1.0, _MAX_STEP / longest) if longest > 0 else q
+        return None
+
+    def _joint_matrices(self, q: Vector) -> Matrix:
+        angles = q + self._offset
+        cosine, sine = np.cos(angles), np.sin(angles)
+        turn = np.zeros((6, 4, 4))
+        turn[:, 0, 0] = cosine
+        turn[:, 1, 1] = cosine
+        turn[:, 1, 0] = sine
+        turn[:, 0, 1] = -sine
+        turn[:, 2, 2] = 1.0
+        turn[:, 3, 3] = 1.0
+        return turn @ self._links
+
+
+def pose_error(target: Matrix, pose: Matrix) -> Vector:
+    """Translation and rotation vector (6,), in base axes, that carry `pose` (4, 4) onto `target` (4, 4)."""
+    error = np.empty(6)
+    error[:3] = target[:3, 3] - pose[:3, 3]
+    error[3:] = rotation_vector(target[:3, :3].dot(pose[:3, :3].T))
+    return error
+
+
+def rotation_vector(rotation: Matrix) -> Vector:
+    """Rotation vector (3,) in rad of a rotation matrix (3, 3); well behaved up to and at half a turn."""
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation.tolist()
+    # Shepperd's choice of the largest quaternion component keeps the division away from zero.
+    trace = r00 + r11 + r22
+    if trace > 0.0:
+        w, x, y, z = 1.0 + trace, r21 - r12, r02 - r20, r10 - r01
+    elif r00 >= r11 and r00 >= r22:
+        w, x, y, z = r21 - r12, 1.0 + r00 - r11 - r22, r01 + r10, r02 + r20
+    elif r11 >= r22:
+        w, x, y, z = r02 - r20, r01 + r10, 1.0 + r11 - r00 - r22, r12 + r21
+    else:
+        w, x, y, z = r10 - r01, r02 + r20, r12 + r21, 1.0 + r22 - r00 - r11
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-300 else 0.0
+    return np.array([x * scale, y * scale, z * scale])
+
+
+def rotation_matrix(vector: Iterable[float]) -> Matrix:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in rad (Rodrigues)."""
+    x, y, z = (float(v) for v in vector)
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-8:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    c = 1.0 - b * angle * angle
+    return np.array(
+        [
+            [c + b * x * x, b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, c + b * y * y, b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, c + b * z * z],
+        ]
+    )
+
+
+def matrix_from_pose(pose: Vector) -> Matrix:
+    """(4, 4) matrix of the controller's 6-vector (x, y, z, rx, ry, rz)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrix(pose[3:])
+    matrix[:3, 3] = pose[:3]
+    return matrix
+
+
+def pose_from_matrix(matrix: Matrix) -> Vector:
+    """The controller's 6-vector (x, y, z, rx, ry, rz) of a (4, 4) matrix."""
+    return np.concatenate((matrix[:3, 3], rotation_vector(matrix[:3, :3])))
+
+
+def invert(matrix: Matrix) -> Matrix:
+    """Inverse of a rigid (4, 4) transformation."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -matrix[:3, :3].T.dot(matrix[:3, 3])
+    return inverse
