@@ -1,0 +1,145 @@
+"""Promises of the stripe extraction, against pictures drawn here from a formula and against the Cramér–Rao bound."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.special import erf
+
+from cell.vision.stripe import StripeSettings, extract
+
+RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+HEIGHT, WIDTH = 480, 640
+PHOTONS_ONLY = StripeSettings(speckle_contrast=0.0)
+
+
+def draw(sigma: float, peak: float, contrast: float = 0.0, seed: int = 0, slope: float = 0.02):
+    """A stripe integrated over pixels, on a gradient, 40 e⁻/DN, read noise 0.4 DN; the image and the true centres."""
+    rng = np.random.default_rng(seed)
+    centres = WIDTH / 2 + 40 * np.sin(np.arange(HEIGHT) / 90) + rng.uniform(-0.5, 0.5, HEIGHT)
+    edges = (np.arange(WIDTH + 1) - 0.5 - centres[:, None]) / (np.sqrt(2) * sigma)
+    stripe = peak * sigma * np.sqrt(np.pi / 2) * np.diff(erf(edges), axis=1)
+    if contrast:
+        field = rng.normal(size=stripe.shape) + 1j * rng.normal(size=stripe.shape)
+        speckle = np.abs(gaussian_filter(field, 1.0)) ** 2
+        stripe = stripe * (1 + contrast * (speckle / speckle.mean() - 1))
+    light = stripe + 8 + slope * np.arange(WIDTH)
+    image = rng.poisson(light * 40) / 40 + rng.normal(0, 0.4, light.shape)
+    return np.clip(np.round(image), 0, 255).astype(np.uint8), centres
+
+
+@pytest.mark.parametrize(
+    ("sigma", "peak", "bound"),
+    [(1.2, 40, 0.0304), (2, 100, 0.0199), (2, 200, 0.0126), (3, 200, 0.0156)],
+)
+def test_centres_come_near_the_cramer_rao_bound(sigma, peak, bound):
+    errors = []
+    for seed in range(3):
+        image, centres = draw(sigma, peak, seed=seed)
+        profile = extract(image, settings=PHOTONS_ONLY)
+        assert profile.valid.all()
+        errors.append(profile.centres - centres)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.2 * bound
+
+
+@pytest.mark.parametrize(("sigma", "peak"), [(2, 600), (5, 800)])
+def test_a_saturated_core_is_masked_not_believed(sigma, peak):
+    image, centres = draw(sigma, peak)
+    assert (image == 255).sum() > 2 * HEIGHT
+    profile = extract(image, settings=PHOTONS_ONLY)
+    assert profile.saturated.all()
+    assert np.sqrt(np.mean((profile.centres - centres) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("contrast", [0.2, 0.35])
+def test_the_predicted_deviation_is_honest_under_speckle(contrast):
+    image, centres = draw(2.0, 150, contrast)
+    profile = extract(image)
+    z = (profile.centres - centres) / profile.sigma
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
+
+
+def test_a_steep_background_does_not_bias():
+    image, centres = draw(2.0, 100, slope=0.15)
+    assert abs(np.mean(extract(image, settings=PHOTONS_ONLY).centres - centres)) < 0.004
+
+
+def test_a_stripe_along_columns_is_that_along_rows_turned():
+    image, _ = draw(2.0, 120)
+    rows, columns = extract(image), extract(np.ascontiguousarray(image.T), axis="columns")
+    np.testing.assert_array_equal(rows.centres, columns.centres)
+    np.testing.assert_array_equal(rows.pixels(), columns.pixels()[:, ::-1])
+
+
+def test_rows_without_a_stripe_are_gaps():
+    image, _ = draw(2.0, 120)
+    empty, _ = draw(2.0, 0.0, seed=3)
+    image[100:200] = empty[100:200]
+    profile = extract(image)
+    assert not profile.valid[100:200].any()
+    assert profile.valid[:100].all()
+    assert profile.valid[200:].all()
+    assert set(profile.rows) == set(range(480)) - set(range(100, 200))
+
+
+def test_of_two_stripes_the_one_with_more_energy_is_taken_and_marked():
+    strong, centres = draw(2.0, 120)
+    # Higher but narrower: less energy.
+    weak, _ = draw(1.0, 150, slope=0.0)
+    image = np.maximum(strong, np.roll(weak, 150, axis=1))
+    profile = extract(image)
+    assert profile.double.mean() > 0.9
+    assert np.nanmax(np.abs(profile.centres - centres)) < 0.5
+    assert not extract(strong).double.any()
+
+
+def test_a_dark_frame_takes_the_scenery_away():
+    image, centres = draw(2.0, 100)
+    scenery = np.zeros_like(image)
+    scenery[:, 50:90] = 120
+    lit = np.minimum(image.astype(int) + scenery, 255).astype(np.uint8)
+    profile = extract(lit, dark=scenery)
+    assert np.sqrt(np.nanmean((profile.centres - centres) ** 2)) < 0.05
+    assert profile.valid.all()
+
+
+def test_a_picture_without_a_stripe_has_no_centres():
+    image, _ = draw(2.0, 0.0)
+    assert not extract(image).valid.any()
+
+
+def test_wrong_input_is_named():
+    with pytest.raises(ValueError, match="8-bit"):
+        extract(np.zeros((480, 640), np.uint16))
+    with pytest.raises(ValueError, match="dark frame"):
+        extract(np.zeros((480, 640), np.uint8), dark=np.zeros((10, 10), np.uint8))
+
+
+def test_a_frame_takes_about_a_millisecond():
+    image, _ = draw(2.0, 150, 0.2)
+    extract(image)
+    best = np.inf
+    for _ in range(20):
+        start = time.perf_counter()
+        extract(image)
+        best = min(best, time.perf_counter() - start)
+    assert best < 5e-3, f"{best * 1e3:.2f} ms a frame"
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize("frame", [2, 3, 4, 5, 6, 7, 8])
+def test_recorded_saturated_stripes_are_smooth(frame):
+    path = RECORDED / "robot_line_laser" / f"frame{frame:04d}.png"
+    if not path.exists():
+        pytest.skip(f"recorded data are missing: {path} (set CELL_RECORDED_DATA)")
+    profile = extract(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    assert profile.valid.mean() > 0.97
+    roughness = np.diff(profile.centres[profile.valid], 2)
+    # Second differences of independent errors scatter √6 times as much as the errors.
+    assert np.median(np.abs(roughness)) / 0.6745 / np.sqrt(6) < 0.1
