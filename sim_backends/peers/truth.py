@@ -1,0 +1,78 @@
+"""The truth endpoint of a simulated world, for reports and for causing faults; no part of any device.
+
+One JSON object per line each way: {"op": "truth"} → {"ok": true, "truth": {…}}, {"op": "fault", "name": …} and
+{"op": "reset"} → {"ok": true}; anything else → {"ok": false, "error": …}.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sim_backends.peers.server import TcpServer
+
+_LONGEST = 64 * 1024
+
+
+class TruthPeer:
+    """Serves at `address` (`127.0.0.1:port`).
+
+    `truth` gives the whole truth (numbers, strings, lists, arrays); `fault` causes a fault by name and raises
+    ValueError for one it does not know; `reset` takes away all faults.
+    """
+
+    def __init__(
+        self, truth: Callable[[], dict[str, Any]], fault: Callable[[str], None], reset: Callable[[], None]
+    ) -> None:
+        self._truth, self._fault, self._reset = truth, fault, reset
+        self._server = TcpServer("truth", self._serve)
+        self.address = self._server.address
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._server.start()
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
+        self._server.stop()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection.makefile("rb") as lines:
+            while line := lines.readline(_LONGEST):
+                reply = self._answer(line)
+                connection.sendall(json.dumps(reply, default=_plain).encode("utf-8") + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            operation = request["op"]
+        except (ValueError, TypeError, KeyError):
+            return _refusal('a request is one line with a JSON object that has "op"')
+        if operation == "truth":
+            return {"ok": True, "truth": self._truth()}
+        if operation == "fault":
+            try:
+                self._fault(str(request.get("name")))
+            except ValueError as error:
+                return _refusal(str(error))
+            return {"ok": True}
+        if operation == "reset":
+            self._reset()
+            return {"ok": True}
+        return _refusal(f"unknown op {operation!r}; known: truth, fault, reset")
+
+
+def _refusal(error: str) -> dict[str, Any]:
+    return {"ok": False, "error": error}
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is not fit for JSON")
