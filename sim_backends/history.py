@@ -87,3 +87,26 @@ def _turn(rotation: NDArray[np.float64], fraction: float) -> NDArray[np.float64]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turned: NDArray[np.float64] = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
     return turned
+
+
+class SwitchHistory:
+    """When a switch was on: its changes over the last `keep` world seconds; safe between threads."""
+
+    def __init__(self, on: bool = False, keep: float = 30.0) -> None:
+        self._keep = keep
+        self._changes: list[tuple[float, bool]] = [(float("-inf"), on)]
+        self._lock = threading.Lock()
+
+    def record(self, t: float, on: bool) -> None:
+        """Note the switch's state at world time `t`, which must not go back."""
+        with self._lock:
+            if on == self._changes[-1][1]:
+                return
+            self._changes.append((t, on))
+            first = bisect_right(self._changes, t - self._keep, key=lambda change: change[0])
+            del self._changes[: max(0, first - 1)]
+
+    def at(self, t: float) -> bool:
+        """Whether it was on at world time `t`."""
+        with self._lock:
+            return self._changes[max(0, bisect_right(self._changes, t, key=lambda change: change[0]) - 1)][1]

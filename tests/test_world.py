@@ -92,7 +92,7 @@ def test_assumed_noise_states_value_unit_and_meaning_of_everything() -> None:
     assert table["arm_repeatability"] == {
         "sigma": 0.04e-3,
         "unit": "m",
-        "of": "radial, anew each time the arm settles",
+        "of": "radial (1/√3 of it per axis), anew each time the arm settles",
     }
     assert all(entry["unit"] and entry["of"] for entry in table.values())
 

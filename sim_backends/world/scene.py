@@ -48,7 +48,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class CameraClock:
-    """A camera's own clock: relative drift, epoch (world s at its zero) and exposure latency, s."""
+    """A camera's own clock: relative drift, reading at world time 0, lag of time stamps behind exposures; s."""
 
     drift: float
     epoch: float
@@ -200,5 +200,5 @@ def _dh_error(d: _Draws, sigma: Deviations) -> Pose:
 def _clock(d: _Draws, name: str, sigma: Deviations) -> CameraClock:
     drift = d.scalar(name + ".drift", sigma.camera_clock_drift)
     latency = abs(d.scalar(name + ".latency", sigma.exposure_latency))
-    epoch = -abs(d.scalar(name + ".epoch", 1000.0))
+    epoch = 1000.0 + abs(d.scalar(name + ".epoch", 1000.0))
     return CameraClock(drift, epoch, latency)

@@ -1,0 +1,203 @@
+"""Serves one simulated cell: a seeded world and a peer for each device, each on a free loopback endpoint.
+
+`python -m sim_backends.serve --seed 7 --json` prints one JSON line with every endpoint when all peers are ready and
+serves until SIGINT, SIGTERM or, with `--exit-with-stdin`, the end of its standard input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+from sim_backends.peers.agilex import FAULTS as VEHICLE_FAULTS
+from sim_backends.peers.agilex import AgilexPeer
+from sim_backends.peers.frames import FAULTS as CAMERA_FAULTS
+from sim_backends.peers.frames import CameraSpec, FramePeer
+from sim_backends.peers.rtde import RtdePeer
+from sim_backends.peers.tmcl import FAULTS as RAIL_FAULTS
+from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.truth import TruthPeer
+from sim_backends.world import nominal
+from sim_backends.world.levels import LEVELS
+from sim_backends.world.scene import CameraClock
+from sim_backends.world.surfaces import SURFACES
+from sim_backends.world.truth import truth
+from sim_backends.world.world import World
+
+ARM_FAULTS = ("arm.protective_stop", "arm.emergency_stop")
+SPEEDS = (0.05, 50.0)
+"""World seconds per wall second that can be asked for."""
+
+
+class _Peer(Protocol):
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+P = TypeVar("P", bound=_Peer)
+
+
+class ServedCell:
+    """A world and its peers; use it as a context manager, or call `start` and `stop`."""
+
+    def __init__(self, world: World) -> None:
+        """Bind every endpoint of `world`. Raises OSError when no loopback address is free."""
+        self.world = world
+        clock = world.clock
+        with contextlib.ExitStack() as bound:
+            self._arm = _bound(bound, RtdePeer(world.arm, clock))
+            self._rail = _bound(bound, TmclPeer(world.rail, clock))
+            self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
+            self._cameras = {
+                name: _bound(bound, FramePeer(f"{name}_camera", clock, partial(world.render, name), _spec(world, name)))
+                for name in ("scan", "target")
+            }
+            self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset))
+            self._peers = bound.pop_all()
+        self._faults: dict[str, Callable[[], None]] = {
+            **{name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS},
+            **{name: partial(self._rail.fault, name) for name in RAIL_FAULTS},
+            **{name: partial(self._vehicle.fault, name) for name in VEHICLE_FAULTS},
+            **{name: partial(self._cameras["scan"].fault, name) for name in CAMERA_FAULTS},
+            **{f"target_{name}": partial(self._cameras["target"].fault, name) for name in CAMERA_FAULTS},
+        }
+
+    def start(self) -> None:
+        """Begin to serve; every peer answers when this returns."""
+        self.world.warm_up()
+        for peer in self._all():
+            peer.start()
+
+    def stop(self) -> None:
+        """End every connection and thread; idempotent."""
+        self._peers.close()
+
+    def __enter__(self) -> ServedCell:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def endpoints(self) -> dict[str, Any]:
+        """Where each device is, as it is printed."""
+        scene = self.world.scene
+        return {
+            "arm": {"address": self._arm.address},
+            "rail": {"url": self._rail.url},
+            "vehicle": {"interface": self._vehicle.interface, "channel": self._vehicle.channel},
+            "scan_camera": {"address": self._cameras["scan"].address},
+            "target_camera": {"address": self._cameras["target"].address},
+            "truth": {"address": self._truth.address},
+            "seed": scene.seed,
+            "level": scene.level,
+            "speed": self.world.clock.speed,
+            "surface": self.world.surface,
+            "pid": os.getpid(),
+        }
+
+    def fault(self, name: str) -> None:
+        """Cause the fault `name`, of the scan camera where it says only `camera.`; ValueError that lists the names."""
+        if name not in self._faults:
+            raise ValueError(f"unknown fault {name!r}; known: {', '.join(sorted(self._faults))}")
+        self._faults[name]()
+
+    def reset(self) -> None:
+        """Take away every fault's cause."""
+        self.world.arm.clear()
+        self._rail.clear()
+        self._vehicle.clear()
+        for camera in self._cameras.values():
+            camera.clear()
+
+    def _all(self) -> tuple[_Peer, ...]:
+        return (self._arm, self._rail, self._vehicle, *self._cameras.values(), self._truth)
+
+
+def _bound(stack: contextlib.ExitStack, peer: P) -> P:
+    stack.callback(peer.stop)
+    return peer
+
+
+def _spec(world: World, camera: str) -> CameraSpec:
+    """The identity carries the seed, so that another cell's calibration is recognised as foreign."""
+    scan = camera == "scan"
+    size, rate = (nominal.SCAN_SIZE, nominal.SCAN_RATE) if scan else (nominal.TARGET_SIZE, nominal.TARGET_RATE)
+    timing: CameraClock = world.scene.scan_clock if scan else world.scene.target_clock
+    return CameraSpec(
+        model=f"SIM-{camera.upper()}",
+        serial=f"SIM{world.scene.seed:06d}-{camera.upper()}",
+        width=size[0],
+        height=size[1],
+        frame_rate_max=rate,
+        epoch=timing.epoch,
+        drift_ppm=1e6 * timing.drift,
+        latency=timing.latency,
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Serve until told to end. Exit code 0, or 2 for a wrong option."""
+    options = _options(argv)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    if options.exit_with_stdin:
+        threading.Thread(target=_watch_stdin, args=(ended,), name="stdin", daemon=True).start()
+    try:
+        cell = ServedCell(World(options.seed, options.level, options.speed, options.surface))
+    except OSError as error:
+        print(f"no free loopback endpoint: {error}; end other simulated cells and try again", file=sys.stderr)
+        return 1
+    with cell:
+        endpoints = cell.endpoints()
+        print(json.dumps(endpoints) if options.json else _table(endpoints), flush=True)
+        ended.wait()
+    return 0
+
+
+def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="sim serve", description="Serve a simulated cell over its real protocols.")
+    parser.add_argument("--seed", type=int, default=1, help="which world, 0 or greater (default: %(default)s)")
+    parser.add_argument("--level", choices=list(LEVELS), default="nominal", help="deviations (default: %(default)s)")
+    parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second (default: %(default)s)")
+    parser.add_argument("--surface", choices=sorted(SURFACES), default="pot", help="what lies at the placement area")
+    parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
+    parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")
+    options = parser.parse_args(argv)
+    if options.seed < 0:
+        parser.error(f"--seed {options.seed} must be 0 or greater")
+    if not SPEEDS[0] <= options.speed <= SPEEDS[1]:
+        parser.error(
+            f"--speed {options.speed:g} must be within {SPEEDS[0]:g} and {SPEEDS[1]:g} world seconds per second"
+        )
+    return options
+
+
+def _watch_stdin(ended: threading.Event) -> None:
+    # Read the descriptor itself: a thread that waits inside sys.stdin holds a lock that Python's exit wants.
+    with contextlib.suppress(OSError):
+        while os.read(0, 4096):
+            pass
+    ended.set()
+
+
+def _table(endpoints: dict[str, Any]) -> str:
+    lines = []
+    for name, value in endpoints.items():
+        text = " ".join(str(part) for part in value.values()) if isinstance(value, dict) else str(value)
+        lines.append(f"{name:14} {text}")
+    return "\n".join([*lines, "serving until interrupted (Ctrl-C)"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

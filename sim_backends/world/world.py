@@ -1,0 +1,99 @@
+"""The world: the devices' models in one place, what couples them, and the pictures that the cameras take of it.
+
+The models are advanced by their peers. What they share passes through here: switches on the arm's outputs, contact,
+the vehicle's lean under the arm, and the chain of poses from the floor to the cameras.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.clock import WorldClock
+from sim_backends.history import SwitchHistory
+from sim_backends.world import hardware, nominal
+from sim_backends.world.cameras import Cameras
+from sim_backends.world.contact import PartContact
+from sim_backends.world.scene import draw
+from sim_backends.world.surfaces import surface as named_surface
+
+Pose = NDArray[np.float64]
+
+
+class World:
+    """One seeded world. `scene` holds what was drawn, `arm`, `rail` and `vehicle` the models that the peers drive."""
+
+    def __init__(self, seed: int = 1, level: str = "nominal", speed: float = 1.0, surface: str = "pot") -> None:
+        """Draw the world and let its clock run. Raises ValueError for an unknown level or surface, or a bad number."""
+        shape = named_surface(surface)
+        self.surface = surface
+        self.scene = draw(seed, level)
+        self.clock = WorldClock(speed)
+        self.arm = hardware.make_arm(self.scene, self.clock)
+        self.rail = hardware.make_rail(self.scene, self.clock)
+        self.vehicle = hardware.make_vehicle(self.scene)
+        self.part = PartContact(shape, self.scene.world_from_surface, self.scene.flange_from_part)
+        self.laser = SwitchHistory()
+        self._cameras = Cameras(self.scene, surface)
+        self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
+        self.vehicle.sag = self._sag
+        self.arm.contact = self._touch
+
+    # --- where things are ---
+
+    def world_from_base(self, t: float) -> Pose:
+        """True pose (4, 4) of the arm's base at world time `t`, the vehicle's lean included."""
+        return self.vehicle.world_from_vehicle(t) @ self.scene.vehicle_from_base
+
+    def world_from_flange(self, t: float) -> Pose:
+        """True pose (4, 4) of the flange at world time `t`."""
+        return self.world_from_base(t) @ self.arm.base_from_flange(t)
+
+    def flange_from_camera(self, camera: str, t: float) -> Pose:
+        """True pose (4, 4) of the camera "scan" or "target" on the flange at world time `t`."""
+        if camera == "target":
+            return self.scene.flange_from_target_camera
+        made = self.scene.flange_from_scan_camera.copy()
+        made[:3, 3] += made[:3, :3] @ (self.rail.carriage(t) * self.scene.rail_direction)
+        return made
+
+    # --- what the cameras see ---
+
+    def render(self, camera: str, t_mid: float, exposure: float) -> NDArray[np.uint8]:
+        """The picture (height, width) of "scan" or "target": the world as it was at `t_mid`, exposed `exposure` s."""
+        world_from_base = self.world_from_base(t_mid)
+        world_from_flange = world_from_base @ self.arm.base_from_flange(t_mid)
+        world_from_camera = world_from_flange @ self.flange_from_camera(camera, t_mid)
+        return self._cameras.picture(camera, world_from_camera, world_from_base, self.laser.at(t_mid), exposure)
+
+    def warm_up(self) -> None:
+        """Render one picture of everything, so that compiling is over before the first client asks for one."""
+        base = self.world_from_base(self.clock.now())
+        for camera, distance in (("scan", nominal.SCAN_FOCUS), ("target", nominal.TARGET_FOCUS)):
+            for target in (self.scene.world_from_surface, self.scene.world_from_board):
+                facing = target @ nominal.pose((0.0, 0.0, distance), (1, 0, 0), (0, 0, -1))
+                self._cameras.picture(camera, facing, base, True, 0.002)
+
+    # --- what couples the devices ---
+
+    def _touch(self, base_from_flange: Pose) -> NDArray[np.float64]:
+        """Called by the arm at every tick: follow its outputs, then give the wrench (6,) on the flange in base axes."""
+        t = self.arm.time
+        world_from_base = self.world_from_base(t)
+        world_from_flange = world_from_base @ base_from_flange
+        outputs = self.arm.digital_outputs
+        self.laser.record(t, bool(outputs >> nominal.LASER_OUTPUT & 1))
+        self.part.set_claw(bool(outputs >> nominal.CLAW_OUTPUT & 1), world_from_flange)
+        self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
+        wrench = self.part.wrench(world_from_flange)
+        base_from_world = world_from_base[:3, :3].T
+        return np.concatenate([base_from_world @ wrench[:3], base_from_world @ wrench[3:]])
+
+    def _sag(self) -> tuple[float, float, float]:
+        """Roll, pitch (rad) and height (m) of the body: it leans towards where the arm reaches out."""
+        reach = self.arm.base_from_flange(self.clock.now())[:3, 3]
+        return (
+            float(-self.scene.suspension[1] * reach[1]),
+            float(self.scene.suspension[0] * reach[0]),
+            0.0,
+        )
