@@ -1,0 +1,227 @@
+"""A skid-steered vehicle that speaks AgileX protocol v2 over CAN.
+
+The set velocity is kept alive by a thread of the driver, which falls back to zero when nobody renews it; the vehicle
+itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, CellError, DeadlineError, InterlockError, NotConnectedError
+from drivers.interfaces import Identity, LinkStatistics, VehicleState
+from drivers.quantities import check_range
+from drivers.vehicle.can_link import CanLink, load_database
+from drivers.vehicle.feedback import CAN_MODE, WANTED, Feedback, patience
+
+KEEP_ALIVE_S = 0.020
+DEAD_MAN_S = 0.5
+"""A velocity that has not been renewed for this long is replaced by zero."""
+STOP_TIMEOUT_S = 4.0
+ENABLE_TIMEOUT_S = 2.0
+REPLY_TIMEOUT_S = 0.5
+FIRST_FEEDBACK_S = 1.0
+_ENABLE_RETRY_S = 0.3
+_KEEP_ALIVE_WALL_S = 0.005
+
+
+class AgilexVehicle:
+    """A vehicle on the python-can bus (`interface`, `channel`).
+
+    `track` in m between left and right wheels, effective for turning on the spot; `max_speed` in m/s, `max_yaw_rate`
+    in rad/s; `bus_options` go to python-can. Raises `NotConnectedError` when no vehicle reports on the bus.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        interface: str,
+        channel: str,
+        *,
+        bitrate: int = 500_000,
+        track: float,
+        max_speed: float,
+        max_yaw_rate: float,
+        clock: Clock,
+        bus_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self._address = f"{interface}:{channel}"
+        self._max_speed = max_speed
+        self._max_yaw_rate = max_yaw_rate
+        self._clock = clock
+        self._feedback = Feedback(name, clock, track=track, max_speed=max_speed, statistics=self.statistics)
+        self._command = threading.Lock()
+        self._velocity = (0.0, 0.0)
+        self._renewed = -math.inf
+        self._enabled = False
+        self._braked = False
+        self._stopping = 0
+        self._closed = threading.Event()
+        self._open = partial(
+            CanLink,
+            name,
+            interface,
+            channel,
+            bitrate=bitrate,
+            options=dict(bus_options or {}),
+            database=load_database(),
+            wanted=WANTED,
+            receive=self._feedback.take,
+            statistics=self.statistics,
+        )
+        self._link = self._open()
+        if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
+            self._link.close()
+            raise NotConnectedError(
+                name, f"no vehicle reports on {self._address}. Check that it is on, and the bit rate"
+            )
+        self._keeper = threading.Thread(target=self._keep_alive, name=f"{name} keep-alive", daemon=True)
+        self._keeper.start()
+
+    def identity(self) -> Identity:
+        """Versions from the version request; the protocol has no serial number."""
+        versions = {name: round(value) for name, value in self._versions().items()}
+        return Identity(
+            f"AgileX v2, hardware {versions['ControllerHardware']}/{versions['DriverHardware']}",
+            "",
+            f"controller {versions['ControllerSoftware']}, drivers {versions['DriverSoftware']}",
+            self._address,
+        )
+
+    def ping(self) -> float:
+        """One version request and its answer, in wall seconds."""
+        before = self._clock.now()
+        self._versions()
+        return self._clock.wall(self._clock.now() - before)
+
+    def state(self, max_age: float = 0.2) -> VehicleState:
+        """The newest feedback, at most `max_age` s old (see `Feedback.state`), else `DeadlineError`."""
+        self._link.check()
+        return self._feedback.state(max_age, self._braked)
+
+    def enable(self) -> None:
+        """Take command over CAN and release the brake; opens the bus again if it had failed.
+
+        Raises `DeviceFault` on an emergency stop or an error that does not clear, `DeadlineError` when the vehicle
+        does not change to CAN mode.
+        """
+        if self._closed.is_set():
+            raise NotConnectedError(self.name, "the vehicle was closed. Open it again")
+        with self._command:
+            self._velocity = (0.0, 0.0)
+            if not self._link.alive:
+                self._link.close()
+                self._link = self._open()
+                self.statistics.count("reopened")
+        deadline = self._clock.now() + patience(self._clock, ENABLE_TIMEOUT_S)
+        while True:
+            asked = self._clock.now()
+            self._link.send("ClearErrorsCommand", Which=0)
+            self._link.send("ControlModeCommand", Mode=CAN_MODE)
+            if self._wait_for(partial(self._feedback.commanded, asked), _ENABLE_RETRY_S):
+                break
+            if self._clock.now() > deadline:
+                self._feedback.check()
+                raise DeadlineError(
+                    self.name,
+                    f"did not change to CAN mode within {ENABLE_TIMEOUT_S:.0f} s. Is the remote control in charge?",
+                )
+        self._link.send("BrakeCommand", Locked=0)
+        self._braked = False
+        self._enabled = True
+
+    def drive(self, speed: float, yaw_rate: float) -> None:
+        """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero.
+
+        Raises `LimitError`, `InterlockError` before `enable()` or when another has taken command, `DeviceFault` on
+        emergency stop, vehicle error or lost feedback, `Aborted` while a stop is under way.
+        """
+        speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        self._link.check()
+        self._feedback.check()
+        if self._braked or not self._enabled or self._feedback.get("SystemState")[1]["Mode"] != CAN_MODE:
+            reason = "the brake is locked" if self._braked else "it is not under CAN command"
+            raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
+        with self._command:
+            if self._stopping:
+                raise Aborted(f"{self.name}: a stop is under way")
+            self._velocity = (speed, yaw_rate)
+            self._renewed = self._clock.now()
+            self._send_velocity()
+
+    def stop(self) -> None:
+        """Command zero at once and wait until the vehicle reports standstill; `DeadlineError` after 4 s."""
+        with self._command:
+            self._velocity = (0.0, 0.0)
+            self._stopping += 1
+        try:
+            asked = self._clock.now()
+            with self._command:
+                self._send_velocity()
+            if not self._wait_for(partial(self._feedback.stands, asked), STOP_TIMEOUT_S):
+                self._link.check()
+                raise DeadlineError(
+                    self.name,
+                    f"did not report standstill within {STOP_TIMEOUT_S:.0f} s of the stop. Press its emergency stop",
+                )
+        finally:
+            with self._command:
+                self._stopping -= 1
+
+    def brake(self) -> None:
+        """Stop, wait for standstill and lock the brake; it stays locked until `enable()`."""
+        self.stop()
+        self._link.send("BrakeCommand", Locked=1)
+        self._braked = True
+
+    def close(self) -> None:
+        """Stop the vehicle, end the threads and shut the bus down."""
+        if self._closed.is_set():
+            return
+        try:
+            self.stop()
+        finally:
+            self._closed.set()
+            self._keeper.join(2.0)
+            self._link.close()
+
+    def _keep_alive(self) -> None:
+        period = max(self._clock.wall(KEEP_ALIVE_S), _KEEP_ALIVE_WALL_S)
+        while not self._closed.wait(period):
+            with self._command:
+                if self._velocity != (0.0, 0.0) and self._clock.now() - self._renewed > DEAD_MAN_S:
+                    self._velocity = (0.0, 0.0)
+                    self.statistics.count("dead_man")
+                if self._enabled and self._link.alive:
+                    try:
+                        self._send_velocity()
+                    except CellError:
+                        self.statistics.count("keep_alive_failed")
+
+    def _send_velocity(self) -> None:
+        """Send the set velocity, holding `_command`: else an older velocity could follow the zero of a stop."""
+        speed, yaw_rate = self._velocity
+        self._link.send("MotionCommand", Speed=speed, YawRate=yaw_rate, LateralSpeed=0.0, Steering=0.0)
+
+    def _versions(self) -> dict[str, float]:
+        for _ in range(2):
+            asked = self._clock.now()
+            self._link.send("VersionRequest", Request=1)
+            if self._wait_for(partial(self._feedback.newer, "VersionResponse", asked), REPLY_TIMEOUT_S):
+                answered, versions = self._feedback.get("VersionResponse")
+                self.statistics.add_round_trip(self._clock.wall(answered - asked))
+                return versions
+            self.statistics.count("timeouts")
+        self._link.check()
+        raise DeadlineError(self.name, "does not answer the version request. Check the CAN bus")
+
+    def _wait_for(self, happened: Callable[[], bool], timeout: float) -> bool:
+        return self._feedback.wait_for(happened, timeout, lambda: self._link.alive)

@@ -1,0 +1,151 @@
+"""The CAN bus with its message table: sending, and a receive thread that never dies unnoticed.
+
+python-can's own notifier thread ends silently on a bus error; this one keeps the reason, and every later use of the
+link raises it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from importlib.resources import as_file, files
+from typing import Any, cast
+
+import can
+import cantools
+from cantools.database.can import Database, Message
+
+from drivers.errors import ConfigError, DeviceFault, NotConnectedError
+from drivers.interfaces import LinkStatistics
+
+RECEIVE_TIMEOUT_S = 0.1
+SEND_TIMEOUT_S = 0.5
+
+
+def load_database() -> Database:
+    """The AgileX v2 messages of `agilex_v2.dbc`."""
+    with as_file(files("drivers.vehicle") / "agilex_v2.dbc") as path:
+        return cast(Database, cantools.database.load_file(path))
+
+
+class CanLink:
+    """An open CAN bus; `receive` is called in the receive thread with each known message's name and signal values.
+
+    `wanted` names the messages that are decoded; others are ignored. Raises `NotConnectedError` when the bus cannot be
+    opened, `ConfigError` when python-can has no such interface.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        interface: str,
+        channel: str,
+        *,
+        bitrate: int,
+        options: Mapping[str, Any],
+        database: Database,
+        wanted: frozenset[str],
+        receive: Callable[[str, dict[str, float]], None],
+        statistics: LinkStatistics,
+    ) -> None:
+        self._name = name
+        self._address = f"{interface}:{channel}"
+        self._database = database
+        self._wanted: dict[int, Message] = {
+            message.frame_id: message for message in database.messages if message.name in wanted
+        }
+        self._receive = receive
+        self._statistics = statistics
+        self._sending = threading.Lock()
+        self._closing = threading.Event()
+        self._failure: str | None = None
+        self._bus = self._open(interface, channel, bitrate, options)
+        self._thread = threading.Thread(target=self._run, name=f"{name} receiver", daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """True while the bus works and its receive thread runs."""
+        return self._failure is None and self._thread.is_alive()
+
+    def check(self) -> None:
+        """Raise `NotConnectedError` after `close`, `DeviceFault` (vehicle.link_lost) when the bus has failed."""
+        if self._closing.is_set():
+            raise NotConnectedError(self._name, "the vehicle was closed. Open it again")
+        if not self.alive:
+            raise DeviceFault(
+                self._name,
+                "vehicle.link_lost",
+                f"the CAN bus at {self._address} failed: {self._failure or 'the receive thread has ended'}; "
+                "the vehicle stops by itself 0.5 s after the last command",
+                recoverable=True,
+                hint="Check the adapter and its cable, then enable() the vehicle, which opens the bus again.",
+            )
+
+    def send(self, name: str, **signals: float) -> None:
+        """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
+        self.check()
+        message = self._database.get_message_by_name(name)
+        frame = can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
+        try:
+            with self._sending:
+                self._bus.send(frame, timeout=SEND_TIMEOUT_S)
+        except (can.CanError, OSError) as error:
+            self._fail(f"sending {name}: {error}")
+            self.check()
+
+    def close(self) -> None:
+        """End the receive thread and shut the bus down; idempotent."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(10 * RECEIVE_TIMEOUT_S + SEND_TIMEOUT_S)
+        # A bus whose peer is gone cannot say goodbye; its socket is released all the same.
+        with suppress(can.CanError, OSError), self._sending:
+            self._bus.shutdown()
+
+    def _open(self, interface: str, channel: str, bitrate: int, options: Mapping[str, Any]) -> can.BusABC:
+        settings: dict[str, Any] = {"bitrate": bitrate, **options}
+        if interface == "slcan" and channel.startswith("socket://"):
+            # The default waits 2 s for a serial adapter to boot, which one behind a socket has done already.
+            settings.setdefault("sleep_after_open", 0.0)
+        try:
+            return can.Bus(channel=channel, interface=interface, **settings)
+        except can.CanInterfaceNotImplementedError as error:
+            raise ConfigError(f"{self._name}: CAN interface {interface!r} cannot be used: {error}") from error
+        except (can.CanError, OSError, ValueError) as error:
+            raise NotConnectedError(
+                self._name,
+                f"CAN bus {self._address} at {bitrate} bit/s cannot be opened: {error}. "
+                "Check interface, channel and adapter",
+            ) from error
+
+    def _fail(self, reason: str) -> None:
+        if self._failure is None:
+            self._failure = reason
+            self._statistics.count("link_lost")
+
+    def _run(self) -> None:
+        while not self._closing.is_set() and self._failure is None:
+            try:
+                frame = self._bus.recv(RECEIVE_TIMEOUT_S)
+                if frame is not None:
+                    self._handle(frame)
+            except (ValueError, IndexError):
+                self._statistics.count("malformed")
+            except Exception as error:
+                self._fail(f"receiving: {error}")
+
+    def _handle(self, frame: can.Message) -> None:
+        if frame.is_error_frame:
+            self._statistics.count("error_frames")
+            return
+        message = self._wanted.get(frame.arbitration_id)
+        if message is None or frame.is_extended_id or frame.is_remote_frame:
+            return
+        if len(frame.data) != message.length:
+            self._statistics.count("malformed")
+            return
+        self._receive(message.name, cast(dict[str, float], message.decode(bytes(frame.data), decode_choices=False)))
