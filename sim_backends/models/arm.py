@@ -85,6 +85,7 @@ class ArmModel:
         self.payload = (0.0, np.zeros(3))
         self.wrench = np.zeros(6)
         self.time = clock.now()
+        self._speed_limits = (1.02 * params.speed_limits).tolist()
         self._true_kinematics = Kinematics(params.dh + params.dh_error)
         self._rng = rng
         self._lock = threading.RLock()
@@ -97,6 +98,7 @@ class ArmModel:
         self._error_from = self._draw_error()
         self._error_to = self._error_from
         self._error = self._error_from
+        self._error_turn = rotation_matrix(self._error[3:])
         self._blend = 1.0
         self._true_q: Vector | None = None
         self._history = History()
@@ -181,7 +183,7 @@ class ArmModel:
     @property
     def moving(self) -> bool:
         """True while a joint turns."""
-        return float(np.abs(self.drive.qd).max()) > _REST_SPEED
+        return bool(max(map(abs, self.drive.qd.tolist())) > _REST_SPEED)
 
     @property
     def steady(self) -> bool:
@@ -287,28 +289,29 @@ class ArmModel:
             if not self._begun:
                 self._queue[0].begin(self.drive)
                 self._begun = True
-            if self._queue[0].step(self.drive, dt):
-                self._queue.popleft()
-                self._begun = False
+            motion = self._queue[0]
+            ended = motion.step(self.drive, dt)
         except MotionError as error:
             self.protective_stop(str(error))
             return
         self._check_limits(before)
+        if ended and self.motion is motion:
+            self._queue.popleft()
+            self._begun = False
 
     def _check_limits(self, before: Vector) -> None:
-        drive = self.drive
-        if (np.abs(drive.q) > self.params.joint_limit).any() or not np.isfinite(drive.q).all():
-            joint = int(np.argmax(np.abs(drive.q)))
-            drive.q = before
-            drive.qd = np.zeros(6)
-            self.protective_stop(f"joint {joint} at its limit of ±{math.degrees(self.params.joint_limit):.0f}°")
-        elif (np.abs(drive.qd) > 1.02 * self.params.speed_limits).any() and self.safety is Safety.NORMAL:
-            joint = int(np.argmax(np.abs(drive.qd) / self.params.speed_limits))
-            if isinstance(self._queue[0] if self._queue else None, Stop):
+        drive, params = self.drive, self.params
+        q, qd = drive.q.tolist(), drive.qd.tolist()
+        for joint in range(6):
+            if not abs(q[joint]) <= params.joint_limit:
+                drive.q, drive.qd = before, np.zeros(6)
+                self.protective_stop(f"joint {joint} at its limit of ±{math.degrees(params.joint_limit):.0f}°")
                 return
-            drive.q = before
-            drive.qd = np.clip(drive.qd, -self.params.speed_limits, self.params.speed_limits)
-            self.protective_stop(f"joint {joint} faster than its limit")
+            if abs(qd[joint]) > self._speed_limits[joint] and not isinstance(self.motion, Stop):
+                drive.q = before
+                drive.qd = np.clip(drive.qd, -params.speed_limits, params.speed_limits)
+                self.protective_stop(f"joint {joint} faster than its limit of {params.speed_limits[joint]:.2f} rad/s")
+                return
 
     def _feel(self) -> None:
         if self.contact is None:
@@ -335,6 +338,7 @@ class ArmModel:
             self._blend = min(1.0, self._blend + dt / self.params.blend_time)
             angle = 0.5 * math.pi * self._blend
             self._error = math.cos(angle) * self._error_from + math.sin(angle) * self._error_to
+            self._error_turn = rotation_matrix(self._error[3:])
             self._true_q = None
 
     def _remember_true_pose(self, keep: bool = True) -> None:
@@ -343,7 +347,7 @@ class ArmModel:
         if self._true_q is not self.drive.q:
             pose = self._true_kinematics.forward(self.drive.q)
             pose[:3, 3] += self._error[:3]
-            pose[:3, :3] = rotation_matrix(self._error[3:]).dot(pose[:3, :3])
+            pose[:3, :3] = self._error_turn.dot(pose[:3, :3])
             self._true_pose = pose
             self._true_q = self.drive.q
         if keep:

@@ -28,6 +28,10 @@ UR10E_DH: Matrix = np.array(
 )
 """One row per joint: a in m, d in m, alpha in rad, joint offset in rad."""
 
+_Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""Axes x, y, z and origin of a frame, three numbers each."""
+_BASE: _Frame = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+_EYE = np.eye(6)
 _MAX_STEP = 0.5
 _RESTARTS = (
     (0.0,) * 6,
@@ -43,38 +47,23 @@ class Kinematics:
     def __init__(self, table: Matrix) -> None:
         if table.shape != (6, 4) or not np.all(np.isfinite(table)):
             raise ValueError(f"a DH table needs finite numbers in shape (6, 4), got shape {table.shape}")
-        a, d, alpha, offset = table.T
-        self._offset = offset.copy()
-        self._links = np.zeros((6, 4, 4))
-        for i in range(6):
-            ca, sa = math.cos(alpha[i]), math.sin(alpha[i])
-            self._links[i] = [[1, 0, 0, a[i]], [0, ca, -sa, 0], [0, sa, ca, d[i]], [0, 0, 0, 1]]
+        self._links = [(a, d, math.cos(alpha), math.sin(alpha), offset) for a, d, alpha, offset in table.tolist()]
 
     def forward(self, q: Vector) -> Matrix:
         """base_from_flange (4, 4) at joint angles `q` (6,)."""
-        joints = self._joint_matrices(q)
-        pose: Matrix = joints[0]
-        for i in range(1, 6):
-            pose = pose.dot(joints[i])
-        return pose
+        return _matrix(self._chain(q)[-1])
 
     def forward_with_jacobian(self, q: Vector) -> tuple[Matrix, Matrix]:
         """base_from_flange (4, 4) and the Jacobian (6, 6) of flange velocity and rotation rate in base axes."""
-        joints = self._joint_matrices(q)
-        axes = np.empty((6, 3))
-        origins = np.empty((6, 3))
-        pose = np.eye(4)
-        for i in range(6):
-            axes[i] = pose[:3, 2]
-            origins[i] = pose[:3, 3]
-            pose = pose.dot(joints[i])
-        jacobian = np.empty((6, 6))
-        arm = pose[:3, 3] - origins
-        jacobian[0] = axes[:, 1] * arm[:, 2] - axes[:, 2] * arm[:, 1]
-        jacobian[1] = axes[:, 2] * arm[:, 0] - axes[:, 0] * arm[:, 2]
-        jacobian[2] = axes[:, 0] * arm[:, 1] - axes[:, 1] * arm[:, 0]
-        jacobian[3:] = axes.T
-        return pose, jacobian
+        frames = self._chain(q)
+        flange = frames[-1]
+        px, py, pz = flange[9:]
+        rows = []
+        for frame in frames[:-1]:
+            zx, zy, zz = frame[6:9]
+            x, y, z = px - frame[9], py - frame[10], pz - frame[11]
+            rows.append((zy * z - zz * y, zz * x - zx * z, zx * y - zy * x, zx, zy, zz))
+        return _matrix(flange), np.array(rows).T
 
     def inverse(
         self, target: Matrix, near: Vector, limit: float = 2 * math.pi, tolerance: float = 1e-9
@@ -98,26 +87,38 @@ class Kinematics:
         for _ in range(iterations):
             pose, jacobian = self.forward_with_jacobian(q)
             error = pose_error(target, pose)
-            size = float(np.abs(error).max())
+            size = max(map(abs, error.tolist()))
             if size < tolerance:
                 return q
+            # Damping that fades with the error converges quadratically and yet passes singularities.
             damping = 1e-3 * size + 1e-12
-            step = jacobian.T.dot(np.linalg.solve(jacobian.dot(jacobian.T) + damping * np.eye(6), error))
-            longest = float(np.abs(step).max())
+            step = jacobian.T.dot(np.linalg.solve(jacobian.dot(jacobian.T) + damping * _EYE, error))
+            longest = max(map(abs, step.tolist()))
             q = q + step * min(1.0, _MAX_STEP / longest) if longest > 0 else q
         return None
 
-    def _joint_matrices(self, q: Vector) -> Matrix:
-        angles = q + self._offset
-        cosine, sine = np.cos(angles), np.sin(angles)
-        turn = np.zeros((6, 4, 4))
-        turn[:, 0, 0] = cosine
-        turn[:, 1, 1] = cosine
-        turn[:, 1, 0] = sine
-        turn[:, 0, 1] = -sine
-        turn[:, 2, 2] = 1.0
-        turn[:, 3, 3] = 1.0
-        return turn @ self._links
+    def _chain(self, q: Vector) -> list[_Frame]:
+        """Axes and origins of the base and the six link frames.
+
+        Plain floats: on matrices this small they are several times faster than arrays, and the arm's tick rests on it.
+        """
+        frames = [_BASE]
+        x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = _BASE
+        for angle, (a, d, ca, sa, offset) in zip(q.tolist(), self._links, strict=True):
+            c, s = math.cos(angle + offset), math.sin(angle + offset)
+            p0, p1, p2 = p0 + d * z0, p1 + d * z1, p2 + d * z2
+            n0, n1, n2 = c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2
+            x0, x1, x2 = c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2
+            p0, p1, p2 = p0 + a * x0, p1 + a * x1, p2 + a * x2
+            y0, y1, y2 = ca * n0 + sa * z0, ca * n1 + sa * z1, ca * n2 + sa * z2
+            z0, z1, z2 = ca * z0 - sa * n0, ca * z1 - sa * n1, ca * z2 - sa * n2
+            frames.append((x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2))
+        return frames
+
+
+def _matrix(frame: _Frame) -> Matrix:
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
+    return np.array(((x0, y0, z0, p0), (x1, y1, z1, p1), (x2, y2, z2, p2), (0.0, 0.0, 0.0, 1.0)))
 
 
 def pose_error(target: Matrix, pose: Matrix) -> Vector:

@@ -48,11 +48,15 @@ class Drive:
 
     def tcp_jacobian(self) -> Matrix:
         """Jacobian (6, 6) of the tool point's velocity and rotation rate in base axes."""
+        return self.tcp_state()[1]
+
+    def tcp_state(self) -> tuple[Matrix, Matrix]:
+        """base_from_flange (4, 4) and the Jacobian (6, 6) of the tool point."""
         pose, jacobian = self.kinematics.forward_with_jacobian(self.q)
-        x, y, z = pose[:3, :3].dot(self.flange_from_tcp[:3, 3])
-        lever = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-        jacobian[:3] += lever.dot(jacobian[3:])
-        return jacobian
+        if self.flange_from_tcp[:3, 3].any():
+            x, y, z = pose[:3, :3].dot(self.flange_from_tcp[:3, 3])
+            jacobian[:3] += np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]).dot(jacobian[3:])
+        return pose, jacobian
 
     def move_with(self, qd: Vector, dt: float) -> None:
         """Change to joint speeds `qd` evenly over `dt`."""
@@ -163,7 +167,7 @@ class LinearMove(Motion):
         pose = np.eye(4)
         pose[:3, :3] = rotation_matrix(self._turn * fraction).dot(self._start[:3, :3])
         pose[:3, 3] = self._start[:3, 3] + self._way * fraction
-        q = drive.kinematics.refine(pose.dot(self._tcp_from_flange), drive.q)
+        q = drive.kinematics.refine(pose.dot(self._tcp_from_flange), drive.q + dt * drive.qd)
         if q is None:
             raise MotionError("the straight line leaves the reach of the arm or passes a singularity")
         done = self._time >= self._profile.duration

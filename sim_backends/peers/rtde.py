@@ -24,11 +24,13 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.peers.controller_ports import Client, TcpPorts
 from sim_backends.peers.dashboard import BANNER, VERSION, Dashboard
-from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, Getter, Registers, View, apply_inputs
+from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, Getter, InputRecipe, Registers, View
 from sim_backends.peers.script import ControlProgram, ScriptText
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
+_CATCH_UP = 25
+"""Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 
 _log = logging.getLogger(__name__)
@@ -50,24 +52,6 @@ class _OutputRecipe:
         return self.packer.pack(self.packer.size, ord("U"), self.number, *values)
 
 
-class _InputRecipe:
-    def __init__(self, names: list[str]) -> None:
-        self._fields = [(name, INPUTS[name]) for name in names]
-        self._unpacker = struct.Struct(">" + "".join(FORMATS[kind] for _, kind in self._fields))
-
-    def values(self, payload: bytes) -> dict[str, float]:
-        """Named values; real clients send packets that are too long or too short, which count as cut or padded."""
-        data = payload[: self._unpacker.size].ljust(self._unpacker.size, b"\0")
-        numbers = list(self._unpacker.unpack(data))
-        values = {}
-        for name, kind in self._fields:
-            if kind.startswith("VECTOR"):
-                del numbers[: int(kind[6])]
-            else:
-                values[name] = numbers.pop(0)
-        return values
-
-
 class _Session:
     """One RTDE connection: its recipes and whether it has been started."""
 
@@ -75,7 +59,7 @@ class _Session:
         self._peer = peer
         self._client = client
         self._buffer = b""
-        self._inputs: dict[int, _InputRecipe] = {}
+        self._inputs: dict[int, InputRecipe] = {}
         self._outputs: list[_OutputRecipe] = []
         self.started = False
 
@@ -128,7 +112,7 @@ class _Session:
         usable = names and not {"NOT_FOUND", "IN_USE"} & set(kinds)
         number = len(self._inputs) + 1 if usable else 0
         if usable:
-            self._inputs[number] = _InputRecipe(names)
+            self._inputs[number] = self._peer.input_recipe(names)
         self._reply("I", bytes([number & 255]) + ",".join(kinds).encode())
 
     def _claim(self, name: str) -> str:
@@ -147,7 +131,7 @@ class _Session:
     def _on_data(self, payload: bytes) -> None:
         recipe = self._inputs.get(payload[0]) if payload else None
         if recipe is not None:
-            self._peer.write_inputs(recipe.values(payload[1:]))
+            recipe.apply(payload[1:], self._peer.wall_time)
 
     _HANDLERS: dict[str, Callable[[_Session, bytes], None]] = {  # noqa: RUF012
         "V": _on_protocol,
@@ -204,11 +188,13 @@ class RtdePeer:
         """Give an input variable to a connection; False when another one holds it."""
         return self._owners.setdefault(name, session) is session
 
-    def write_inputs(self, values: dict[str, float]) -> None:
-        """Apply one data packet from a client."""
-        apply_inputs(values, self._model, self._registers, self._wall())
+    def input_recipe(self, names: list[str]) -> InputRecipe:
+        """A recipe that writes to this controller's inputs."""
+        return InputRecipe(names, self._model, self._registers)
 
-    def _wall(self) -> float:
+    @property
+    def wall_time(self) -> float:
+        """Seconds on the wall at the newest tick."""
         return self._clock.wall(self._model.time)
 
     def _run(self) -> None:
@@ -220,8 +206,9 @@ class RtdePeer:
                 late = self._clock.now() - due
                 self._note(late)
                 self._tick(due)
-                # Late by more than a period: skip packets like a controller that lost cycles, keep the rhythm.
-                due += period * (1 + max(0, int((self._clock.now() - due) / period)))
+                due += period
+                if self._clock.now() - due > _CATCH_UP * period:
+                    due = self._clock.now()
         finally:
             self._ports.close()
 

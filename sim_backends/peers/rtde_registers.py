@@ -5,7 +5,9 @@ Names and types follow the maker's RTDE guide; a `View` computes what is costly 
 
 from __future__ import annotations
 
+import math
 import re
+import struct
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -51,28 +53,41 @@ class View:
         self.model = model
         self.registers = registers
         self.runtime_state = 1
-        self._stamp = -1.0
         self._q: Vector | None = None
+        self._qd: Vector | None = None
         self._tool: Matrix | None = None
+        self._turn = np.eye(3)
+        self._jacobian: Matrix = np.eye(6)
         self._pose: list[float] = []
-        self._twist: list[float] = []
-        self._speed_stamp = -1.0
+        self._speed: list[float] = []
 
     def tcp_pose(self) -> list[float]:
         """Tool pose as a 6-vector."""
-        drive = self.model.drive
-        if self._q is not drive.q or self._tool is not drive.flange_from_tcp:
-            self._pose = pose_from_matrix(drive.base_from_tcp()).tolist()
-            self._q, self._tool = drive.q, drive.flange_from_tcp
+        self._update()
         return self._pose
 
     def tcp_speed(self) -> list[float]:
-        """Tool velocity and rotation rate in base axes."""
-        model = self.model
-        if self._speed_stamp != model.time:
-            self._twist = model.drive.tcp_jacobian().dot(model.drive.qd).tolist() if model.moving else _ZERO6
-            self._speed_stamp = model.time
-        return self._twist
+        """Tool velocity and rotation rate (6,) in base axes."""
+        self._update()
+        if self._qd is not self.model.drive.qd:
+            self._qd = self.model.drive.qd
+            self._speed = self._jacobian.dot(self._qd).tolist()
+        return self._speed
+
+    def raw_wrench(self) -> list[float]:
+        """What the force sensor in the flange feels, in flange axes, without any zero."""
+        self._update()
+        wrench = self.model.wrench
+        return [*wrench[:3].dot(self._turn).tolist(), *wrench[3:].dot(self._turn).tolist()]
+
+    def _update(self) -> None:
+        drive = self.model.drive
+        if self._q is drive.q and self._tool is drive.flange_from_tcp:
+            return
+        self._q, self._tool, self._qd = drive.q, drive.flange_from_tcp, None
+        flange, self._jacobian = drive.tcp_state()
+        self._turn = flange[:3, :3]
+        self._pose = pose_from_matrix(flange.dot(self._tool)).tolist()
 
     def safety_bits(self) -> int:
         """RTDE `safety_status_bits`."""
@@ -95,13 +110,7 @@ _SAFETY_BITS = {
 
 
 def _momentum(view: View) -> float:
-    return 5.0 * float(np.linalg.norm(view.tcp_speed()[:3]))
-
-
-def _raw_wrench(view: View) -> list[float]:
-    turn = view.model.reported_flange()[:3, :3].T
-    wrench = view.model.wrench
-    return [*turn.dot(wrench[:3]).tolist(), *turn.dot(wrench[3:]).tolist()]
+    return 5.0 * math.hypot(*view.tcp_speed()[:3])
 
 
 OUTPUTS: dict[str, tuple[str, Getter]] = {
@@ -148,8 +157,8 @@ OUTPUTS: dict[str, tuple[str, Getter]] = {
     "standard_analog_output0": ("DOUBLE", lambda v: (v.registers.analog_out[0],)),
     "standard_analog_output1": ("DOUBLE", lambda v: (v.registers.analog_out[1],)),
     "io_current": ("DOUBLE", lambda v: (0.0,)),
-    "tcp_force_scalar": ("DOUBLE", lambda v: (float(np.linalg.norm(v.model.felt[:3])),)),
-    "ft_raw_wrench": ("VECTOR6D", _raw_wrench),
+    "tcp_force_scalar": ("DOUBLE", lambda v: (math.hypot(*v.model.felt[:3]),)),
+    "ft_raw_wrench": ("VECTOR6D", View.raw_wrench),
     "payload": ("DOUBLE", lambda v: (v.model.payload[0],)),
     "payload_cog": ("VECTOR3D", lambda v: v.model.payload[1].tolist()),
     "payload_inertia": ("VECTOR6D", lambda v: _ZERO6),
@@ -193,39 +202,55 @@ INPUTS: dict[str, str] = {
 }
 """Writable variables and their types."""
 
-_COMMAND_REGISTERS = ("0", "24")
+_COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
 _REGISTER = re.compile(r"input_(int|double)_register_(\d+)")
 
 
-def apply_inputs(values: dict[str, float], model: ArmModel, registers: Registers, wall_time: float) -> None:
-    """Write the variables of one data packet; masked outputs change only where their mask says so."""
-    for name, value in values.items():
-        match = _REGISTER.fullmatch(name)
-        if match is None:
-            continue
-        if match[1] == "int":
-            registers.int_in[int(match[2])] = int(value)
-            if match[2] in _COMMAND_REGISTERS:
-                registers.commanded_at = wall_time
-                registers.command_fields = frozenset(values)
-        else:
-            registers.double_in[int(match[2])] = value
-    if "standard_digital_output_mask" in values:
-        model.write_digital_outputs(
-            int(values["standard_digital_output_mask"]), int(values.get("standard_digital_output", 0))
-        )
-    if "configurable_digital_output_mask" in values:
-        model.write_digital_outputs(
-            int(values["configurable_digital_output_mask"]) << 8,
-            int(values.get("configurable_digital_output", 0)) << 8,
-        )
-    if "tool_digital_output_mask" in values:
-        model.write_digital_outputs(
-            (int(values["tool_digital_output_mask"]) & 3) << 16, (int(values.get("tool_digital_output", 0)) & 3) << 16
-        )
-    if int(values.get("speed_slider_mask", 0)) & 1:
-        model.drive.speed_fraction = min(1.0, max(0.0, values.get("speed_slider_fraction", 1.0)))
-    mask = int(values.get("standard_analog_output_mask", 0))
-    for i in (0, 1):
-        if mask >> i & 1:
-            registers.analog_out[i] = values.get(f"standard_analog_output_{i}", 0.0)
+class InputRecipe:
+    """The variables that one kind of data packet carries, in order."""
+
+    def __init__(self, names: list[str], model: ArmModel, registers: Registers) -> None:
+        """`names` are keys of `INPUTS`."""
+        self._model = model
+        self._registers = registers
+        self._names = frozenset(names)
+        self._unpacker = struct.Struct(">" + "".join(FORMATS[INPUTS[name]] for name in names))
+        self._slots: list[tuple[list[int] | list[float], int]] = []
+        self._others: list[tuple[str, int]] = []
+        place = 0
+        for name in names:
+            match = _REGISTER.fullmatch(name)
+            if match is None:
+                self._others.append((name, place))
+                self._slots += [([0.0], 0)] * (6 if INPUTS[name] == "VECTOR6D" else 1)
+            elif match[1] == "int":
+                self._slots.append((registers.int_in, int(match[2])))
+            else:
+                self._slots.append((registers.double_in, int(match[2])))
+            place = len(self._slots)
+
+    def apply(self, payload: bytes, wall_time: float) -> None:
+        """Write one packet's values; real clients send packets too long or too short, which are cut or padded."""
+        size = self._unpacker.size
+        numbers = self._unpacker.unpack(payload if len(payload) == size else payload[:size].ljust(size, b"\0"))
+        for (bank, index), number in zip(self._slots, numbers, strict=True):
+            bank[index] = number
+        if self._names & _COMMANDS:
+            self._registers.commanded_at = wall_time
+            self._registers.command_fields = self._names
+        if self._others:
+            self._write_outputs({name: numbers[place] for name, place in self._others})
+
+    def _write_outputs(self, values: dict[str, float]) -> None:
+        """Masked outputs change only where their mask says so."""
+        for kind, first, bits in (("standard", 0, 255), ("configurable", 8, 255), ("tool", 16, 3)):
+            mask = int(values.get(f"{kind}_digital_output_mask", 0)) & bits
+            levels = int(values.get(f"{kind}_digital_output", 0))
+            if mask:
+                self._model.write_digital_outputs(mask << first, levels << first)
+        if int(values.get("speed_slider_mask", 0)) & 1:
+            self._model.drive.speed_fraction = min(1.0, max(0.0, values.get("speed_slider_fraction", 1.0)))
+        mask = int(values.get("standard_analog_output_mask", 0))
+        for i in (0, 1):
+            if mask >> i & 1:
+                self._registers.analog_out[i] = values.get(f"standard_analog_output_{i}", 0.0)
