@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from sim_backends.world.contact import STIFFNESS, PartContact
 from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
 from sim_backends.world.scene import draw, rotation, stream
 from sim_backends.world.surfaces import HALF_X, HALF_Y, surface
+from sim_backends.world.truth import truth
+from sim_backends.world.world import World
 
 
 def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
@@ -256,3 +259,135 @@ def test_an_empty_claw_feels_the_table_with_its_fingers() -> None:
     tips_on_the_table[2, 3] = target[2, 3] + 0.155
     assert not part.wrench(raised(tips_on_the_table, dz=1e-4)).any()
     assert part.wrench(raised(tips_on_the_table, dz=-0.01))[2] > 0
+
+
+# --- the whole world, without its peers ---
+
+
+class StandingWorld(World):
+    """An ideal or nominal world whose vehicle stands at the station and whose arm is put wherever a test wants it."""
+
+    def __init__(self, level: str = "ideal", seed: int = 5, surface: str = "pot") -> None:
+        super().__init__(seed=seed, level=level, surface=surface)
+        self.base = nominal.pose((-0.75, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
+
+    def world_from_base(self, t: float) -> np.ndarray:
+        return self.base
+
+    def look(
+        self, camera: str, world_from_camera: np.ndarray, exposure: float = 0.002, laser: bool = False
+    ) -> np.ndarray:
+        return self._cameras.picture(camera, world_from_camera, self.base, laser, exposure)
+
+
+@pytest.fixture(scope="module")
+def ideal() -> StandingWorld:
+    return StandingWorld()
+
+
+def above(point: tuple[float, float, float]) -> np.ndarray:
+    """A camera that looks straight down from `point`, its x axis along world x."""
+    return nominal.pose(point, (1, 0, 0), (0, 0, -1))
+
+
+def test_the_stripe_on_the_table_is_where_the_closed_form_puts_it(ideal: StandingWorld) -> None:
+    """x' = f (cot θ − l/Z), theory sheet part 1, on the bare table beside the surface at Z = 130 mm."""
+    picture = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130)), laser=True).astype(float)
+    dark = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130))).astype(float)
+    light = (picture - dark)[40:440]
+    light[light < 4] = 0.0
+    centres = (light * np.arange(640)).sum(axis=1) / light.sum(axis=1)
+    expected = 319.5 + 0.008 / 4.8e-6 * (1 / 3.5 - 0.035 / 0.130)
+    assert centres.mean() == pytest.approx(expected, abs=0.01)
+    assert centres.std() < 0.05
+
+
+def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
+    """Each lit pixel's ray, cut with the light plane, ends on the closed form of the surface."""
+    world_from_camera = above((0.0, 0.0, 0.60 + 0.130))
+    light = ideal.look("scan", world_from_camera, laser=True).astype(float) - ideal.look("scan", world_from_camera)
+    light[light < 4] = 0.0
+    rows = np.arange(30, 450)
+    u = (light[rows] * np.arange(640)).sum(axis=1) / light[rows].sum(axis=1)
+    ray = np.column_stack([(u - 319.5), (rows - 239.5), np.full(len(rows), 0.008 / 4.8e-6)]) / (0.008 / 4.8e-6)
+    depth = 0.035 / (1 / 3.5 - ray[:, 0])
+    points = ray * depth[:, None]
+    x, y, z = points[:, 0], -points[:, 1], 0.130 - points[:, 2]
+    on_it = np.abs(y) < HALF_Y - 0.001
+    assert on_it.sum() > 300
+    assert np.sqrt(np.mean((z - surface("pot").height(x, y))[on_it] ** 2)) < 1e-4
+
+
+def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal: StandingWorld) -> None:
+    world_from_board = nominal.WORLD_FROM_PLACE @ nominal.PLACE_FROM_BOARD
+    world_from_camera = world_from_board @ nominal.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
+    picture = ideal.look("target", world_from_camera, exposure=0.008).astype(float)
+    for i, j in [(0, 0), (8, 0), (0, 6), (8, 6)]:
+        u, v = (
+            (np.array([i * 0.02 - 0.08, j * 0.02 - 0.06]) / 0.9 * 0.008 / 4.8e-6 + [639.5, 511.5]).round().astype(int)
+        )
+        patch = 190.0 - picture[v - 14 : v + 15, u - 14 : u + 15]
+        patch[patch < 60] = 0.0
+        at = [(patch.sum(axis=axis) * np.arange(-14, 15)).sum() / patch.sum() for axis in (0, 1)]
+        exact = np.array([i * 0.02 - 0.08, j * 0.02 - 0.06]) / 0.9 * 0.008 / 4.8e-6 + [639.5, 511.5]
+        assert [u + at[0], v + at[1]] == pytest.approx(exact, abs=0.05)
+
+
+def test_a_camera_that_looks_away_sees_only_the_room(ideal: StandingWorld) -> None:
+    picture = ideal.look("target", nominal.pose((-0.75, 0.0, 1.5), (1, 0, 0), (0, 0, 1)), exposure=0.008)
+    assert np.ptp(picture) < 30
+
+
+def test_the_scan_camera_moves_along_the_rails_true_direction() -> None:
+    world = StandingWorld("nominal")
+    here = world.flange_from_camera("scan", 0.0)
+    start = world.rail.carriage(0.0)
+    moved = here[:3, 3] - world.scene.flange_from_scan_camera[:3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(start)
+    assert here[:3, :3].T @ moved / start == pytest.approx(world.scene.rail_direction)
+
+
+def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick() -> None:
+    world = StandingWorld()
+    t = world.arm.time
+    world.arm.tick(t + 0.01)
+    assert world.part.held
+    assert world.arm.digital_inputs & 1
+    world.arm.write_digital_outputs(0b11, 0b01)
+    world.arm.tick(t + 0.02)
+    assert not world.part.held
+    assert not world.arm.digital_inputs & 1
+    assert not world.laser.at(t + 0.015)
+    assert world.laser.at(t + 0.025)
+
+
+def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
+    world = StandingWorld()
+    on_the_surface = nominal.inverse(world.base) @ world.scene.world_from_surface
+    on_the_surface[2, 3] -= 0.0005
+    wrench = world.arm.contact(on_the_surface @ nominal.inverse(nominal.FLANGE_FROM_PART))
+    assert 5.0 < wrench[2] < 10.0
+
+
+def test_the_body_leans_towards_where_the_arm_reaches() -> None:
+    world = World(seed=2, level="nominal")
+    world.arm.tick(0.5)
+    world.vehicle.tick(0.6)
+    reach = world.arm.base_from_flange(0.5)[:3, 3]
+    up = world.vehicle.world_from_vehicle(0.6)[:3, 2]
+    assert np.hypot(*up[:2]) > 0
+    assert up[0] * reach[0] >= 0
+    assert up[1] * reach[1] >= 0
+
+
+def test_truth_is_complete_json_and_consistent() -> None:
+    world = World(seed=9, level="nominal")
+    told = json.loads(json.dumps(truth(world)))
+    pose = {name: np.array(value) for name, value in told["poses"].items()}
+    assert pose["world_from_base"] @ pose["base_from_surface"] == pytest.approx(pose["world_from_surface"])
+    assert pose["base_from_flange"] @ pose["flange_from_part"] == pytest.approx(pose["base_from_part"])
+    assert pose["base_from_surface"] @ pose["surface_from_part"] == pytest.approx(pose["base_from_part"])
+    assert told["assumed_noise"]["speckle_contrast"]["sigma"] == 0.15
+    assert told["part"]["held"]
+    assert not told["laser_on"]
+    assert told["vehicle"]["stopped"]
