@@ -1,1 +1,35 @@
-"""Placeholder."""
+"""The command line `cell`: one file per group of commands, imported only when a command of it runs.
+
+Exit codes: 0 success, 1 a refused or failed run, 2 a usage or configuration error, 130 an interrupt (after the safe
+stop).
+"""
+
+from __future__ import annotations
+
+import sys
+
+EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+
+
+def main() -> None:
+    """Entry point of the console script: runs a command and turns errors into a message and an exit code."""
+    from cell.cli.app import app
+    from drivers.errors import CellError, ConfigError
+
+    try:
+        app(standalone_mode=True)
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        sys.exit(EXIT_INTERRUPTED)
+    except ConfigError as error:
+        _complain(str(error))
+        sys.exit(EXIT_USAGE)
+    except CellError as error:
+        _complain(str(error))
+        sys.exit(EXIT_FAILED)
+
+
+def _complain(text: str) -> None:
+    from rich.console import Console
+
+    Console(stderr=True, soft_wrap=True, highlight=False).print("error:", text, style="red", markup=False)

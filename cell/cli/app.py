@@ -1,0 +1,19 @@
+"""The table of commands. Their bodies import what they need when they run, so that `cell --help` stays quick."""
+
+from __future__ import annotations
+
+import typer
+
+from cell.cli import calibrate, devices, run, setup, sim
+
+app = typer.Typer(
+    name="cell",
+    help="Control of a laser-guided assembly cell: drive, photograph, sweep, reconstruct, invert, place.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for register in (run.register, calibrate.register, devices.register, setup.register):
+    register(app)
+app.add_typer(sim.app, name="sim")

@@ -1,0 +1,86 @@
+"""`cell calibrate`: the cell's own calibration, or one from a folder of recorded frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cell.cli.options import (
+    ConfigOption,
+    JobOption,
+    JsonOption,
+    Level,
+    LevelOption,
+    SeedOption,
+    SimOption,
+    print_json,
+)  # fmt: skip
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command()(calibrate)
+
+
+def calibrate(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    source: Annotated[
+        Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
+    ] = None,
+    board: Annotated[
+        str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate rail, cameras, hand-eye and light plane, and store the result.
+
+    Moves the cell through its own calibration poses over the boards on its deck; with --from it moves nothing.
+    """
+    from drivers.errors import ConfigError
+
+    if source is None and board is not None:
+        raise ConfigError("--board belongs to --from; the boards on the deck are named in the configuration")
+    if source is not None:
+        _from_folder(source, board, json)
+        return
+    from cell.cli.display import ProgressDisplay
+    from cell.supervisor import Cell
+
+    if config is None and sim is None:
+        raise ConfigError(
+            "`cell calibrate` needs --config for a real cell, --sim all for a simulated one, or --from FOLDER"
+        )
+    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
+        calibration = cell.calibrate(display, job)
+        where = cell.calibrations_folder
+    if json:
+        print_json(calibration.summary())
+    else:
+        _print_summary(calibration.summary())
+        typer.echo(f"stored in {where}")
+
+
+def _from_folder(folder: Path, board: str | None, json: bool) -> None:
+    from cell.calibration.recorded import calibrate_folder
+    from cell.vision import parse_board
+    from drivers.errors import ConfigError
+
+    result = calibrate_folder(folder, None if board is None else parse_board(board))
+    if json:
+        print_json(result)
+    else:
+        _print_summary(result)
+    if not any(frame["used"] for frame in result["frames"]):
+        raise ConfigError(f"no picture in {folder} could be used; the reasons are listed above")
+
+
+def _print_summary(summary: object) -> None:
+    from rich.console import Console
+
+    Console().print(summary)

@@ -1,0 +1,104 @@
+"""`cell jog`, `cell home` and `cell diag`: one device at a time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cell.cli.options import (
+    ConfigOption,
+    JsonOption,
+    Level,
+    LevelOption,
+    SeedOption,
+    SimOption,
+    SpeedOption,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from cell.diagnosis import Diagnosis
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command(context_settings={"ignore_unknown_options": True})(jog)
+    app.command()(home)
+    app.command()(diag)
+
+
+def jog(
+    device: Annotated[str, typer.Argument(help="rail, arm or vehicle.")],
+    motion: Annotated[
+        list[str], typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg.")
+    ],
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    json: JsonOption = False,
+) -> None:
+    """Move one device by a little: refused outside its limits or while a run holds the cell."""
+    from cell.jogging import jog as perform
+    from cell.jogging import parse_jog
+    from cell.supervisor import Cell
+
+    wish = parse_jog(device, motion)
+    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
+        result = perform(cell, wish)
+    if json:
+        print_json(result)
+    else:
+        typer.echo("  ".join(f"{name} {value}" for name, value in result.items()))
+
+
+def home(
+    config: ConfigOption = None, sim: SimOption = None, seed: SeedOption = 1, level: LevelOption = Level.nominal
+) -> None:
+    """Home the rail and bring the arm to its folded posture above the deck."""
+    from cell.supervisor import Cell
+
+    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
+        cell.home()
+    typer.echo("rail homed, arm folded")
+
+
+def diag(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    speed: SpeedOption = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Ask every device how it is: connection, identity, round trips, errors, state. Exit code 1 if any fails."""
+    from cell.diagnosis import diagnose
+
+    rows = diagnose(config, sim=sim, seed=seed, level=level.value, speed=speed)
+    if json:
+        print_json({row.device: row.as_dict() for row in rows})
+    else:
+        _print_table(rows)
+    if not all(row.ok for row in rows):
+        raise typer.Exit(1)
+
+
+def _print_table(rows: list[Diagnosis]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="devices")
+    for name in ("device", "", "model", "serial", "firmware", "address"):
+        table.add_column(name, overflow="fold")
+    table.add_column("p50 ms", justify="right")
+    table.add_column("p99 ms", justify="right")
+    table.add_column("errors")
+    table.add_column("state", overflow="fold")
+    for row in rows:
+        mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
+        table.add_row(
+            row.device, mark, row.model, row.serial, row.firmware, row.address, row.p50_text, row.p99_text,
+            row.errors_text, row.state,
+        )  # fmt: skip
+    Console().print(table)

@@ -1,0 +1,37 @@
+"""Options that several commands share, and how they print."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+class Level(str, Enum):
+    """How far the simulated world deviates from its nominal geometry."""
+
+    ideal = "ideal"
+    nominal = "nominal"
+    harsh = "harsh"
+
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", help="The cell's configuration, cell.toml. Without it, the one that ships."),
+]
+JobOption = Annotated[str, typer.Option("--job", "-j", help="A job file, or the name of a job that ships.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, nothing else.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, max=999_999, help="Which simulated world.")]
+LevelOption = Annotated[Level, typer.Option("--level", help="How far that world deviates from the drawing.")]
+SpeedOption = Annotated[float, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")]
+SimOption = Annotated[
+    str | None, typer.Option("--sim", help='"all": start a simulated cell for this command and use it.')
+]
+
+
+def print_json(data: Any) -> None:
+    """Write JSON to standard output."""
+    typer.echo(json.dumps(data, indent=2))

@@ -1,0 +1,161 @@
+"""How every device is: connected, who it is, round trips, error counters, state. One device's failure hides no other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell import assembly
+from cell.config import CellConfig, load_config
+from cell.runs import CellLock
+from cell.simulation import SimulatedCell, with_endpoints
+from drivers.clock import Clock
+from drivers.errors import CellError
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
+
+PINGS = 100
+
+
+@dataclass
+class Diagnosis:
+    """One device's row. Round trips in ms on the wall."""
+
+    device: str
+    ok: bool
+    address: str
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+    p50_ms: float | None = None
+    p99_ms: float | None = None
+    errors: dict[str, int] = field(default_factory=dict)
+    state: str = ""
+
+    @property
+    def p50_text(self) -> str:
+        """Median round trip for people."""
+        return "" if self.p50_ms is None else f"{self.p50_ms:.2f}"
+
+    @property
+    def p99_text(self) -> str:
+        """99th percentile for people."""
+        return "" if self.p99_ms is None else f"{self.p99_ms:.2f}"
+
+    @property
+    def errors_text(self) -> str:
+        """Counters for people."""
+        return ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
+    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or a held cell."""
+    config = load_config(path)
+    if sim is None:
+        return _diagnose(config)
+    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
+    try:
+        return _diagnose(with_endpoints(config, simulated.endpoints))
+    finally:
+        simulated.close()
+
+
+def _diagnose(config: CellConfig) -> list[Diagnosis]:
+    clock = Clock(config.cell.time_scale)
+    with CellLock(config):
+        rows, arm = _open_and_ask("arm", config.arm.address, lambda: assembly.connect_arm(config, clock), _arm_state)
+        try:
+            more: list[tuple[str, str, Callable[[], Any], Callable[[Any], str]]] = [
+                ("rail", config.rail.url, lambda: assembly.connect_rail(config, clock), _rail_state),
+                ("vehicle", config.vehicle.channel, lambda: assembly.connect_vehicle(config, clock), _vehicle_state),
+            ]
+            for name, camera in (("scan_camera", config.scan_camera), ("target_camera", config.target_camera)):
+                build = lambda name=name, camera=camera: assembly.connect_camera(name, camera, clock)  # noqa: E731
+                more.append((name, camera.address, build, _camera_state))
+            for entry in more:
+                found, device = _open_and_ask(*entry)
+                rows += found
+                if device is not None:
+                    device.close()
+            rows += _switches(config, arm, clock)
+        finally:
+            if arm is not None:
+                arm.close()
+    return rows
+
+
+def _open_and_ask(
+    name: str, address: str, build: Callable[[], Any], state: Callable[[Any], str]
+) -> tuple[list[Diagnosis], Any]:
+    try:
+        device = build()
+    except CellError as error:
+        return [Diagnosis(name, False, address, state=str(error))], None
+    return [_ask(name, address, device, state)], device
+
+
+def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -> Diagnosis:
+    row = Diagnosis(name, False, address)
+    try:
+        identity = device.identity()
+        row.model, row.serial, row.firmware = identity.model, identity.serial, identity.firmware
+        times = [1e3 * device.ping() for _ in range(PINGS)]
+        row.p50_ms, row.p99_ms = (float(v) for v in np.percentile(times, [50, 99]))
+        row.state = state(device)
+        row.ok = True
+    except CellError as error:
+        row.state = str(error)
+    row.errors = dict(device.statistics.errors)
+    return row
+
+
+def _switches(config: CellConfig, arm: Arm | None, clock: Clock) -> list[Diagnosis]:
+    outputs = {"laser": config.laser.output, "claw": config.claw.output}
+    if arm is None:
+        return [
+            Diagnosis(name, False, f"arm output {output}", state="the arm that switches it is not connected")
+            for name, output in outputs.items()
+        ]
+    laser, claw = assembly.connect_switches(config, arm, clock)
+    return [
+        _ask("laser", f"arm output {outputs['laser']}", laser, _laser_state),
+        _ask("claw", f"arm output {outputs['claw']}", claw, _claw_state),
+    ]
+
+
+def _arm_state(arm: Arm) -> str:
+    state = arm.state()
+    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg"
+
+
+def _rail_state(rail: Rail) -> str:
+    state = rail.state()
+    return f"{'homed' if state.homed else 'not homed'}, at {1e3 * state.position:.2f} mm"
+
+
+def _vehicle_state(vehicle: Vehicle) -> str:
+    state = vehicle.state()
+    if state.emergency_stop:
+        return "emergency stop"
+    return f"{'braked' if state.braked else 'brake open'}, {state.battery_volts:.1f} V, errors {state.error_bits:#06x}"
+
+
+def _camera_state(camera: Camera) -> str:
+    frame = camera.grab()
+    return f"frame {frame.frame_id}, {camera.shape[1]}×{camera.shape[0]}, mean {frame.image.mean():.0f} DN"
+
+
+def _laser_state(laser: Laser) -> str:
+    return "ON" if laser.is_on else "off"
+
+
+def _claw_state(claw: Claw) -> str:
+    return "holds a part" if claw.holding else "empty"

@@ -1,0 +1,53 @@
+"""Keeps the frames of a run as PNG files, written by a thread of its own so that the sweep does not wait for the disk."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+
+from drivers.errors import CellError
+from drivers.interfaces import Frame
+
+CAPACITY = 64
+"""Frames that may wait to be written; with more, the sweep is held up rather than a frame lost."""
+
+
+class FrameStore:
+    """Writes frames into `folder` as `<what>-<frame id>.png`, lossless."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._waiting: queue.Queue[tuple[str, Frame] | None] = queue.Queue(CAPACITY)
+        self._failure: str | None = None
+        self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
+        self._thread.start()
+
+    def keep(self, what: str, frame: Frame) -> None:
+        """Queue a frame; raises `CellError` when an earlier one could not be written."""
+        if self._failure is not None:
+            raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
+        self._waiting.put((what, frame))
+
+    def _write(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            what, frame = item
+            path = self._folder / f"{what}-{frame.frame_id:06d}.png"
+            try:
+                if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                    self._failure = f"{path} could not be written"
+            except cv2.error as error:
+                self._failure = f"{path}: {error}"
+
+    def __enter__(self) -> FrameStore:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._waiting.put(None)
+        self._thread.join(60.0)

@@ -1,0 +1,154 @@
+"""Where the cameras have to be: poses for looking, photographing, scanning and calibrating.
+
+Pure geometry: nominal poses and the present calibration come in, poses of the flange in the arm's base go out. Whether
+the arm can reach them without a collision is `cell.motion`'s business.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration import ScanCalibration
+from cell.config import CellConfig
+from cell.geometry.poses import from_parts, transform
+from cell.job import Job
+from cell.vision import BoardSpec
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """A planned sweep: the flange's pose in the base and the rail positions between which the velocity is constant."""
+
+    base_from_flange: pin.SE3
+    rail_start: float
+    rail_stop: float
+
+
+@dataclass(frozen=True)
+class View:
+    """A calibration view: the flange's pose in the base and, for the camera on the rail, the rail's position."""
+
+    base_from_flange: pin.SE3
+    rail_position: float
+
+
+def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
+    """Nominal pose of the place frame in the arm's base once the vehicle stands at its target."""
+    place_from_base = job.approach.target.se3() * config.arm.vehicle_from_base.se3()
+    return place_from_base.inverse()
+
+
+def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:
+    """base_from_camera that looks square at the board's centre from `stand_off` m, image x along the board's x."""
+    return base_from_board * from_parts(board.centre) * from_parts((0.0, 0.0, -stand_off))
+
+
+def look_pose(config: CellConfig, job: Job, board: BoardSpec, flange_from_camera: pin.SE3) -> pin.SE3:
+    """base_from_flange for driving: the target camera looks ahead and down and sees the board all along."""
+    base_from_board = base_from_place_at_target(config, job) * job.place_from_board
+    place = transform(facing(board, base_from_board, job.photo.stand_off), np.zeros(3))
+    down = job.photo.look_down
+    forward = np.array([np.cos(down), 0.0, -np.sin(down)])
+    right = np.array([0.0, -1.0, 0.0])
+    base_from_camera = from_parts(place, np.column_stack([right, np.cross(forward, right), forward]))
+    return base_from_camera * flange_from_camera.inverse()
+
+
+def photo_pose(job: Job, board: BoardSpec, base_from_board: pin.SE3, flange_from_camera: pin.SE3) -> pin.SE3:
+    """base_from_flange that puts the target camera square in front of the board."""
+    return facing(board, base_from_board, job.photo.stand_off) * flange_from_camera.inverse()
+
+
+def scan_plan(config: CellConfig, job: Job, base_from_surface: pin.SE3, calibration: ScanCalibration) -> ScanPlan:
+    """The sweep over the surface's centre along its x axis, with the rail in the middle of its travel at half-way.
+
+    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x; the stripe crosses
+    the optical axis's height where the calibrated light plane does, so the camera runs behind by that much.
+    """
+    low, high = config.rail.travel
+    middle = 0.5 * (low + high)
+    if job.scan.length > high - low:
+        raise ValueError(
+            f"scan.length {job.scan.length * 1e3:g} mm exceeds the rail's travel {1e3 * (high - low):g} mm"
+        )
+    normal, distance = np.array(calibration.light_plane.normal), calibration.light_plane.distance
+    stripe_x = (distance - normal[2] * job.scan.stand_off) / normal[0]
+    looking_down = np.diag([1.0, -1.0, -1.0])
+    surface_from_camera = from_parts((-stripe_x, 0.0, job.scan.stand_off), looking_down)
+    base_from_flange = base_from_surface * surface_from_camera * calibration.flange_from_camera_at(middle).inverse()
+    return ScanPlan(base_from_flange, middle - 0.5 * job.scan.length, middle + 0.5 * job.scan.length)
+
+
+def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
+    """Views of the fine deck board for the scan camera: depths, tilts, turns, all of the field and of the rail."""
+    base_from_board = config.calibration.fine.base_from_board.se3()
+    low, high = config.rail.travel
+    views = []
+    for k, (along, across, depth, tilt_x, tilt_y, turn) in enumerate(_SCAN_VIEWS):
+        rail = low + (high - low) * (0.1 + 0.8 * ((k * 5) % len(_SCAN_VIEWS)) / (len(_SCAN_VIEWS) - 1))
+        offset = np.array([along, across, 0.0]) * 1e-3
+        base_from_camera = _tilted(base_from_board, board, offset, depth * 1e-3, tilt_x, tilt_y, turn)
+        flange_from_camera = config.scan_camera.flange_from_camera.se3() * from_parts((rail, 0.0, 0.0))
+        views.append(View(base_from_camera * flange_from_camera.inverse(), rail))
+    return views
+
+
+def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
+    """Views of the large deck board for the target camera: several distances and tilts, and all of the field."""
+    base_from_board = config.calibration.large.base_from_board.se3()
+    views = []
+    for along, across, depth, tilt_x, tilt_y, turn in _TARGET_VIEWS:
+        offset = np.array([along, across, 0.0]) * 1e-3
+        base_from_camera = _tilted(base_from_board, board, offset, depth * 1e-3, tilt_x, tilt_y, turn)
+        views.append(View(base_from_camera * config.target_camera.flange_from_camera.se3().inverse(), 0.0))
+    return views
+
+
+def _tilted(
+    base_from_board: pin.SE3, board: BoardSpec, offset: np.ndarray, depth: float, rx: float, ry: float, rz: float
+) -> pin.SE3:
+    rotation = pin.rpy.rpyToMatrix(*np.deg2rad([rx, ry, rz]))
+    centre = base_from_board * from_parts(np.asarray(board.centre))
+    return centre * from_parts(np.zeros(3), rotation) * from_parts(offset - np.array([0.0, 0.0, depth]))
+
+
+# Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.
+_SCAN_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (
+    (0, 0, 130, 0, 0, 0),
+    (4, 2, 120, 15, 0, 0),
+    (-4, -2, 142, -15, 0, 0),
+    (4, -2, 135, 0, 18, 10),
+    (-4, 2, 125, 0, -18, -10),
+    (0, 3, 118, 12, 12, 25),
+    (0, -3, 142, -12, 12, -25),
+    (5, 0, 138, 12, -12, 40),
+    (-5, 0, 122, -12, -12, -40),
+    (2, 2, 130, 20, 0, 90),
+    (-2, -2, 130, -20, 0, 90),
+    (2, -2, 124, 0, 20, 70),
+    (-2, 2, 140, 0, -20, 70),
+    (5, 3, 132, 8, 15, -20),
+    (-5, -3, 128, -8, -15, 20),
+    (5, -3, 140, 15, -8, 0),
+    (-5, 3, 120, -15, 8, 0),
+    (0, 0, 118, 0, 0, 45),
+    (3, 0, 144, 0, 10, -60),
+    (-3, 0, 136, 10, 0, 60),
+)
+_TARGET_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (
+    (0, 0, 650, 0, 0, 0),
+    (90, 60, 620, 15, 0, 0),
+    (-90, -60, 600, -15, 0, 0),
+    (90, -60, 640, 0, 18, 0),
+    (-90, 60, 600, 0, -18, 0),
+    (0, 0, 560, 12, 12, 30),
+    (0, 0, 700, -12, 12, -30),
+    (60, 0, 680, 15, -12, 20),
+    (-60, 0, 580, -15, -12, -20),
+    (0, 50, 640, 20, 0, 45),
+    (0, -50, 640, -20, 0, -45),
+    (100, 0, 600, 0, 15, 15),
+)

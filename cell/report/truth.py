@@ -1,0 +1,110 @@
+"""The simulated world's truth, asked for by the report alone: no step has the address of that endpoint."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.poses import from_matrix, from_parts, transform
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job
+from cell.reconstruction import Cloud
+from drivers.errors import CellError
+from drivers.interfaces import Vector
+from statemachine.runner import Event
+
+SEGMENTS, POINTS_PER_SEGMENT = 5, 9
+SENSOR_POINTS = 1000
+TIMEOUT_S = 5.0
+
+
+def ask_truth(address: str) -> dict[str, Any]:
+    """The whole truth of a simulated cell; raises `CellError` when its endpoint does not answer."""
+    host, port = address.rsplit(":", 1)
+    try:
+        with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
+            file.write(b'{"op": "truth"}\n')
+            file.flush()
+            answer: dict[str, Any] = json.loads(file.readline())
+    except (OSError, ValueError) as error:
+        raise CellError(f"the simulated cell's truth at {address} does not answer: {error}") from error
+    return answer
+
+
+class Witness:
+    """Listens to a run and notes the truth right after the sweep, when the scanned surface was where it was scanned."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self.at_sweep: dict[str, Any] | None = None
+
+    def __call__(self, event: Event) -> None:
+        """Take an event of the runner."""
+        if event.kind == "step_done" and event.step == "laser_sweep":
+            self.at_sweep = ask_truth(self._address)
+
+
+def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:
+    """A pose of the truth by its name."""
+    return from_matrix(truth["poses"][name])
+
+
+def part_points(nominal: NominalSurface) -> Vector:
+    """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each."""
+    (x_low, x_high), (y_low, y_high) = nominal.footprint
+    x = np.linspace(x_low, x_high, SEGMENTS * POINTS_PER_SEGMENT + 2)[1:-1]
+    across = np.tile(np.linspace(0.8 * y_low, 0.8 * y_high, POINTS_PER_SEGMENT), SEGMENTS)
+    return np.column_stack([x, across, nominal.height(x, across)])
+
+
+def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, float] | None:
+    """Distance of 1000 cloud points from the true surface, the arm's and the hand-eye's error included; mm."""
+    lines, rows = cloud.valid.nonzero()
+    points = transform(pose_of(truth, "base_from_surface").inverse(), cloud.points[lines, rows])
+    inside = nominal.inside(points)
+    points = points[inside]
+    if len(points) < SENSOR_POINTS:
+        return None
+    chosen = points[np.linspace(0, len(points) - 1, SENSOR_POINTS).astype(int)]
+    distance = 1e3 * np.abs(nominal.deviations(chosen))
+    return {"mean": float(distance.mean()), "p85": float(np.percentile(distance, 85))}
+
+
+def place_error(job: Job, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, Any]:
+    """How far the part's 45 points ended from where they belong on the true surface, in the surface's axes, mm."""
+    points = part_points(nominal)
+    ended = transform(pose_of(truth, "surface_from_part"), points)
+    error = 1e3 * (ended - transform(job.place.surface_from_part.se3(), points))
+    distance = np.linalg.norm(error, axis=1)
+    columns = {"x": np.abs(error[:, 0]), "y": np.abs(error[:, 1]), "z": np.abs(error[:, 2]), "d": distance}
+    return {
+        "points": len(points),
+        "error_mm": {name: {"mean": float(v.mean()), "max": float(v.max())} for name, v in columns.items()},
+        "d_p95": float(np.percentile(distance, 95)),
+    }
+
+
+def expected_error(job: Job, nominal: NominalSurface, pose: PlacePose, repeatability: Vector) -> float:
+    """Mean D in mm over the 45 points that the assumed noise leads to: the stated covariance and the arm's repeatability.
+
+    `repeatability` (6, 6) counts once more for the placing pose; that of the sweep is in the pose's covariance.
+    """
+    base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
+    arms = transform(from_parts(np.zeros(3), base_from_part.rotation), part_points(nominal))
+    to_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
+    surface_part = _jacobians(arms)
+    flange_part = _jacobians(arms + base_from_part.translation - to_flange.translation)
+    covariance = surface_part @ pose.covariance @ surface_part.transpose(0, 2, 1)
+    covariance = covariance + flange_part @ repeatability @ flange_part.transpose(0, 2, 1)
+    draws = np.random.default_rng(0).standard_normal((2000, 1, 3, 1))
+    roots = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
+    return float(1e3 * np.linalg.norm((roots @ draws)[..., 0], axis=-1).mean())
+
+
+def _jacobians(arms: Vector) -> Vector:
+    """∂point/∂(δt, δφ) (n, 3, 6) for points at `arms` (n, 3) from the pose's origin."""
+    return np.stack([np.hstack([np.eye(3), -pin.skew(arm)]) for arm in arms])

@@ -1,0 +1,107 @@
+"""Starts a simulated cell in a process of its own and ends it, whatever happens to this one.
+
+The process serves the devices' real protocols on free loopback endpoints; the rest of the cell only gets their
+addresses, as if they were hardware. It ends when its standard input closes, so it cannot outlive its owner.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from typing import Any
+
+from cell.config import CellConfig
+from drivers.errors import ConfigError, DeviceFault
+
+START_TIMEOUT_S = 60.0
+
+
+class SimulatedCell:
+    """A served simulated cell; `endpoints` is the JSON object that it printed."""
+
+    def __init__(self, *, seed: int, level: str, speed: float, surface: str) -> None:
+        command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
+        command += ["--seed", str(seed), "--level", level, "--speed", repr(speed), "--surface", surface]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C goes to the supervisor, which stops the devices before their world ends
+        )
+        try:
+            self.endpoints: dict[str, Any] = self._read_endpoints()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Process id of the simulated cell."""
+        return self._process.pid
+
+    def _read_endpoints(self) -> dict[str, Any]:
+        assert self._process.stdout is not None and self._process.stderr is not None
+        deadline = time.monotonic() + START_TIMEOUT_S
+        line = b""
+        descriptor = self._process.stdout.fileno()
+        while not line.endswith(b"\n"):
+            ready, _, _ = select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))
+            chunk = os.read(descriptor, 65536) if ready else b""
+            if not chunk:
+                reason = self._failure(timed_out=not ready)
+                if self._process.poll() == 2:
+                    raise ConfigError(reason)
+                raise DeviceFault(
+                    "simulated cell",
+                    "sim.start",
+                    reason,
+                    recoverable=False,
+                    hint="Run `cell sim serve` to see its output.",
+                )
+            line += chunk
+        endpoints: dict[str, Any] = json.loads(line)
+        return endpoints
+
+    def _failure(self, *, timed_out: bool) -> str:
+        if timed_out:
+            return f"it did not start within {START_TIMEOUT_S:.0f} s"
+        self._process.wait(5)
+        assert self._process.stderr is not None
+        text = self._process.stderr.read().decode(errors="replace").strip()
+        return text.splitlines()[-1] if text else f"it ended with exit code {self._process.returncode}"
+
+    def close(self) -> None:
+        """End the process: first by closing its input, then by force."""
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(5)
+        for pipe in (self._process.stdout, self._process.stderr):
+            if pipe is not None and not pipe.closed:
+                pipe.close()
+
+
+def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
+    """The configuration with every device's address replaced by a simulated one."""
+    return config.model_copy(
+        update={
+            "cell": config.cell.model_copy(
+                update={"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+            ),
+            "arm": config.arm.model_copy(update={"address": endpoints["arm"]["address"]}),
+            "rail": config.rail.model_copy(update={"url": endpoints["rail"]["url"]}),
+            "vehicle": config.vehicle.model_copy(
+                update={"interface": endpoints["vehicle"]["interface"], "channel": endpoints["vehicle"]["channel"]}
+            ),
+            "scan_camera": config.scan_camera.model_copy(update={"address": endpoints["scan_camera"]["address"]}),
+            "target_camera": config.target_camera.model_copy(update={"address": endpoints["target_camera"]["address"]}),
+        }
+    )

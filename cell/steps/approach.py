@@ -1,0 +1,131 @@
+"""The vehicle's way over the floor: planar poses, the law that keeps it on a line, and driving on odometry.
+
+Frame: the place frame seen from above, with the line of approach along its x axis. Angles are about z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from drivers.clock import Clock
+from drivers.errors import DeadlineError
+from drivers.interfaces import Vehicle, VehicleState
+
+CONTROL_PERIOD_S = 0.04
+DECELERATION = 0.25  # m/s², below what the vehicle can do, so that it stops where it was told to
+CREEP = 0.015  # m/s, the slowest speed that is commanded while a distance remains
+LINE_GAIN = 2.2  # rad of heading per m beside the line
+HEADING_GAIN = 2.0  # 1/s
+TURN_GAIN = 1.5  # 1/s
+MAX_HEADING = math.radians(25)
+MAX_TURN_RATE = math.radians(25)
+ARRIVED = 0.0005  # m
+
+
+@dataclass(frozen=True)
+class Planar:
+    """A pose in the plane: m, m, rad."""
+
+    x: float
+    y: float
+    yaw: float
+
+    @classmethod
+    def of(cls, pose: pin.SE3) -> Planar:
+        """The planar part of a spatial pose."""
+        return cls(pose.translation[0], pose.translation[1], math.atan2(pose.rotation[1, 0], pose.rotation[0, 0]))
+
+    def __mul__(self, other: Planar) -> Planar:
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(
+            self.x + c * other.x - s * other.y, self.y + s * other.x + c * other.y, wrap(self.yaw + other.yaw)
+        )
+
+    def inverse(self) -> Planar:
+        """The pose that undoes this one."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(-c * self.x - s * self.y, s * self.x - c * self.y, wrap(-self.yaw))
+
+
+def wrap(angle: float) -> float:
+    """The angle in (−π, π]."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def line_command(pose: Planar, goal: Planar, speed: float) -> tuple[float, float]:
+    """Speed in m/s and yaw rate in rad/s that bring a vehicle at `pose` along the goal's line to the goal.
+
+    The line runs through `goal` along its heading. Forwards or backwards, whichever leads there; the speed falls so
+    that the vehicle can stop at the goal. (0, 0) once it is there or past it within 0.5 mm.
+    """
+    error = goal.inverse() * pose
+    remaining = -error.x
+    if abs(remaining) < ARRIVED:
+        return 0.0, 0.0
+    magnitude = max(CREEP, min(speed, math.sqrt(2 * DECELERATION * abs(remaining))))
+    v = math.copysign(magnitude, remaining)
+    wanted = np.clip(-LINE_GAIN * error.y, -MAX_HEADING, MAX_HEADING) * math.copysign(1.0, v)
+    # The correction fades at low speed: a vehicle that creeps cannot move sideways, it can only spoil its heading.
+    fade = min(1.0, magnitude / 0.1)
+    turn = np.clip(HEADING_GAIN * wrap(fade * wanted - error.yaw), -MAX_TURN_RATE, MAX_TURN_RATE)
+    return v, float(turn)
+
+
+class Odometry:
+    """The vehicle's pose in the place frame, from its odometry and the newest pose that it was seen at."""
+
+    def __init__(self, vehicle: Vehicle, seen: Planar) -> None:
+        self._vehicle = vehicle
+        self.anchor(seen)
+
+    def anchor(self, seen: Planar) -> None:
+        """From now on count from the pose `seen`; the vehicle stands still."""
+        self._place_from_odometry = seen * _reading(self._vehicle.state()).inverse()
+
+    def pose(self) -> Planar:
+        """The pose now."""
+        return self._place_from_odometry * _reading(self._vehicle.state())
+
+
+def _reading(state: VehicleState) -> Planar:
+    return Planar(state.x, state.y, state.yaw)
+
+
+def drive_line(
+    vehicle: Vehicle, odometry: Odometry, goal: Planar, speed: float, clock: Clock, check: Callable[[], None]
+) -> None:
+    """Drive along the goal's line and stop at the goal, on odometry. `check` raises when the run is to end."""
+    distance = abs((goal.inverse() * odometry.pose()).x)
+    deadline = clock.now() + 10.0 + 3.0 * (distance / speed + speed / DECELERATION + 0.1 / CREEP)
+    direction = 0.0
+    while True:
+        check()
+        v, w = line_command(odometry.pose(), goal, speed)
+        if v == 0.0 or direction * v < 0:  # there, or just past it
+            break
+        direction = v
+        if clock.now() > deadline:
+            vehicle.stop()
+            raise DeadlineError("vehicle", f"did not arrive at x = {goal.x:.3f} m in time; is it blocked or slipping?")
+        vehicle.drive(v, w)
+        clock.sleep(CONTROL_PERIOD_S)
+    vehicle.stop()
+
+
+def turn_to(vehicle: Vehicle, odometry: Odometry, yaw: float, clock: Clock, check: Callable[[], None]) -> None:
+    """Turn on the spot to `yaw` in the place frame, on odometry, to 0.1°."""
+    deadline = clock.now() + 20.0
+    while abs(error := wrap(yaw - odometry.pose().yaw)) > math.radians(0.1):
+        check()
+        if clock.now() > deadline:
+            vehicle.stop()
+            raise DeadlineError("vehicle", f"did not turn by {math.degrees(error):.2f} deg in time; is it blocked?")
+        rate = math.copysign(max(math.radians(0.6), min(MAX_TURN_RATE, TURN_GAIN * abs(error))), error)
+        vehicle.drive(0.0, rate)
+        clock.sleep(CONTROL_PERIOD_S)
+    vehicle.stop()

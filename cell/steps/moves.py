@@ -1,0 +1,106 @@
+"""Moves of the arm as the steps ask for them: planned free of collisions, jerk-limited, followed and settled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config import ArmConfig, CellConfig
+from cell.geometry.poses import from_parts
+from cell.job import Job
+from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.collision import CollisionModel, Pair
+from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.planning import Planner
+from cell.motion.trajectory import LineLimits, Trajectory
+from cell.vision import BoardSpec, parse_board
+from drivers.clock import Clock
+from drivers.interfaces import Arm
+
+PLATE_THICKNESS = 0.01
+HOME = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
+"""Where `cell home` brings the arm: folded above the deck, tool down."""
+
+
+class Mover:
+    """Moves one arm among the bodies that are known so far. Used by one thread at a time."""
+
+    def __init__(self, arm: Arm, clock: Clock, config: CellConfig, job: Job | None) -> None:
+        self._arm = arm
+        self._clock = clock
+        self._settle_time = config.arm.settle_time
+        self._line_speed = config.arm.max_tool_speed
+        self.kinematics = ArmKinematics(limits=_joint_limits(config.arm))
+        grasp = None if job is None else job.grasp
+        part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
+        self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(_plates(config))]
+        self._planner = self._plan_among([])
+
+    def meet_station(self, base_from_place: pin.SE3, job: Job, board: BoardSpec) -> None:
+        """From now on avoid the station as well, where it was measured."""
+        centre = job.place_from_board * from_parts(board.centre)
+        self._planner = self._plan_among(station_bodies(base_from_place, centre))
+
+    def leave_part(self) -> None:
+        """From now on the claw is empty; the part is where it was put, among the bodies that may be near the claw."""
+        self._moving = [body for body in self._moving if body.name != "part"]
+        still = [body for body in self._planner.collisions.bodies if body.name in _STATION]
+        self._planner = self._plan_among(still)
+
+    def _plan_among(self, still: Sequence[Body]) -> Planner:
+        return Planner(self.kinematics, CollisionModel(self.kinematics, [*self._moving, *still]))
+
+    @property
+    def joints(self) -> Joints:
+        """Where the arm stands, (6,) rad."""
+        return self._arm.state().joints
+
+    def plan_to(self, base_from_flange: pin.SE3, what: str) -> Trajectory:
+        """A free motion to a flange pose; raises `Unreachable` or `CollisionError` before anything moves."""
+        start = self.joints
+        return self._planner.free(start, self._planner.reach(base_from_flange, start, what))
+
+    def to(self, base_from_flange: pin.SE3, what: str) -> None:
+        """Move freely to a flange pose and settle."""
+        self.follow(self.plan_to(base_from_flange, what))
+
+    def to_joints(self, joints: Joints) -> None:
+        """Move freely to joint angles and settle."""
+        self.follow(self._planner.free(self.joints, joints))
+
+    def line(
+        self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None
+    ) -> bool:
+        """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
+        limits = LineLimits(speed=min(speed, self._line_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
+        return self.follow(self._planner.line(self.joints, base_from_flange, limits, allowed), force_limit)
+
+    def follow(self, trajectory: Trajectory, force_limit: float | None = None) -> bool:
+        """Have the arm follow a trajectory to its end and settle; True when it ended early in contact."""
+        motion = self._arm.follow(trajectory.times, trajectory.joints, force_limit)
+        motion.wait(2.0 * trajectory.duration + 5.0)
+        self._clock.sleep(self._settle_time)
+        return motion.contact
+
+
+_STATION = ("table", "surface", "board post", "board")
+
+
+def _joint_limits(config: ArmConfig) -> JointLimits:
+    return JointLimits(
+        speed=(config.max_joint_speed,) * 6,
+        acceleration=(config.max_joint_acceleration,) * 6,
+        jerk=(config.max_joint_jerk,) * 6,
+    )
+
+
+def _plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:
+    plates = []
+    for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
+        board = parse_board(plate.board)
+        width, height = board.size
+        below = from_parts((*board.centre[:2], PLATE_THICKNESS / 2))
+        plates.append((name, plate.base_from_board.se3() * below, (width, height, PLATE_THICKNESS)))
+    return plates

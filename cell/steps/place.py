@@ -1,0 +1,83 @@
+"""Place: approach, guarded descent until contact, release, retreat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pinocchio as pin
+
+from cell.geometry.poses import from_parts, from_ur, to_ur
+from cell.job import Job
+from cell.steps.moves import Mover
+from drivers.errors import RefusedError
+from drivers.interfaces import Arm, Claw
+
+TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
+"""What may come closer than the collision margin on the way down and up."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceResult:
+    """Where the flange was when the part was let go, and how far contact was from where it was expected, in m."""
+
+    base_from_flange: pin.SE3
+    contact: bool
+    depth_error: float
+
+    def summary(self) -> dict[str, object]:
+        """Figures for the journal."""
+        return {
+            "contact": self.contact,
+            "depth_error_mm": round(1e3 * self.depth_error, 4),
+            "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
+        }
+
+
+def place(
+    job: Job,
+    base_from_surface: pin.SE3,
+    mover: Mover,
+    arm: Arm,
+    claw: Claw,
+    check: Callable[[], None],
+    progress: Callable[[float, str], None],
+) -> PlaceResult:
+    """Put the part onto the surface whose pose was measured.
+
+    Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
+    `contact_force`. Raises `RefusedError`, with the part still held and lifted, when contact comes too early, that is
+    more than `contact_travel` from where it was expected, or does not come at all.
+    """
+    plan = job.place
+    base_from_part = base_from_surface * plan.surface_from_part.se3()
+    part_from_flange = job.grasp.flange_from_part.se3().inverse()
+
+    def flange_at(height: float) -> pin.SE3:
+        return base_from_part * from_parts((0.0, 0.0, height)) * part_from_flange
+
+    above, below = flange_at(plan.approach), flange_at(-plan.contact_travel)
+    progress(0.05, "approaching")
+    mover.to(above, "the approach pose")
+    check()
+    if not claw.holding:
+        raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
+    progress(0.4, "descending")
+    mover.line(flange_at(plan.contact_travel), plan.speed, TOUCHES)
+    arm.zero_force()
+    progress(0.6, "feeling for contact")
+    contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
+    reached = from_ur(arm.state().flange)
+    depth = float((flange_at(0.0).inverse() * reached).translation @ job.grasp.flange_from_part.se3().rotation[:, 2])
+    if not contact or abs(depth) > plan.contact_travel:
+        mover.line(above, plan.speed, TOUCHES)
+        raise RefusedError(
+            f"no contact within {1e3 * plan.contact_travel:.2f} mm of the place pose (the part stopped "
+            f"{1e3 * depth:+.2f} mm from it along the normal); it was lifted again, still held. Is the part the right one, and whole?"
+        )
+    progress(0.8, "releasing")
+    claw.release()
+    mover.leave_part()
+    progress(0.9, "retreating")
+    mover.line(above, plan.speed, TOUCHES)
+    return PlaceResult(reached, contact, depth)

@@ -1,0 +1,160 @@
+"""The six steps of one job, bound to one cell's devices: takes each step's inputs from the earlier results.
+
+Here a step's context meets its function; what a step does is in `cell.steps`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from cell.assembly import Devices
+from cell.calibration import CellCalibration
+from cell.config import CellConfig
+from cell.frames import FrameStore
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job
+from cell.planning import look_pose, photo_pose, scan_plan
+from cell.reconstruction import Cloud
+from cell.steps.board_photo import board_photo
+from cell.steps.drive_to_target import Arrival, drive_to_target
+from cell.steps.invert_pose import invert_pose
+from cell.steps.laser_sweep import SweepRecord, laser_sweep
+from cell.steps.moves import Mover
+from cell.steps.photograph import BoardFix, photograph
+from cell.steps.place import PlaceResult, place
+from cell.steps.reconstruct import reconstruct
+from cell.vision import parse_board
+from drivers.interfaces import Vector
+from statemachine.runner import StepContext
+
+
+class JobWork:
+    """What the runner calls, a method a step; results travel in the step context."""
+
+    def __init__(
+        self,
+        config: CellConfig,
+        job: Job,
+        nominal: NominalSurface,
+        calibration: CellCalibration,
+        devices: Devices,
+        frames: FrameStore,
+        folder: Path,
+    ) -> None:
+        self._config = config
+        self._job = job
+        self._nominal = nominal
+        self._calibration = calibration
+        self._devices = devices
+        self._frames = frames
+        self._folder = folder
+        self._board = parse_board(job.board.spec)
+        self._mover = Mover(devices.arm, devices.clock, config, job)
+
+    def steps(self) -> dict[str, Callable[[StepContext], object]]:
+        """The work by step name."""
+        return {
+            "drive_to_target": self.drive_to_target,
+            "board_photo": self.board_photo,
+            "laser_sweep": self.laser_sweep,
+            "reconstruct": self.reconstruct,
+            "invert_pose": self.invert_pose,
+            "place": self.place,
+        }
+
+    def drive_to_target(self, context: StepContext) -> Arrival:
+        """See `cell.steps.drive_to_target`."""
+        context.progress(0.0, "arm to the looking pose")
+        self._devices.vehicle.brake()
+        camera = self._calibration.target.flange_from_camera
+        self._mover.to(look_pose(self._config, self._job, self._board, camera), "the looking pose")
+        self._devices.target_camera.configure(self._config.target_camera.photo_exposure, 10.0)
+        return drive_to_target(
+            self._job,
+            self._config.arm.vehicle_from_base.se3(),
+            self._devices.vehicle,
+            self._photograph,
+            self._devices.clock,
+            context.check,
+            context.progress,
+        )
+
+    def board_photo(self, context: StepContext) -> BoardFix:
+        """See `cell.steps.board_photo`."""
+        arrival = cast(Arrival, context.results["drive_to_target"])
+        self._mover.meet_station(arrival.base_from_place, self._job, self._board)
+        goal = photo_pose(
+            self._job, self._board, arrival.fix.base_from_board, self._calibration.target.flange_from_camera
+        )
+        self._devices.target_camera.configure(self._config.target_camera.photo_exposure, 10.0)
+        return board_photo(goal, self._mover, self._photograph, self._job.photo.count, context.progress)
+
+    def laser_sweep(self, context: StepContext) -> SweepRecord:
+        """See `cell.steps.laser_sweep`."""
+        fix = cast(BoardFix, context.results["board_photo"])
+        base_from_place = fix.base_from_board * self._job.place_from_board.inverse()
+        base_from_surface = base_from_place * self._job.surface.place_from_surface.se3()
+        devices = self._devices
+        if not devices.rail.state().homed:
+            context.progress(0.0, "homing the rail")
+            devices.rail.home().wait(60.0)
+        return laser_sweep(
+            scan_plan(self._config, self._job, base_from_surface, self._calibration.scan),
+            self._job.scan,
+            self._mover,
+            devices.arm,
+            devices.rail,
+            devices.scan_camera,
+            devices.laser,
+            lambda frame: self._frames.keep("stripe", frame),
+            context.progress,
+        )
+
+    def reconstruct(self, context: StepContext) -> Cloud:
+        """See `cell.steps.reconstruct`."""
+        sweep = cast(SweepRecord, context.results["laser_sweep"])
+        rail_sigma = self._config.calibration.rail_sigma
+        return reconstruct(sweep, self._calibration.scan, rail_sigma, self._folder / "cloud.ply")
+
+    def invert_pose(self, context: StepContext) -> PlacePose:
+        """See `cell.steps.invert_pose`."""
+        fix = cast(BoardFix, context.results["board_photo"])
+        cloud = cast(Cloud, context.results["reconstruct"])
+        return invert_pose(cloud, fix, self._job, self._nominal, self._calibration.scan, self.repeatability)
+
+    def place(self, context: StepContext) -> PlaceResult:
+        """See `cell.steps.place`."""
+        pose = cast(PlacePose, context.results["invert_pose"])
+        return place(
+            self._job,
+            pose.base_from_surface,
+            self._mover,
+            self._devices.arm,
+            self._devices.claw,
+            context.check,
+            context.progress,
+        )
+
+    @property
+    def repeatability(self) -> Vector:
+        """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""
+        arm = self._config.arm
+        return np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+
+    def _photograph(self, count: int = 1) -> BoardFix:
+        fix = photograph(
+            self._devices.arm,
+            self._devices.target_camera,
+            self._calibration.target,
+            self._board,
+            self._job.photo,
+            self.repeatability,
+            count,
+        )
+        for frame in fix.frames:
+            self._frames.keep("board", frame)
+        return fix
