@@ -1,4 +1,4 @@
-"""How every device is: connected, who it is, round trips, error counters, state. One device's failure hides no other."""
+"""How every device is: connected, who it is, round trips, errors, state. One device's failure hides no other."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Diagnosis:
 
 
 def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
-    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or a held cell."""
+    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or held cell."""
     config = load_config(path)
     if sim is None:
         return _diagnose(config)

@@ -1,4 +1,4 @@
-"""Keeps the frames of a run as PNG files, written by a thread of its own so that the sweep does not wait for the disk."""
+"""Keeps the frames of a run as PNG files, written by a thread of its own so that no sweep waits for the disk."""
 
 from __future__ import annotations
 

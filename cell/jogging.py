@@ -104,9 +104,8 @@ def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
     mover.line(goal_pose, JOG_SPEED)
     reached_pose = from_ur(cell.devices.arm.state().flange)
     shown = ", ".join(f"{1e3 * v:.2f}" for v in reached_pose.translation)
-    return {
-        "flange": f"({shown}) mm in the base, moved {1e3 * np.linalg.norm(reached_pose.translation - start.translation):.2f} mm"
-    }
+    way = np.linalg.norm(reached_pose.translation - start.translation)
+    return {"flange": f"({shown}) mm in the base, moved {1e3 * way:.2f} mm"}
 
 
 def _jog_vehicle(cell: Cell, wish: Jog) -> dict[str, str]:

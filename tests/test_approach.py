@@ -1,4 +1,4 @@
-"""The way to the target: planar poses form a group, and the line law brings a vehicle in from where odometry leaves it."""
+"""The way to the target: planar poses form a group, and the line law brings the vehicle in from beside the line."""
 
 from __future__ import annotations
 

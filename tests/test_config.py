@@ -51,7 +51,7 @@ def test_a_quantity_is_read_into_si(text: str, unit: str, expected: float) -> No
     "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "inf mm", "5 furlongs/", None]
 )
 def test_anything_but_a_number_with_a_fitting_unit_is_refused(text: object) -> None:
-    with pytest.raises(ValueError, match="unit|quantity|range"):
+    with pytest.raises(ValueError, match=r"unit|quantity|range"):
         parse_quantity(text, "mm", 0, 100)
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 
-class Level(str, Enum):
+class Level(StrEnum):
     """How far the simulated world deviates from its nominal geometry."""
 
     ideal = "ideal"

@@ -85,7 +85,9 @@ def _sigma(pose: PlacePose) -> dict[str, Any]:
 def _configured_noise(config: CellConfig) -> dict[str, Any]:
     arm = config.arm
     return {
-        "arm_repeatability": {"of": "arm, each axis, each time it settles", "sigma": 1e3 * arm.repeatability, "unit": "mm"},
+        "arm_repeatability": {
+            "of": "arm, each axis, each time it settles", "sigma": 1e3 * arm.repeatability, "unit": "mm",
+        },
         "arm_repeatability_angle": {
             "of": "arm's angles, each time it settles", "sigma": 1e3 * arm.repeatability_angle, "unit": "mrad",
         },

@@ -89,7 +89,7 @@ def place_error(job: Job, nominal: NominalSurface, truth: dict[str, Any]) -> dic
 
 
 def expected_error(job: Job, nominal: NominalSurface, pose: PlacePose, repeatability: Vector) -> float:
-    """Mean D in mm over the 45 points that the assumed noise leads to: the stated covariance and the arm's repeatability.
+    """Mean D in mm over the 45 points to expect from the assumed noise: stated covariance and arm's repeatability.
 
     `repeatability` (6, 6) counts once more for the placing pose; that of the sweep is in the pose's covariance.
     """

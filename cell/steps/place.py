@@ -73,7 +73,8 @@ def place(
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(
             f"no contact within {1e3 * plan.contact_travel:.2f} mm of the place pose (the part stopped "
-            f"{1e3 * depth:+.2f} mm from it along the normal); it was lifted again, still held. Is the part the right one, and whole?"
+            f"{1e3 * depth:+.2f} mm from it along the normal); it was lifted again, still held. "
+            "Is the part the right one, and whole?"
         )
     progress(0.8, "releasing")
     claw.release()

@@ -12,8 +12,8 @@ from cell.steps.laser_sweep import SweepRecord
 def reconstruct(sweep: SweepRecord, calibration: ScanCalibration, rail_sigma: float, path: Path) -> Cloud:
     """Triangulate every profile, remove outliers and write the cloud to `path`.
 
-    `rail_sigma` is the standard deviation in m of one profile's rail position. Raises `RefusedError` when too few points
-    are left.
+    `rail_sigma` is the standard deviation in m of one profile's rail position. Raises `RefusedError` when too few
+    points are left.
     """
     geometry = ScanGeometry(
         calibration.camera, calibration.light_plane, calibration.rail_direction, calibration.flange_from_camera
