@@ -13,16 +13,19 @@ Image = NDArray[np.float32]
 def blur_window(image: Image, window: tuple[int, int, int, int], sigma: float) -> None:
     """Blur `image` inside the window (u0, v0, u1, v1, ends excluded) by `sigma` pixels; edges are repeated."""
     u0, v0, u1, v1 = window
-    radius = max(1, int(np.ceil(3.5 * sigma)))
+    radius = 3 * max(1, int(np.ceil(3.5 * sigma / 3)))
     if u1 <= u0 or v1 <= v0 or sigma < 0.05:
         return
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
-    separable_blur(image[v0:v1, u0:u1], (kernel / kernel.sum()).astype(np.float32))
+    # The compiler makes fast code for contiguous arrays only.
+    part = np.ascontiguousarray(image[v0:v1, u0:u1])
+    separable_blur(part, (kernel / kernel.sum()).astype(np.float32))
+    image[v0:v1, u0:u1] = part
 
 
 @compiled_fast
 def separable_blur(image: Image, kernel: Image) -> None:
-    """Convolve with the symmetric `kernel` along both axes, repeating edge pixels."""
+    """Convolve with the symmetric `kernel` along both axes, repeating edge pixels; its radius is a multiple of 3."""
     rows, cols = image.shape
     radius = kernel.shape[0] // 2
     across = np.empty((rows, cols), dtype=np.float32)
@@ -32,17 +35,46 @@ def separable_blur(image: Image, kernel: Image) -> None:
         line[radius : radius + cols] = image[v]
         line[radius + cols :] = image[v, cols - 1]
         out = across[v]
-        for u in range(cols):
-            out[u] = kernel[radius] * line[u + radius]
-        for k in range(radius):
-            for u in range(cols):
-                out[u] += kernel[k] * (line[u + k] + line[u + 2 * radius - k])
+        scale(out, line[radius : radius + cols], kernel[radius])
+        for k in range(0, radius, 3):
+            far = 2 * radius - k
+            add_pairs(
+                out,
+                kernel[k : k + 3],
+                line[k : k + cols],
+                line[far : far + cols],
+                line[k + 1 : k + 1 + cols],
+                line[far - 1 : far - 1 + cols],
+                line[k + 2 : k + 2 + cols],
+                line[far - 2 : far - 2 + cols],
+            )
     for v in range(rows):
         out = image[v]
-        for u in range(cols):
-            out[u] = kernel[radius] * across[v, u]
-        for k in range(radius):
-            above = across[max(0, v - radius + k)]
-            below = across[min(rows - 1, v + radius - k)]
-            for u in range(cols):
-                out[u] += kernel[k] * (above[u] + below[u])
+        scale(out, across[v], kernel[radius])
+        for k in range(0, radius, 3):
+            reach = radius - k
+            add_pairs(
+                out,
+                kernel[k : k + 3],
+                across[max(0, v - reach)],
+                across[min(rows - 1, v + reach)],
+                across[max(0, v - reach + 1)],
+                across[min(rows - 1, v + reach - 1)],
+                across[max(0, v - reach + 2)],
+                across[min(rows - 1, v + reach - 2)],
+            )
+
+
+@compiled_fast
+def scale(out: Image, line: Image, weight: np.float32) -> None:
+    """Set `out` to `weight` times `line`."""
+    for u in range(out.shape[0]):
+        out[u] = weight * line[u]
+
+
+@compiled_fast
+def add_pairs(out: Image, weights: Image, a: Image, b: Image, c: Image, d: Image, e: Image, f: Image) -> None:
+    """Add the weighted pairs (a, b), (c, d), (e, f) to `out`."""
+    p, q, r = weights[0], weights[1], weights[2]
+    for u in range(out.shape[0]):
+        out[u] += p * (a[u] + b[u]) + q * (c[u] + d[u]) + r * (e[u] + f[u])

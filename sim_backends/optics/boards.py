@@ -11,64 +11,25 @@ from numpy.typing import NDArray
 
 from sim_backends.optics.blur import blur_window
 from sim_backends.optics.camera import CameraOptics
-from sim_backends.optics.compiled import compiled
-from sim_backends.optics.scene import KINDS, Board, BoardInstance, Light, PlaneInstance
+from sim_backends.optics.compiled import compiled, compiled_fast
+from sim_backends.optics.lighting import ambient_dn, fill_background, gain_line, gain_parameters, lambert
+from sim_backends.optics.pattern import (
+    CHESS,
+    EDGE,
+    PLAIN,
+    chess_share,
+    classify,
+    disc_share,
+    nearest_dot,
+    pattern_parameters,
+    plain_parameters,
+    rectangle_share,
+)
+from sim_backends.optics.scene import BoardInstance, Light, PlaneInstance
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float32]
 Window = tuple[int, int, int, int]
-
-AMBIENT_RATE = 25_000.0
-"""DN per second of a facing surface of albedo 1 in light of level 1, without a filter, in the image's centre."""
-PLAIN, MARKED, ASYMMETRIC, DOTS, CHESS = range(5)
-
-
-def ambient_dn(optics: CameraOptics, light: Light, exposure: float) -> float:
-    """DN in the image's centre of a surface of albedo 1 that faces the light, after `exposure` seconds."""
-    return AMBIENT_RATE * light.level * optics.transmission * exposure
-
-
-def lambert(light: Light, normal: Vector) -> float:
-    """Relative light on a surface of unit `normal` (camera frame, towards the camera)."""
-    lamp = (0.0, 0.0, -1.0) if light.direction is None else light.direction
-    return light.diffuse + (1 - light.diffuse) * max(0.0, float(np.dot(normal, lamp)))
-
-
-def gain_parameters(optics: CameraOptics, light: Light) -> Vector:
-    """(6,) centre, inverse corner radius², vignetting and gradients per pixel: what `pixel_gain` takes."""
-    centre_u, centre_v = (optics.width - 1) / 2, (optics.height - 1) / 2
-    return np.array(
-        [
-            centre_u,
-            centre_v,
-            1 / (centre_u**2 + centre_v**2),
-            optics.vignetting,
-            light.gradient[0] / optics.width,
-            light.gradient[1] / optics.height,
-        ]
-    )
-
-
-def pattern_parameters(board: Board) -> Vector:
-    """(12,) kind, cols, rows, pitch, bounds, albedos and dot radius: what the kernels take."""
-    return np.array(
-        [
-            KINDS.index(board.kind),
-            board.cols,
-            board.rows,
-            board.pitch,
-            *board.bounds,
-            board.white,
-            board.black,
-            board.dot_radius,
-            board.dot_radius / 2,
-        ]
-    )
-
-
-def plain_parameters(bounds: tuple[float, float, float, float], albedo: float) -> Vector:
-    """Parameters of a rectangle without a pattern, same layout as `pattern_parameters`."""
-    return np.array([PLAIN, 1, 1, 1.0, *bounds, albedo, albedo, 0.0, 0.0])
 
 
 def appearance(instance: BoardInstance | PlaneInstance) -> tuple[Vector, Vector]:
@@ -97,6 +58,9 @@ def render_rectangle(
     inverse = np.linalg.inv(np.column_stack([pose[:3, 0], pose[:3, 1], pose[:3, 3]]))
     level = ambient_dn(optics, light, exposure) * lambert(light, normal)
     x, y = optics.rays()
+    if pattern[0] == PLAIN and _fills(x, y, inverse, pattern):
+        fill_background(image, level * pattern[8], gain_parameters(optics, light))
+        return
     edges = draw(
         image, x, y, inverse, pattern, np.array(window), offset, optics.fx, level, gain_parameters(optics, light)
     )
@@ -127,124 +91,20 @@ def visible_window(optics: CameraOptics, pose: Vector, pattern: Vector) -> Windo
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
+def _fills(x: Image, y: Image, inverse: Vector, pattern: Vector) -> bool:
+    """Whether the picture's rim, and so all of it, shows the rectangle."""
+    rim_x = np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]])
+    rim_y = np.concatenate([y[0], y[-1], y[:, 0], y[:, -1]])
+    a, b, w = inverse @ np.stack([rim_x, rim_y, np.ones_like(rim_x)])
+    x0, x1, y0, y1 = pattern[4:8]
+    return bool(
+        (w > 0).all() and (a > x0 * w).all() and (a < x1 * w).all() and (b > y0 * w).all() and (b < y1 * w).all()
+    )
+
+
 def _distance(pose: Vector, pattern: Vector) -> float:
     centre = np.array([(pattern[4] + pattern[5]) / 2, (pattern[6] + pattern[7]) / 2, 0.0])
     return max(float(pose[2, :3] @ centre + pose[2, 3]), 1e-3)
-
-
-@compiled
-def pixel_gain(u: float, v: float, gain: Vector) -> float:
-    """Vignetting times ambient gradient at a pixel."""
-    a = u - gain[0]
-    b = v - gain[1]
-    return (1.0 - gain[3] * (a * a + b * b) * gain[2]) * (1.0 + gain[4] * a + gain[5] * b)
-
-
-@compiled
-def fill_background(image: Image, level: float, gain: Vector) -> None:
-    """Set the whole image to `level` DN times the gain."""
-    for v in range(image.shape[0]):
-        for u in range(image.shape[1]):
-            image[v, u] = level * pixel_gain(u, v, gain)
-
-
-@compiled
-def nearest_dot(bx: float, by: float, pattern: Vector) -> tuple[float, float, bool, bool]:
-    """Centre of the dot nearest to a point of the board, whether there is one, and whether it is a ring."""
-    kind, cols, rows, pitch = int(pattern[0]), int(pattern[1]), int(pattern[2]), pattern[3]
-    j = min(max(int(np.floor(by / pitch + 0.5)), 0), rows - 1)
-    if kind == ASYMMETRIC:
-        shift = j % 2
-        i = min(max(int(np.floor((bx / pitch - shift) / 2.0 + 0.5)), 0), cols - 1)
-        return (2 * i + shift) * pitch, j * pitch, True, False
-    i = min(max(int(np.floor(bx / pitch + 0.5)), 0), cols - 1)
-    c, r = (cols - 1) // 2, (rows - 1) // 2
-    ring = kind == MARKED and ((j == r and (i == c or i == c + 2)) or (j == r + 1 and i == c))
-    return i * pitch, j * pitch, True, ring
-
-
-@compiled
-def albedo_at(bx: float, by: float, pattern: Vector) -> float:
-    """Albedo of the board at a point inside its bounds."""
-    kind = int(pattern[0])
-    if kind == PLAIN:
-        return pattern[8]
-    if kind == CHESS:
-        p = pattern[3]
-        a, b = int(np.floor(bx / p)), int(np.floor(by / p))
-        inside = a >= -1 and b >= -1 and a < pattern[1] and b < pattern[2]
-        return pattern[9] if inside and (a + b) % 2 == 0 else pattern[8]
-    x, y, _, ring = nearest_dot(bx, by, pattern)
-    d2 = (bx - x) ** 2 + (by - y) ** 2
-    if d2 > pattern[10] ** 2 or (ring and d2 < pattern[11] ** 2):
-        return pattern[8]
-    return pattern[9]
-
-
-@compiled
-def near_edge(bx: float, by: float, reach: float, pattern: Vector) -> bool:
-    """Whether an edge of the pattern passes within `reach` (m on the board) of a point."""
-    kind = int(pattern[0])
-    if kind == PLAIN:
-        return False
-    if kind == CHESS:
-        p = pattern[3]
-        return abs(bx - p * np.floor(bx / p + 0.5)) < reach or abs(by - p * np.floor(by / p + 0.5)) < reach
-    x, y, _, ring = nearest_dot(bx, by, pattern)
-    d = np.sqrt((bx - x) ** 2 + (by - y) ** 2)
-    return abs(d - pattern[10]) < reach or (ring and abs(d - pattern[11]) < reach)
-
-
-@compiled
-def chord(x: float, y: float, dx: float, dy: float, radius: float) -> float:
-    """Share of the segment (x, y) … (x + dx, y + dy) inside the circle of `radius` about the origin."""
-    a = dx * dx + dy * dy
-    b = x * dx + y * dy
-    c = x * x + y * y - radius * radius
-    root = b * b - a * c
-    if root <= 0.0:
-        return 0.0
-    root = np.sqrt(root)
-    return max(0.0, min(1.0, (-b + root) / a) - max(0.0, (-b - root) / a))
-
-
-@compiled
-def segment_albedo(x: float, y: float, dx: float, dy: float, pattern: Vector) -> float:
-    """Mean albedo along a segment of the board that is shorter than the pattern's details."""
-    kind = int(pattern[0])
-    if kind == PLAIN:
-        return pattern[8]
-    if kind == CHESS:
-        p = pattern[3]
-        ends = np.array([0.0, 1.0, 1.0, 1.0])
-        line = p * np.floor((x + 0.5 * dx) / p + 0.5)
-        if dx != 0.0 and 0.0 < (line - x) / dx < 1.0:
-            ends[1] = (line - x) / dx
-        line = p * np.floor((y + 0.5 * dy) / p + 0.5)
-        if dy != 0.0 and 0.0 < (line - y) / dy < 1.0:
-            ends[2] = (line - y) / dy
-        if ends[1] > ends[2]:
-            ends[1], ends[2] = ends[2], ends[1]
-        mean = 0.0
-        for i in range(3):
-            middle = 0.5 * (ends[i] + ends[i + 1])
-            mean += (ends[i + 1] - ends[i]) * albedo_at(x + middle * dx, y + middle * dy, pattern)
-        return mean
-    cx, cy, _, ring = nearest_dot(x + 0.5 * dx, y + 0.5 * dy, pattern)
-    dark = chord(x - cx, y - cy, dx, dy, pattern[10])
-    if ring:
-        dark -= chord(x - cx, y - cy, dx, dy, pattern[11])
-    return pattern[8] + dark * (pattern[9] - pattern[8])
-
-
-@compiled
-def covered(x: float, dx: float, low: float, high: float, start: float, end: float) -> tuple[float, float]:
-    """Clip the parameter interval (start, end) of x + s dx to low … high."""
-    if dx == 0.0:
-        return (start, end) if low <= x <= high else (start, start)
-    a = (low - x) / dx
-    b = (high - x) / dx
-    return max(start, min(a, b)), min(end, max(a, b))
 
 
 @compiled
@@ -261,56 +121,72 @@ def draw(
     gain: Vector,
 ) -> int:
     """Draw the rectangle; `inverse` maps a ray to (bx, by, 1)/Z. Returns the number of edge pixels."""
-    lines = 8
     u0, v0, u1, v1 = window[0], window[1], window[2], window[3]
-    x0, x1, y0, y1 = pattern[4], pattern[5], pattern[6], pattern[7]
-    last_u, last_v = image.shape[1] - 1, image.shape[0] - 1
+    board = np.empty((3, u1 - u0), dtype=np.float64)
+    albedo = np.empty(u1 - u0, dtype=np.float32)
+    light = np.empty(u1 - u0, dtype=np.float32)
     edges = 0
     for v in range(v0, v1):
-        above, below = max(v - 1, 0), min(v + 1, last_v)
-        for u in range(u0, u1):
-            x, y = ray_x[v, u], ray_y[v, u]
-            w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-            if w <= 0.0:
-                continue
-            depth = 1.0 / w
-            bx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * depth
-            by = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * depth
-            reach = 0.85 * depth * depth / (focal_px * offset)
-            if bx < x0 - reach or bx > x1 + reach or by < y0 - reach or by > y1 + reach:
-                continue
-            inside = bx > x0 + reach and bx < x1 - reach and by > y0 + reach and by < y1 - reach
-            light = level * pixel_gain(u, v, gain)
-            if inside and not near_edge(bx, by, reach, pattern):
-                image[v, u] = light * albedo_at(bx, by, pattern)
-                continue
-            edges += 1
-            left, right = max(u - 1, 0), min(u + 1, last_u)
-            xu = (ray_x[v, right] - ray_x[v, left]) / (right - left)
-            yu = (ray_y[v, right] - ray_y[v, left]) / (right - left)
-            xv = (ray_x[below, u] - ray_x[above, u]) / (below - above)
-            yv = (ray_y[below, u] - ray_y[above, u]) / (below - above)
-            wu = inverse[2, 0] * xu + inverse[2, 1] * yu
-            wv = inverse[2, 0] * xv + inverse[2, 1] * yv
-            bxu = (inverse[0, 0] * xu + inverse[0, 1] * yu - bx * wu) * depth
-            byu = (inverse[1, 0] * xu + inverse[1, 1] * yu - by * wu) * depth
-            bxv = (inverse[0, 0] * xv + inverse[0, 1] * yv - bx * wv) * depth
-            byv = (inverse[1, 0] * xv + inverse[1, 1] * yv - by * wv) * depth
-            albedo = 0.0
-            cover = 0.0
-            for line in range(lines):
-                t = (line + 0.5) / lines - 0.5
-                sx = bx + t * bxv - 0.5 * bxu
-                sy = by + t * byv - 0.5 * byu
-                start, end = 0.0, 1.0
-                if not inside:
-                    start, end = covered(sx, bxu, x0, x1, start, end)
-                    start, end = covered(sy, byu, y0, y1, start, end)
-                if end > start:
-                    length = end - start
-                    cover += length
-                    albedo += length * segment_albedo(
-                        sx + start * bxu, sy + start * byu, length * bxu, length * byu, pattern
-                    )
-            image[v, u] = (image[v, u] * (lines - cover) + light * albedo) / lines
+        locate(ray_x[v, u0:u1], ray_y[v, u0:u1], inverse, 0.85 / (focal_px * offset), board)
+        classify(board, pattern, albedo)
+        gain_line(light, u0, v, level, gain)
+        line = image[v, u0:u1]
+        for u in range(u1 - u0):
+            if albedo[u] >= 0.0:
+                line[u] = light[u] * albedo[u]
+            elif albedo[u] == EDGE:
+                edges += 1
+                cover, shade = edge_pixel(ray_x, ray_y, u + u0, v, inverse, pattern)
+                line[u] = line[u] * (1.0 - cover) + light[u] * cover * shade
     return edges
+
+
+@compiled_fast
+def locate(ray_x: Image, ray_y: Image, inverse: Vector, footprint: float, board: Vector) -> None:
+    """For a line of rays: where they meet the board, and the reach of a pixel on it (negative behind the camera)."""
+    a, b, c = inverse[0, 0], inverse[0, 1], inverse[0, 2]
+    d, e, f = inverse[1, 0], inverse[1, 1], inverse[1, 2]
+    g, h, i = inverse[2, 0], inverse[2, 1], inverse[2, 2]
+    for u in range(ray_x.shape[0]):
+        x, y = ray_x[u], ray_y[u]
+        w = g * x + h * y + i
+        depth = 1.0 / w
+        board[0, u] = (a * x + b * y + c) * depth
+        board[1, u] = (d * x + e * y + f) * depth
+        board[2, u] = footprint * depth * depth if w > 1e-9 else -1e9
+
+
+@compiled
+def edge_pixel(ray_x: Image, ray_y: Image, u: int, v: int, inverse: Vector, pattern: Vector) -> tuple[float, float]:
+    """Share of a pixel that the rectangle covers, and the mean albedo of that share."""
+    left, right = max(u - 1, 0), min(u + 1, ray_x.shape[1] - 1)
+    above, below = max(v - 1, 0), min(v + 1, ray_x.shape[0] - 1)
+    x, y = ray_x[v, u], ray_y[v, u]
+    depth = 1.0 / (inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2])
+    bx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * depth
+    by = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * depth
+    xu = (ray_x[v, right] - ray_x[v, left]) / (right - left)
+    yu = (ray_y[v, right] - ray_y[v, left]) / (right - left)
+    xv = (ray_x[below, u] - ray_x[above, u]) / (below - above)
+    yv = (ray_y[below, u] - ray_y[above, u]) / (below - above)
+    wu = inverse[2, 0] * xu + inverse[2, 1] * yu
+    wv = inverse[2, 0] * xv + inverse[2, 1] * yv
+    bxu = (inverse[0, 0] * xu + inverse[0, 1] * yu - bx * wu) * depth
+    byu = (inverse[1, 0] * xu + inverse[1, 1] * yu - by * wu) * depth
+    bxv = (inverse[0, 0] * xv + inverse[0, 1] * yv - bx * wv) * depth
+    byv = (inverse[1, 0] * xv + inverse[1, 1] * yv - by * wv) * depth
+    wide, tall = abs(bxu) + abs(bxv), abs(byu) + abs(byv)
+    white = pattern[8]
+    if not (pattern[4] + wide < bx < pattern[5] - wide and pattern[6] + tall < by < pattern[7] - tall):
+        # No detail of a pattern reaches the rim.
+        return rectangle_share(bx, by, bxu, byu, bxv, byv, pattern), white
+    kind = int(pattern[0])
+    if kind == PLAIN:
+        return 1.0, white
+    if kind == CHESS:
+        return 1.0, chess_share(bx, by, bxu, byu, bxv, byv, pattern)
+    dot_x, dot_y, ring = nearest_dot(bx, by, pattern)
+    dark = disc_share(bx - dot_x, by - dot_y, bxu, byu, bxv, byv, pattern[10])
+    if ring:
+        dark -= disc_share(bx - dot_x, by - dot_y, bxu, byu, bxv, byv, pattern[11])
+    return 1.0, white + dark * (pattern[9] - white)

@@ -1,7 +1,7 @@
 """A triangle mesh with a box tree, for the light plane's section and for shadow rays.
 
-Triangles are put in Morton order of their centres; the tree over them is complete and implicit (children of node i are
-2i+1 and 2i+2), so it is built by plain array operations.
+The tree is complete and implicit (children of node i are 2i+1 and 2i+2), so it is built by plain array operations;
+places in the last leaves that hold no triangle are filled with points at the origin, which nothing can hit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ class Mesh:
     """Triangles: `vertices` (n, 3) in m, `triangles` (m, 3) vertex numbers. Orientation does not matter.
 
     `corners` (m, 3, 3) are the triangles' vertices in tree order, `low`, `high` (nodes, 3) the tree's boxes;
-    `leaf_centres`, `leaf_normals` (k, 3) and `leaf_sizes` (k,) describe the leaves for coarse shading.
+    `leaf_centres`, `leaf_normals` (k, 3) and `leaf_sizes` (k,), of median `leaf_size`, describe the leaves for coarse
+    shading; `middle` (3,) is their mean.
     """
 
     def __init__(self, vertices: Vector, triangles: NDArray[np.integer]) -> None:
@@ -33,16 +34,20 @@ class Mesh:
         if self.triangles.min() < 0 or self.triangles.max() >= len(self.vertices):
             raise ValueError(f"a triangle names a vertex outside 0…{len(self.vertices) - 1}")
         corners = self.vertices[self.triangles]
-        order = np.argsort(_morton(corners.mean(axis=1)), kind="stable")
-        self.corners = np.ascontiguousarray(corners[order])
-        self.low, self.high = _tree(self.corners)
-        firsts = np.arange(0, len(self.corners), LEAF)
+        order = _tree_order(corners.mean(axis=1))
+        used = order >= 0
+        self.corners = np.ascontiguousarray(np.where(used[:, None, None], corners[order], 0.0))
+        self.low, self.high = _tree(self.corners, used)
         crosses = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
-        sums = np.add.reduceat(crosses, firsts)
-        self.leaf_normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
-        leaves = slice(len(self.low) // 2, len(self.low) // 2 + len(firsts))
-        self.leaf_centres = (self.low[leaves] + self.high[leaves]) / 2
-        self.leaf_sizes = (self.high[leaves] - self.low[leaves]).max(axis=1)
+        sums = crosses.reshape(-1, LEAF, 3).sum(axis=1)
+        filled: NDArray[np.bool_] = np.asarray(used.reshape(-1, LEAF).any(axis=1))
+        low, high = self.low[-len(filled) :][filled], self.high[-len(filled) :][filled]
+        lengths = np.linalg.norm(sums[filled], axis=1, keepdims=True)
+        self.leaf_normals: Vector = sums[filled] / np.maximum(lengths, 1e-300)
+        self.leaf_centres = (low + high) / 2
+        self.leaf_sizes: Vector = (high - low).max(axis=1)
+        self.middle: Vector = self.leaf_centres.mean(axis=0)
+        self.leaf_size = float(np.median(self.leaf_sizes))
 
     def section(self, normal: Vector, distance: float) -> tuple[Vector, NDArray[np.int64]]:
         """Cut by the plane normal·P = distance: segments (k, 2, 3) and the triangle (tree order) of each."""
@@ -72,26 +77,32 @@ class Mesh:
         return hidden
 
 
-def _morton(points: Vector) -> NDArray[np.uint64]:
-    low, high = points.min(axis=0), points.max(axis=0)
-    cells = ((points - low) / np.maximum(high - low, 1e-12).max() * 65535).astype(np.uint64)
-    code = np.zeros(len(points), dtype=np.uint64)
-    for bit in range(16):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return code
-
-
-def _tree(corners: Vector) -> tuple[Vector, Vector]:
+def _tree_order(centres: Vector) -> NDArray[np.int64]:
+    """Split at the median along the longest side, level by level; places left over at the end hold -1."""
     leaves = 1
-    while leaves * LEAF < len(corners):
+    while leaves * LEAF < len(centres):
         leaves *= 2
-    padded_low = np.full((leaves * LEAF, 3), np.inf)
-    padded_high = np.full((leaves * LEAF, 3), -np.inf)
-    padded_low[: len(corners)] = corners.min(axis=1)
-    padded_high[: len(corners)] = corners.max(axis=1)
-    lows = [padded_low.reshape(leaves, LEAF, 3).min(axis=1)]
-    highs = [padded_high.reshape(leaves, LEAF, 3).max(axis=1)]
+    order = np.full(leaves * LEAF, -1, dtype=np.int64)
+    order[: len(centres)] = np.arange(len(centres))
+    padded = np.full((leaves * LEAF, 3), np.inf)
+    padded[: len(centres)] = centres
+    blocks = 1
+    while blocks < leaves:
+        points = padded.reshape(blocks, -1, 3)
+        finite = np.isfinite(points)
+        spans = np.where(finite, points, -np.inf).max(axis=1) - np.where(finite, points, np.inf).min(axis=1)
+        keys = np.take_along_axis(points, spans.argmax(axis=1)[:, None, None], axis=2)[:, :, 0]
+        inner = keys.argsort(axis=1, kind="stable")
+        padded = np.take_along_axis(points, inner[:, :, None], axis=1).reshape(-1, 3)
+        order = np.take_along_axis(order.reshape(blocks, -1), inner, axis=1).ravel()
+        blocks *= 2
+    return order
+
+
+def _tree(corners: Vector, used: NDArray[np.bool_]) -> tuple[Vector, Vector]:
+    low = np.where(used[:, None], corners.min(axis=1), np.inf).reshape(-1, LEAF, 3).min(axis=1)
+    high = np.where(used[:, None], corners.max(axis=1), -np.inf).reshape(-1, LEAF, 3).max(axis=1)
+    lows, highs = [low], [high]
     while len(lows[0]) > 1:
         lows.insert(0, lows[0].reshape(-1, 2, 3).min(axis=1))
         highs.insert(0, highs[0].reshape(-1, 2, 3).max(axis=1))
@@ -135,7 +146,7 @@ def cut(
             depth += 2
             continue
         start = (node - first_leaf) * LEAF
-        for t in range(start, min(start + LEAF, corners.shape[0])):
+        for t in range(start, start + LEAF):
             for i in range(3):
                 height[i] = (
                     normal[0] * corners[t, i, 0]
@@ -207,7 +218,7 @@ def shadow(
                 depth += 2
                 continue
             begin = (node - first_leaf) * LEAF
-            for t in range(begin, min(begin + LEAF, corners.shape[0])):
+            for t in range(begin, begin + LEAF):
                 ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
                 e1x, e1y, e1z = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
                 e2x, e2y, e2z = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.optics.boards import ambient_dn, fill_background, gain_parameters, render_rectangle
+from sim_backends.optics.boards import render_rectangle
 from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.lighting import ambient_dn, fill_background, gain_parameters
 from sim_backends.optics.scene import BoardInstance, LaserOptics, Light, MeshInstance, PlaneInstance, SceneObject
 from sim_backends.optics.sensor import sensor
 from sim_backends.optics.shading import render_mesh
