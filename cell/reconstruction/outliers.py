@@ -1,0 +1,183 @@
+"""Points of an organised cloud that do not lie on the surface around them.
+
+The depth of each point is compared with the median of its 5×5 neighbours (line × row), in units of its noise and of
+the deviations around it, so that near outliers and streaks stand out (theory sheet, part 5). Compiled.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+THRESHOLD = 6.5
+"""Deviation, in median absolute deviations, from which on a point is an outlier.
+
+The deviation is the lesser of two, so its median is less than a normal variable's and the sheet's 5 becomes 6.5.
+"""
+LEAST_NEIGHBOURS = 6
+"""A point with fewer neighbours in its window is rejected: nothing supports it."""
+SCALE_OF_QUARTILE = 2.0
+"""Median over lower quartile of the absolute values of a normal variable; streaks on both sides spoil the median."""
+LEAST_PAIRS = 5
+"""With fewer pairs of opposite neighbours only the median of all neighbours is used."""
+
+
+def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """True (lines, rows) for outliers of `depth` (lines, rows) in m, NaN for holes; `sigma` is its noise in m.
+
+    Deviations are weighed by `sigma`. What a first pass finds is left out of the medians of a second one.
+    """
+    values = np.array(depth, dtype=np.float64)
+    noise = np.array(sigma, dtype=np.float64)
+    measured = np.isfinite(values)
+    outliers = np.zeros(values.shape, dtype=np.bool_)
+    if not measured.any():
+        return outliers
+    noise = np.where(measured, np.maximum(noise, 0.2 * float(np.median(noise[measured]))), 1.0)
+    level = _level(values, noise)
+    for _ in range(2):
+        outliers = _judge(values, np.where(outliers, np.nan, values), noise, level)
+    return outliers
+
+
+def _level(values: Array, noise: Array) -> float:
+    """Median absolute deviation over the whole cloud, in units of the noise, from every seventh line and row."""
+    deviations = _sampled(values, noise, 3 if values.size < 20_000 else 7)
+    found = deviations[np.isfinite(deviations)]
+    return float(np.median(np.abs(found))) if len(found) else 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort(buffer: Array, count: int) -> None:
+    """Sort the first `count` values of `buffer` in place, by insertion: they are few."""
+    for i in range(1, count):
+        value, j = buffer[i], i - 1
+        while j >= 0 and buffer[j] > value:
+            buffer[j + 1] = buffer[j]
+            j -= 1
+        buffer[j + 1] = value
+
+
+@numba.njit(cache=True, nogil=True)
+def _median(buffer: Array, count: int) -> float:
+    """Median of the first `count` values of `buffer`, which are sorted in place."""
+    _sort(buffer, count)
+    return float(0.5 * (buffer[(count - 1) // 2] + buffer[count // 2]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(values: Array, line: int, row: int, buffer: Array) -> int:
+    """The finite values of the 5×5 window around (line, row), without its middle, into `buffer`; their number."""
+    count = 0
+    for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
+        for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
+            value = values[i, j]
+            if (i != line or j != row) and not np.isnan(value):
+                buffer[count] = value
+                count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather_pairs(values: Array, line: int, row: int, buffer: Array) -> int:
+    """Means of the values opposite each other about (line, row), into `buffer`; their number."""
+    count = 0
+    for i in range(-2, 1):
+        for j in range(-2, 3):
+            if i == 0 and j >= 0:
+                break
+            a, b, c, d = line + i, row + j, line - i, row - j
+            if a < 0 or c >= values.shape[0] or min(b, d) < 0 or max(b, d) >= values.shape[1]:
+                continue
+            mean = 0.5 * (values[a, b] + values[c, d])
+            if not np.isnan(mean):
+                buffer[count] = mean
+                count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _deviation(values: Array, kept: Array, noise: Array, line: int, row: int, buffer: Array) -> float:
+    """How far a value lies off the kept ones around it, in units of its noise; NaN where too few are around.
+
+    Off their median, which an edge does not mislead, or off the median of opposite pairs, which a slope does not
+    mislead: whichever is less.
+    """
+    count = _gather(kept, line, row, buffer)
+    if count < LEAST_NEIGHBOURS:
+        return np.nan
+    own = values[line, row]
+    off = own - _median(buffer, count)
+    count = _gather_pairs(kept, line, row, buffer)
+    if count >= LEAST_PAIRS:
+        off_pairs = own - _median(buffer, count)
+        if abs(off_pairs) < abs(off):
+            off = off_pairs
+    return off / noise[line, row]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sampled(values: Array, noise: Array, stride: int) -> Array:
+    """Deviations of every `stride`-th place."""
+    result = np.full((values.shape[0] // stride + 1, values.shape[1] // stride + 1), np.nan)
+    buffer = np.empty(25)
+    for i in range(0, values.shape[0], stride):
+        for j in range(0, values.shape[1], stride):
+            if not np.isnan(values[i, j]):
+                result[i // stride, j // stride] = _deviation(values, values, noise, i, j, buffer)
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _supported(values: Array, kept: Array, reach: float, line: int, row: int, buffer: Array) -> bool:
+    """True when over half of the neighbours, or of their pairs, lie within `reach`: then so does their median."""
+    value = values[line, row]
+    count = _gather_pairs(kept, line, row, buffer)
+    if count >= LEAST_PAIRS:
+        near = 0
+        for k in range(count):
+            near += abs(buffer[k] - value) <= reach
+        if 2 * near > count:
+            return True
+    count = _gather(kept, line, row, buffer)
+    near = 0
+    for k in range(count):
+        near += abs(buffer[k] - value) <= reach
+    return count >= LEAST_NEIGHBOURS and 2 * near > count
+
+
+@numba.njit(cache=True, nogil=True)
+def _judge(values: Array, kept: Array, noise: Array, level: float) -> NDArray[np.bool_]:
+    """Outliers among `values` with respect to the `kept` ones: further off than so many local or global scales."""
+    outliers = np.zeros(values.shape, dtype=np.bool_)
+    known = np.full(values.shape, np.inf)
+    buffer, sizes = np.empty(25), np.empty(25)
+    for line in range(values.shape[0]):
+        for row in range(values.shape[1]):
+            if np.isnan(values[line, row]):
+                continue
+            if _supported(values, kept, THRESHOLD * level * noise[line, row], line, row, buffer):
+                continue
+            own = _deviation(values, kept, noise, line, row, buffer)
+            if np.isnan(own):
+                outliers[line, row] = True
+                continue
+            count = 0
+            for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
+                for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
+                    if (i == line and j == row) or np.isnan(kept[i, j]):
+                        continue
+                    if known[i, j] == np.inf:
+                        known[i, j] = abs(_deviation(kept, kept, noise, i, j, buffer))
+                    if not np.isnan(known[i, j]):
+                        sizes[count] = known[i, j]
+                        count += 1
+            scale = level
+            if count > 0:
+                _sort(sizes, count)
+                scale = max(level, SCALE_OF_QUARTILE * sizes[count // 4])
+            outliers[line, row] = abs(own) > THRESHOLD * scale
+    return outliers
