@@ -33,12 +33,8 @@ _Frame = tuple[float, float, float, float, float, float, float, float, float, fl
 _BASE: _Frame = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _EYE = np.eye(6)
 _MAX_STEP = 0.5
-_RESTARTS = (
-    (0.0,) * 6,
-    (0.0, -0.5, 0.8, -0.3, 0.2, 0.0),
-    (0.6, 0.4, -0.7, 0.5, -0.4, 0.3),
-    (-0.6, -0.9, 1.2, 0, 0.6, 0),
-)
+_RESTARTS = np.vstack((np.zeros(6), np.random.default_rng(0).uniform(-2.0, 2.0, (15, 6))))
+"""Where the inverse begins, relative to the wanted neighbourhood, until one descent arrives."""
 
 
 class Kinematics:
@@ -73,7 +69,7 @@ class Kinematics:
         `tolerance` bounds the remaining position error in m and rotation error in rad.
         """
         for offset in _RESTARTS:
-            q = self._descend(target, near + np.asarray(offset), tolerance)
+            q = self._descend(target, near + offset, tolerance)
             if q is not None:
                 q = near + np.mod(q - near + math.pi, 2 * math.pi) - math.pi
                 return np.where(q > limit, q - 2 * math.pi, np.where(q < -limit, q + 2 * math.pi, q))
@@ -84,12 +80,17 @@ class Kinematics:
         return self._descend(target, q, tolerance, iterations=8)
 
     def _descend(self, target: Matrix, q: Vector, tolerance: float, iterations: int = 60) -> Vector | None:
-        for _ in range(iterations):
+        milestone = math.inf
+        for i in range(iterations):
             pose, jacobian = self.forward_with_jacobian(q)
             error = pose_error(target, pose)
             size = max(map(abs, error.tolist()))
             if size < tolerance:
                 return q
+            if i % 12 == 11:
+                if size > 0.7 * milestone:
+                    return None
+                milestone = size
             # Damping that fades with the error converges quadratically and yet passes singularities.
             damping = 1e-3 * size + 1e-12
             step = jacobian.T.dot(np.linalg.solve(jacobian.dot(jacobian.T) + damping * _EYE, error))

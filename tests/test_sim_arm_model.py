@@ -1,0 +1,347 @@
+"""The simulated arm without its network: kinematics against Pinocchio, motions against closed forms, true poses."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
+from sim_backends.models.arm_kinematics import (
+    UR10E_DH,
+    Kinematics,
+    matrix_from_pose,
+    pose_error,
+    pose_from_matrix,
+    rotation_vector,
+)
+from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, Stop
+
+TICK = 0.002
+Array = NDArray[np.float64]
+
+
+def pinocchio_arm(table: Array) -> pin.Model:
+    """The same arm built from the DH table by another library."""
+    model = pin.Model()
+    parent, placement = 0, pin.SE3.Identity()
+    for i, (a, d, alpha, offset) in enumerate(table):
+        turn = pin.SE3(pin.utils.rotate("z", offset), np.zeros(3))
+        parent = model.addJoint(parent, pin.JointModelRZ(), placement * turn, f"j{i}")
+        placement = pin.SE3(pin.utils.rotate("x", alpha), np.array([a, 0.0, d]))
+    model.addFrame(pin.Frame("flange", parent, 0, placement, pin.FrameType.OP_FRAME))
+    return model
+
+
+def pinocchio_flange(table: Array, q: Array) -> Array:
+    model = pinocchio_arm(table)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return np.asarray(data.oMf[model.getFrameId("flange")].homogeneous)
+
+
+def make_arm(**params: object) -> ArmModel:
+    return ArmModel(ArmParams(**params), np.random.default_rng(3), WorldClock())  # type: ignore[arg-type]
+
+
+def run(arm: ArmModel, seconds: float, tick: float = TICK) -> None:
+    for _ in range(round(seconds / tick)):
+        arm.tick(arm.time + tick)
+
+
+def finish(arm: ArmModel, limit: float = 30.0) -> float:
+    """Tick until the motion has ended; the seconds it took."""
+    start = arm.time
+    while not arm.idle:
+        assert arm.time - start < limit, "the motion does not end"
+        arm.tick(arm.time + TICK)
+    return arm.time - start
+
+
+def random_table(rng: np.random.Generator) -> Array:
+    return UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
+
+
+def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        table = random_table(rng)
+        q = rng.uniform(-2 * math.pi, 2 * math.pi, 6)
+        pose, jacobian = Kinematics(table).forward_with_jacobian(q)
+        np.testing.assert_allclose(pose, pinocchio_flange(table, q), atol=1e-12)
+        np.testing.assert_allclose(Kinematics(table).forward(q), pose, atol=1e-15)
+        model = pinocchio_arm(table)
+        data = model.createData()
+        expected = pin.computeFrameJacobian(
+            model, data, q, model.getFrameId("flange"), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )
+        np.testing.assert_allclose(jacobian, expected, atol=1e-12)
+
+
+def test_inverse_kinematics_reaches_the_pose_within_the_joint_limits() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        target = pinocchio_flange(UR10E_DH, rng.uniform(-3, 3, 6))
+        q = Kinematics(UR10E_DH).inverse(target, rng.uniform(-3, 3, 6))
+        assert q is not None
+        assert np.abs(q).max() <= 2 * math.pi
+        np.testing.assert_allclose(pinocchio_flange(UR10E_DH, q), target, atol=1e-8)
+
+
+def test_inverse_kinematics_says_when_a_pose_is_out_of_reach() -> None:
+    target = np.eye(4)
+    target[:3, 3] = [1.5, 0.5, 0.5]
+    assert Kinematics(UR10E_DH).inverse(target, np.zeros(6)) is None
+
+
+def test_rotation_vectors_agree_with_pinocchio_up_to_half_a_turn() -> None:
+    rng = np.random.default_rng(4)
+    axes = rng.normal(size=(40, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    for axis, angle in zip(axes, np.linspace(0.0, math.pi - 1e-9, 40), strict=True):
+        np.testing.assert_allclose(rotation_vector(pin.exp3(axis * angle)), axis * angle, atol=1e-7)
+    down = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    np.testing.assert_allclose(np.abs(rotation_vector(down)), math.pi / math.sqrt(2) * np.array([1, 1, 0]), atol=1e-12)
+
+
+def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly() -> None:
+    arm = make_arm()
+    target = arm.drive.q + np.array([0.8, -0.2, 0.1, 0.0, 0.3, -0.4])
+    arm.start(JointMove(target, 0.5, 1.0))
+    assert finish(arm) == pytest.approx(0.8 / 0.5 + 0.5 / 1.0, abs=2 * TICK)
+    np.testing.assert_array_equal(arm.drive.q, target)
+    np.testing.assert_array_equal(arm.drive.qd, np.zeros(6))
+
+
+def test_a_joint_move_keeps_every_joint_within_its_speed_limit() -> None:
+    arm = make_arm()
+    arm.start(JointMove(arm.drive.q + np.array([1.5, 0.1, 0, 0, 0, 1.6]), 3.1, 20.0))
+    fastest = np.zeros(6)
+    while not arm.idle:
+        arm.tick(arm.time + TICK)
+        fastest = np.maximum(fastest, np.abs(arm.drive.qd))
+    assert arm.safety is Safety.NORMAL
+    assert fastest[0] == pytest.approx(math.radians(120), rel=1e-6)
+
+
+def test_a_linear_move_keeps_to_the_line_at_its_speed() -> None:
+    arm = make_arm()
+    start = arm.reported_flange()
+    target = start.copy()
+    target[:3, 3] += [0.05, -0.1, 0.08]
+    target[:3, :3] = pin.exp3(np.array([0.05, 0.0, 0.1])) @ target[:3, :3]
+    arm.start(LinearMove(target, 0.1, 0.5))
+    way = target[:3, 3] - start[:3, 3]
+    points = []
+    while not arm.idle:
+        arm.tick(arm.time + TICK)
+        points.append(arm.reported_flange()[:3, 3] - start[:3, 3])
+    line = np.array(points)
+    along = line @ way / np.linalg.norm(way)
+    assert np.linalg.norm(line - np.outer(along, way) / np.linalg.norm(way), axis=1).max() < 1e-8
+    assert np.diff(along).max() == pytest.approx(0.1 * TICK, rel=1e-4)
+    np.testing.assert_allclose(arm.reported_flange(), target, atol=1e-8)
+
+
+def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag() -> None:
+    arm = make_arm()
+    start = arm.drive.q.copy()
+    servo = Servo(start, lag=0.05)
+    arm.start(servo)
+    rate = np.array([0.2, -0.1, 0.1, 0, 0.3, 0])
+    for k in range(1, 501):
+        servo.target = start + rate * (k * TICK)
+        arm.tick(arm.time + TICK)
+    # Each target already holds for the tick that leads to it: half a tick less of lag.
+    np.testing.assert_allclose(servo.target - arm.drive.q, rate * (0.05 - TICK / 2), atol=1e-6)
+    run(arm, 1.0)
+    np.testing.assert_allclose(arm.drive.q, servo.target, atol=1e-8)
+
+
+@pytest.mark.parametrize("tick", [TICK, 0.016])
+def test_speed_commands_ramp_up_hold_and_stop(tick: float) -> None:
+    arm = make_arm()
+    before = arm.drive.q.copy()
+    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 1.0))
+    run(arm, 1.6, tick)
+    assert arm.drive.qd[5] == pytest.approx(0.5)
+    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.5 * 0.5 * 0.5, abs=2e-3)
+    arm.start(Stop(2.0))
+    finish(arm)
+    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.125 + 0.5**2 / 4, abs=2e-2)
+
+
+def test_a_tool_speed_moves_the_tool_at_that_speed() -> None:
+    arm = make_arm()
+    before = arm.reported_flange()
+    arm.start(LinearSpeed(np.array([0.0, 0.0, -0.05, 0, 0, 0]), 10.0))
+    run(arm, 1.0)
+    np.testing.assert_allclose(arm.reported_flange()[:3, 3] - before[:3, 3], [0, 0, -0.05], atol=2e-4)
+
+
+def test_the_reported_pose_follows_the_nominal_table_and_the_true_pose_the_true_one() -> None:
+    error = np.random.default_rng(5).normal(scale=3e-4, size=(6, 4))
+    arm = make_arm(dh_error=error)
+    arm.start(JointMove(arm.drive.q + 0.2, 1.0, 2.0))
+    finish(arm)
+    np.testing.assert_allclose(arm.reported_flange(), pinocchio_flange(UR10E_DH, arm.drive.q), atol=1e-12)
+    true = pinocchio_flange(UR10E_DH + error, arm.drive.q)
+    np.testing.assert_allclose(arm.base_from_flange(arm.time), true, atol=1e-12)
+
+
+def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it() -> None:
+    arm = make_arm(repeatability=(30e-6, 20e-6))
+    home, away = arm.drive.q.copy(), arm.drive.q + 0.1
+    rests = []
+    for _ in range(150):
+        for target in (away, home):
+            arm.start(JointMove(target, 2.0, 10.0))
+            while not arm.idle:
+                arm.tick(arm.time + 0.01)
+            run(arm, 0.05, 0.01)
+        first = arm.base_from_flange(arm.time)
+        run(arm, 0.05, 0.01)
+        np.testing.assert_array_equal(arm.base_from_flange(arm.time), first)
+        rests.append(pose_error(first, pinocchio_flange(UR10E_DH, home)))
+    spread = np.std(rests, axis=0)
+    # 150 samples give a standard deviation to 6 %; five of those for six axes.
+    np.testing.assert_allclose(spread[:3], 30e-6, rtol=0.3)
+    np.testing.assert_allclose(spread[3:], 20e-6, rtol=0.3)
+    assert abs(np.corrcoef(np.array(rests)[:-1, 0], np.array(rests)[1:, 0])[0, 1]) < 0.3
+
+
+def test_the_true_pose_never_jumps() -> None:
+    arm = make_arm(repeatability=(50e-6, 0.0))
+    arm.start(JointMove(arm.drive.q + np.array([0.1, 0, 0, 0, 0, 0]), 0.5, 1.0))
+    last, jumps = arm.base_from_flange(arm.time), []
+    while not arm.idle:
+        arm.tick(arm.time + TICK)
+        now = arm.base_from_flange(arm.time)
+        nominal = arm.drive.qd[0] * math.hypot(*now[:2, 3])
+        jumps.append(np.linalg.norm(now[:3, 3] - last[:3, 3]) - nominal * TICK)
+        last = now
+    # The error wanders over 0.3 s: at most a few standard deviations times pi/2 over 150 ticks, and half a tick's ramp.
+    assert max(jumps) < 5 * 50e-6 * math.pi / 2 / 150 + 2e-6
+
+
+def test_a_force_above_the_limit_stops_the_arm() -> None:
+    arm = make_arm()
+    surface = arm.reported_flange()[2, 3] - 0.02
+    arm.contact = lambda pose: np.array([0.0, 0, 5e4 * max(0.0, surface - pose[2, 3]), 0, 0, 0])
+    arm.start(LinearSpeed(np.array([0.0, 0.0, -0.02, 0, 0, 0]), 1.0))
+    run(arm, 1.5)
+    assert arm.safety is Safety.PROTECTIVE_STOP
+    assert "150 N" in arm.fault_text
+    assert not arm.moving
+    assert surface - arm.reported_flange()[2, 3] == pytest.approx(150 / 5e4, abs=2e-4)
+
+
+def test_force_mode_settles_at_the_wanted_force() -> None:
+    arm = make_arm()
+    surface = arm.reported_flange()[2, 3] - 0.005
+    arm.contact = lambda pose: np.array([0.0, 0, 1e5 * max(0.0, surface - pose[2, 3]), 0, 0, 0])
+    down = np.array([0.0, 0, 1, 0, 0, 0])
+    arm.start(ForceMode(np.eye(4), down, -20.0 * down, np.full(6, 0.05)))
+    run(arm, 1.5, 0.008)
+    assert arm.wrench[2] == pytest.approx(20.0, abs=0.5)
+    assert np.abs(arm.reported_flange()[:2, 3] - pinocchio_flange(UR10E_DH, arm.params.initial_q)[:2, 3]).max() < 1e-5
+
+
+def test_the_wrench_can_be_taken_as_zero_and_carries_the_stated_noise() -> None:
+    arm = make_arm(force_noise=(0.5, 0.05))
+    arm.contact = lambda pose: np.array([1.0, 2.0, -30.0, 0.1, 0.2, 0.3])
+    run(arm, 0.01)
+    arm.zero_force()
+    samples = []
+    for _ in range(1000):
+        arm.tick(arm.time + TICK)
+        samples.append(arm.felt)
+    np.testing.assert_allclose(np.mean(samples, axis=0), 0.0, atol=0.08)
+    np.testing.assert_allclose(np.std(samples, axis=0), [0.5] * 3 + [0.05] * 3, rtol=0.12)
+
+
+@pytest.mark.parametrize("way", [np.array([2.0, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, math.nan])])
+def test_a_servo_target_that_cannot_be_followed_is_a_protective_stop(way: Array) -> None:
+    arm = make_arm()
+    arm.start(Servo(arm.drive.q + way, 0.02))
+    run(arm, 0.5)
+    assert arm.safety is Safety.PROTECTIVE_STOP
+    assert "limit" in arm.fault_text
+    assert np.isfinite(arm.drive.q).all()
+    assert not arm.moving
+
+
+def test_a_joint_beyond_its_range_is_a_protective_stop() -> None:
+    arm = make_arm(initial_q=np.array([6.0, -1.5, -1.5, -1.5, 1.5, 0]))
+    arm.start(JointSpeed(np.array([1.0, 0, 0, 0, 0, 0]), 5.0))
+    run(arm, 1.0)
+    assert arm.safety is Safety.PROTECTIVE_STOP
+    assert "360°" in arm.fault_text
+    assert arm.drive.q[0] <= 2 * math.pi
+
+
+def test_a_line_through_the_edge_of_the_reach_is_a_protective_stop() -> None:
+    arm = make_arm()
+    target = arm.reported_flange()
+    target[0, 3] += 1.0
+    arm.start(LinearMove(target, 0.5, 2.0))
+    run(arm, 5.0)
+    assert arm.safety is Safety.PROTECTIVE_STOP
+
+
+def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resumed() -> None:
+    arm = make_arm()
+    target = arm.drive.q + 0.5
+    arm.start(JointMove(target, 0.5, 1.0))
+    run(arm, 0.5)
+    arm.fault("protective_stop")
+    run(arm, 1.0)
+    assert not arm.moving
+    assert not arm.ready
+    assert not arm.unlock()
+    run(arm, 4.1)
+    assert arm.unlock()
+    assert arm.ready
+    run(arm, 0.5)
+    assert not arm.moving, "an unlocked arm must not move by itself"
+    arm.resume()
+    finish(arm)
+    np.testing.assert_array_equal(arm.drive.q, target)
+
+
+def test_an_emergency_stop_brakes_then_switches_off_until_it_is_cleared_and_powered() -> None:
+    arm = make_arm()
+    arm.start(JointMove(arm.drive.q + 0.5, 0.5, 1.0))
+    run(arm, 0.5)
+    arm.fault("emergency_stop")
+    run(arm, 0.5)
+    assert (arm.safety, arm.power, arm.moving) == (Safety.EMERGENCY_STOP, Power.OFF, False)
+    assert not arm.set_power(Power.RUNNING)
+    arm.clear()
+    assert (arm.safety, arm.power, arm.ready) == (Safety.NORMAL, Power.OFF, False)
+    assert arm.set_power(Power.RUNNING)
+    assert arm.ready
+    run(arm, 0.5)
+    assert arm.idle
+    assert not arm.moving
+
+
+def test_unknown_faults_and_inputs_are_refused() -> None:
+    arm = make_arm()
+    with pytest.raises(ValueError, match="protective_stop"):
+        arm.fault("lightning")
+    with pytest.raises(ValueError, match=r"0…17"):
+        arm.set_digital_input(18, True)
+
+
+def test_the_past_of_the_true_pose_can_be_asked_for() -> None:
+    arm = make_arm()
+    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 40.0))
+    run(arm, 0.1)
+    between = arm.time - 1.5 * TICK
+    expected = arm.drive.q - [0, 0, 0, 0, 0, 0.5 * 1.5 * TICK]
+    np.testing.assert_allclose(arm.base_from_flange(between), pinocchio_flange(UR10E_DH, expected), atol=1e-9)
+    pose = pose_from_matrix(arm.base_from_flange(between))
+    np.testing.assert_allclose(matrix_from_pose(pose), arm.base_from_flange(between), atol=1e-12)
