@@ -48,9 +48,6 @@ def render_rectangle(
 ) -> None:
     """Draw a board or plane over `image` (height, width) in DN; what is behind the camera or outside is skipped."""
     pose, pattern = appearance(instance)
-    window = visible_window(optics, pose, pattern)
-    if window is None:
-        return
     normal = pose[:3, 2] * -np.sign(pose[:3, 2] @ pose[:3, 3])
     offset = abs(float(normal @ pose[:3, 3]))
     if offset < 1e-9:
@@ -60,6 +57,9 @@ def render_rectangle(
     x, y = optics.rays()
     if pattern[0] == PLAIN and _fills(x, y, inverse, pattern):
         fill_background(image, level * pattern[8], gain_parameters(optics, light))
+        return
+    window = visible_window(optics, pose, pattern)
+    if window is None:
         return
     edges = draw(
         image, x, y, inverse, pattern, np.array(window), offset, optics.fx, level, gain_parameters(optics, light)
@@ -93,8 +93,9 @@ def visible_window(optics: CameraOptics, pose: Vector, pattern: Vector) -> Windo
 
 def _fills(x: Image, y: Image, inverse: Vector, pattern: Vector) -> bool:
     """Whether the picture's rim, and so all of it, shows the rectangle."""
-    rim_x = np.concatenate([x[0], x[-1], x[:, 0], x[:, -1]])
-    rim_y = np.concatenate([y[0], y[-1], y[:, 0], y[:, -1]])
+    step = 16
+    rim_x = np.concatenate([x[0, ::step], x[-1, ::step], x[::step, 0], x[::step, -1], x[-1:, -1]])
+    rim_y = np.concatenate([y[0, ::step], y[-1, ::step], y[::step, 0], y[::step, -1], y[-1:, -1]])
     a, b, w = inverse @ np.stack([rim_x, rim_y, np.ones_like(rim_x)])
     x0, x1, y0, y1 = pattern[4:8]
     return bool(

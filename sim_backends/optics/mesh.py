@@ -49,32 +49,23 @@ class Mesh:
         self.middle: Vector = self.leaf_centres.mean(axis=0)
         self.leaf_size = float(np.median(self.leaf_sizes))
 
-    def section(self, normal: Vector, distance: float) -> tuple[Vector, NDArray[np.int64]]:
-        """Cut by the plane normal·P = distance: segments (k, 2, 3) and the triangle (tree order) of each."""
+    def section(self, normal: Vector, distance: float) -> tuple[Vector, Vector]:
+        """Cut by the plane normal·P = distance: segments (k, 2, 3) and unit surface normals (k, 3)."""
         capacity = 4096
         while True:
             segments = np.empty((capacity, 2, 3))
-            owners = np.empty(capacity, dtype=np.int64)
-            count = cut(self.corners, self.low, self.high, normal, distance, segments, owners)
+            normals = np.empty((capacity, 3))
+            count = cut(self.corners, self.low, self.high, normal, distance, segments, normals)
             if count <= capacity:
-                return segments[:count], owners[:count]
+                return segments[:count], normals[:count]
             capacity = count
 
-    def normals(self, owners: NDArray[np.int64]) -> Vector:
-        """Unit normals (k, 3) of triangles given in tree order."""
-        corners = self.corners[owners]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.asarray(normals / np.maximum(lengths, 1e-300))
-
-    def hides(self, points: Vector, eye: Vector, start: float) -> NDArray[np.bool_]:
-        """Whether the mesh stands between each of `points` (n, 3) and `eye` (3,), all in the mesh frame.
+    def hide(self, points: Vector, eye: Vector, start: float, seen: NDArray[np.bool_]) -> None:
+        """Clear `seen` (n,) where the mesh stands between `points` (n, 3) and `eye` (3,), all in the mesh frame.
 
         Hits nearer than `start` (m) to the point do not count; a negative `start` makes a touching mesh count.
         """
-        hidden = np.zeros(len(points), dtype=np.bool_)
-        shadow(self.corners, self.low, self.high, np.ascontiguousarray(points), eye, start, hidden)
-        return hidden
+        shadow(self.corners, self.low, self.high, np.ascontiguousarray(points), eye, start, seen)
 
 
 def _tree_order(centres: Vector) -> NDArray[np.int64]:
@@ -117,9 +108,9 @@ def cut(
     normal: Vector,
     distance: float,
     segments: Vector,
-    owners: NDArray[np.int64],
+    normals: Vector,
 ) -> int:
-    """Fill `segments` with the triangles' cuts; returns how many there are, also those beyond the capacity."""
+    """Fill `segments` and `normals`; returns how many cuts there are, also those beyond the capacity."""
     first_leaf = low.shape[0] // 2
     stack = np.empty(64, dtype=np.int64)
     stack[0] = 0
@@ -167,7 +158,14 @@ def cut(
                     found += 1
             if found == 2:
                 if count < segments.shape[0]:
-                    owners[count] = t
+                    ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
+                    ex, ey, ez = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
+                    fx, fy, fz = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
+                    nx, ny, nz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+                    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+                    normals[count, 0] = nx / length
+                    normals[count, 1] = ny / length
+                    normals[count, 2] = nz / length
                 count += 1
     return count
 
@@ -180,12 +178,14 @@ def shadow(
     points: Vector,
     eye: Vector,
     start: float,
-    hidden: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
 ) -> None:
-    """Set `hidden[i]` where any triangle lies between `points[i]` and `eye` (Möller–Trumbore, any hit)."""
+    """Clear `seen[i]` where any triangle lies between `points[i]` and `eye` (Möller–Trumbore, any hit)."""
     first_leaf = low.shape[0] // 2
     stack = np.empty(64, dtype=np.int64)
     for i in range(points.shape[0]):
+        if not seen[i]:
+            continue
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         dx, dy, dz = eye[0] - px, eye[1] - py, eye[2] - pz
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -236,7 +236,7 @@ def shadow(
                     continue
                 distance = (e2x * qx + e2y * qy + e2z * qz) / det
                 if start < distance < length - 1e-6:
-                    hidden[i] = True
+                    seen[i] = False
                     break
-            if hidden[i]:
+            if not seen[i]:
                 break

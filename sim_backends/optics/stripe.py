@@ -18,12 +18,10 @@ from sim_backends.optics.compiled import compiled
 from sim_backends.optics.pattern import plain_parameters
 from sim_backends.optics.profile import expose
 from sim_backends.optics.scene import LaserOptics, MeshInstance, SceneObject
+from sim_backends.optics.visibility import laser_frame, lit
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float32]
-
-TOUCH = 5e-6
-"""Surfaces nearer than this (m) to the lit point do not shade it: it is the surface itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +40,14 @@ class Crossings:
         return Crossings(self.rows[mask], self.columns[mask], self.slopes[mask], self.points[mask], self.normals[mask])
 
 
-def laser_frame(laser: LaserOptics) -> tuple[Vector, float, Vector]:
-    """Unit normal, distance and origin (moved onto the plane) of the light plane in the camera frame."""
-    normal = np.asarray(laser.normal, dtype=np.float64)
-    length = float(np.linalg.norm(normal))
-    if not 0.5 < length < 2.0:
-        raise ValueError(f"light plane normal {laser.normal}: needs about unit length")
-    normal, distance = normal / length, laser.distance / length
-    origin = np.asarray(laser.origin, dtype=np.float64)
-    return normal, distance, origin - (origin @ normal - distance) * normal
-
-
 def crossings(optics: CameraOptics, laser: LaserOptics, instance: SceneObject) -> Crossings:
     """Row crossings of one object by itself, without regard to shading."""
     normal, distance, _ = laser_frame(laser)
     if isinstance(instance, MeshInstance):
         pose = np.asarray(instance.camera_from_mesh, dtype=np.float64)
         turned = np.ascontiguousarray(pose[:3, :3].T @ normal)
-        segments, owners = instance.mesh.section(turned, distance - float(normal @ pose[:3, 3]))
-        normals = instance.mesh.normals(owners) @ pose[:3, :3].T
+        segments, normals = instance.mesh.section(turned, distance - float(normal @ pose[:3, 3]))
+        normals = normals @ pose[:3, :3].T
         segments = segments @ pose[:3, :3].T + pose[:3, 3]
     else:
         pose, pattern = appearance(instance)
@@ -94,49 +81,6 @@ def rectangle_section(pose: Vector, pattern: Vector, normal: Vector, distance: f
     return np.array([ends]) if len(ends) == 2 else np.empty((0, 2, 3))
 
 
-def lit(found: Crossings, instance: SceneObject, scene: list[SceneObject], laser: LaserOptics) -> NDArray[np.bool_]:
-    """Which crossings of `instance` the laser reaches and the camera sees, past every object of the scene."""
-    normal, _, origin = laser_frame(laser)
-    to_laser = origin - found.points
-    facing_camera = -np.einsum("ij,ij->i", found.normals, found.points)
-    facing_laser = np.einsum("ij,ij->i", found.normals, to_laser)
-    axis = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
-    along = -(to_laser @ axis) / np.linalg.norm(axis) / np.linalg.norm(to_laser, axis=1)
-    seen = (facing_camera * facing_laser > 0) & (along > np.cos(laser.fan))
-    for other in scene:
-        index = np.flatnonzero(seen)
-        if not len(index):
-            break
-        if isinstance(other, MeshInstance):
-            pose = np.asarray(other.camera_from_mesh, dtype=np.float64)
-            # A plane that a mesh touches is covered by it; a mesh must not shade itself.
-            start = TOUCH if isinstance(instance, MeshInstance) else -2 * TOUCH
-            points = (found.points[index] - pose[:3, 3]) @ pose[:3, :3]
-            for eye in (np.zeros(3), origin):
-                hidden = other.mesh.hides(points, np.ascontiguousarray((eye - pose[:3, 3]) @ pose[:3, :3]), start)
-                seen[index] &= ~hidden
-        elif other is not instance:
-            pose, pattern = appearance(other)
-            for eye in (np.zeros(3), origin):
-                seen[index] &= ~_rectangle_hides(pose, pattern, found.points[index], eye)
-    return np.asarray(seen)
-
-
-def _rectangle_hides(pose: Vector, pattern: Vector, points: Vector, eye: Vector) -> NDArray[np.bool_]:
-    start = (points - pose[:3, 3]) @ pose[:3, :3]
-    end = (eye - pose[:3, 3]) @ pose[:3, :3]
-    share = start[:, 2] / np.where(start[:, 2] == end[2], np.inf, start[:, 2] - end[2])
-    crossing = start + share[:, None] * (end - start)
-    inside = (
-        (crossing[:, 0] > pattern[4])
-        & (crossing[:, 0] < pattern[5])
-        & (crossing[:, 1] > pattern[6])
-        & (crossing[:, 1] < pattern[7])
-    )
-    past = share * np.linalg.norm(end - start, axis=1) > TOUCH
-    return np.asarray(inside & past & (share < 1.0))
-
-
 def render_stripe(
     image: Image, optics: CameraOptics, laser: LaserOptics, scene: list[SceneObject], exposure: float
 ) -> NDArray[np.int64]:
@@ -151,7 +95,7 @@ def render_stripe(
     for instance in scene:
         found = crossings(optics, laser, instance)
         if len(found.rows):
-            found = found.keep(lit(found, instance, scene, laser))
+            found = found.keep(lit(found.points, found.normals, instance, scene, laser))
         if not len(found.rows):
             continue
         if isinstance(instance, MeshInstance):
