@@ -14,10 +14,15 @@ from typing import Any, cast
 
 import can
 import cantools
+import serial
 from cantools.database.can import Database, Message
 
 from drivers.errors import ConfigError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
+from drivers.vehicle.protocol_bufsocket import SCHEME
+
+if "drivers.vehicle" not in serial.protocol_handler_packages:
+    serial.protocol_handler_packages.append("drivers.vehicle")
 
 RECEIVE_TIMEOUT_S = 0.1
 SEND_TIMEOUT_S = 0.5
@@ -111,6 +116,9 @@ class CanLink:
         if interface == "slcan" and channel.startswith("socket://"):
             # The default waits 2 s for a serial adapter to boot, which one behind a socket has done already.
             settings.setdefault("sleep_after_open", 0.0)
+            # Its default of 1 ms makes an idle receiver wake up a thousand times a second.
+            settings.setdefault("timeout", 0.02)
+            channel = channel.replace("socket://", SCHEME, 1)
         try:
             return can.Bus(channel=channel, interface=interface, **settings)
         except can.CanInterfaceNotImplementedError as error:

@@ -1,0 +1,117 @@
+"""The queue between the thread that receives frames and the one that uses them."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError
+from drivers.interfaces import Frame, LinkStatistics
+
+_SLOW_DEVICE_WALL_S = 2.0
+
+
+def frame_patience(clock: Clock, timeout: float) -> float:
+    """Wall seconds to wait for a frame when the caller allows `timeout` s of the clock.
+
+    A picture is made and carried on the wall's time. On a clock that runs faster the wait is therefore not shortened
+    below 2 s of the wall, or below `timeout` itself.
+    """
+    return max(clock.wall(timeout), min(timeout, _SLOW_DEVICE_WALL_S))
+
+
+class FrameQueue:
+    """Frames in order, at most `capacity`; a frame that finds it full is dropped and counts as lost.
+
+    `check` raises when no frame can come any more. `lost` counts the gaps in the frame ids of the frames handed out.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        *,
+        capacity: int,
+        longest_gap: float,
+        check: Callable[[], None],
+        statistics: LinkStatistics,
+    ) -> None:
+        self.lost = 0
+        self._name = name
+        self._clock = clock
+        self._capacity = capacity
+        self._longest_gap = longest_gap
+        self._check = check
+        self._statistics = statistics
+        self._expected: int | None = None
+        self._frames: deque[Frame] = deque()
+        self._news = threading.Condition()
+        self._closed = False
+        self._aborted = False
+
+    def expect(self, frame_id: int | None) -> None:
+        """Tell the id of the first frame, so that the loss of the very first is known; None if unknown."""
+        self._expected = frame_id
+
+    def put(self, frame: Frame) -> None:
+        """Add a frame; called by the receiving thread, never blocks."""
+        with self._news:
+            if len(self._frames) >= self._capacity:
+                self._statistics.count("frames_dropped_by_host")
+                return
+            self._frames.append(frame)
+            self._news.notify_all()
+
+    def wake(self) -> None:
+        """Let waiting callers look again whether frames can still come."""
+        with self._news:
+            self._news.notify_all()
+
+    def close(self, *, aborted: bool = False) -> None:
+        """No more frames: `next` raises `Aborted` from now on, and iteration ends, with `Aborted` if `aborted`."""
+        with self._news:
+            self._closed, self._aborted = True, aborted
+            self._frames.clear()
+            self._news.notify_all()
+
+    def next(self, timeout: float) -> Frame:
+        """The next frame in order; see `drivers.interfaces.FrameStream`. Raises `Aborted` once it was closed."""
+        with self._news:
+            self._news.wait_for(self._settled, frame_patience(self._clock, timeout))
+            if self._closed:
+                raise Aborted(f"{self._name}: the acquisition was stopped")
+            if not self._frames:
+                raise DeadlineError(
+                    self._name,
+                    f"no frame within {timeout:.3g} s. Check that exposure and rate are possible and that the "
+                    "camera's network is not overloaded",
+                )
+            frame = self._frames.popleft()
+        lost = 0 if self._expected is None else max(0, frame.frame_id - self._expected)
+        self._expected = frame.frame_id + 1
+        if lost:
+            self.lost += lost
+            self._statistics.errors["frames_lost"] = self._statistics.errors.get("frames_lost", 0) + lost
+        return replace(frame, lost_before=lost)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames until the stream is closed; raises like `next` when none comes for 2 s and two frame periods."""
+        while not self._closed:
+            try:
+                yield self.next(self._longest_gap)
+            except Aborted:
+                if self._aborted:
+                    raise
+                return
+
+    def _settled(self) -> bool:
+        while self._frames and self._expected is not None and self._frames[0].frame_id < self._expected:
+            self._frames.popleft()
+            self._statistics.count("stale_frames")
+        if self._frames or self._closed:
+            return True
+        self._check()
+        return False

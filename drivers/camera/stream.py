@@ -1,0 +1,242 @@
+"""A camera behind the frame stream protocol, version 1 (docs/frame-stream.md).
+
+Frames carry the device's time of the start of their exposure, which is mapped to the host's clock through latches
+taken before each acquisition. A frame is handed out once and never as an answer to a later question.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.camera.clock_map import ClockMap, Latch
+from drivers.camera.frame_link import FrameLink
+from drivers.camera.frame_protocol import Header
+from drivers.camera.frame_queue import FrameQueue
+from drivers.clock import Clock
+from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError
+from drivers.interfaces import Frame, Identity, LinkStatistics
+from drivers.quantities import check_positive, check_range, shown
+
+_LATCHES = 8
+_MAX_LATCHES = 32
+_GOOD_LATCH_WALL_S = 0.0005
+_QUEUE_BYTES = 64 * 1024 * 1024
+_LONGEST_GAP_S = 2.0
+_SETTING_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class _About:
+    """What the camera says of itself: size in pixels, exposure range in s, highest frame rate in Hz."""
+
+    identity: Identity
+    shape: tuple[int, int]
+    exposure_min: float
+    exposure_max: float
+    frame_rate_max: float
+
+
+class StreamCamera:
+    """The camera at `address` ("host:port").
+
+    `shape` (height, width), when given, is what the camera has to deliver. Raises `NotConnectedError` when no camera
+    answers, `DeviceFault` when another client has it, `ConfigError` when its size is another.
+    """
+
+    def __init__(self, name: str, address: str, *, clock: Clock, shape: tuple[int, int] | None = None) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self._address = address
+        self._clock = clock
+        self._map = ClockMap()
+        self._acquiring = threading.Lock()
+        self._queues: tuple[FrameQueue, ...] = ()
+        self._frame_rate: float | None = None
+        self._link = FrameLink(name, address, clock, take_frame=self._take, lost=self._wake, statistics=self.statistics)
+        try:
+            self._about = self._identify()
+            self.shape = self._about.shape
+            if shape is not None and self.shape != shape:
+                raise ConfigError(
+                    f"{name}: the camera at {address} delivers {self.shape[1]}x{self.shape[0]} pixels, configured are "
+                    f"{shape[1]}x{shape[0]}. Correct the configuration or the address"
+                )
+            self._compare_clocks()
+        except CellError:
+            self._link.close()
+            raise
+
+    def identity(self) -> Identity:
+        """Ask the camera who it is."""
+        return self._identify().identity
+
+    def ping(self) -> float:
+        """One latch of the device's clock; returns the round trip in wall seconds."""
+        _, before, after = self._link.request("latch")
+        return self._clock.wall(after - before)
+
+    def configure(self, exposure: float, frame_rate: float) -> None:
+        """Set exposure in s and frame rate in Hz.
+
+        Raises `LimitError` outside the camera's range or when the exposure does not fit into a frame, `InterlockError`
+        while frames are being acquired, `DeviceFault` when the camera takes other values.
+        """
+        about = self._about
+        check_range(self.name, "exposure", exposure, about.exposure_min, about.exposure_max, "s")
+        check_positive(self.name, "frame rate", frame_rate, about.frame_rate_max, "Hz")
+        if exposure * frame_rate > 1.0:
+            raise LimitError(
+                self.name,
+                f"exposure {shown(exposure, 's')} does not fit into a frame at {frame_rate:g} Hz; nothing was sent. "
+                f"Choose at most {shown(1.0 / frame_rate, 's')}, or at most {1.0 / exposure:g} Hz",
+            )
+        with self._exclusive():
+            set_to = self._link.request("configure", exposure_s=exposure, frame_rate_hz=frame_rate)[0]
+        for key, asked in (("exposure_s", exposure), ("frame_rate_hz", frame_rate)):
+            if abs(float(set_to[key]) - asked) > _SETTING_TOLERANCE * asked:
+                raise DeviceFault(
+                    self.name,
+                    "camera.setting",
+                    f"the camera took {key} {set_to[key]} instead of {asked:g}",
+                    recoverable=False,
+                    hint="Choose a value that the camera supports.",
+                )
+        self._frame_rate = frame_rate
+
+    def grab(self, timeout: float = 2.0) -> Frame:
+        """One frame whose exposure began after the call: never a buffered one.
+
+        Refused with `InterlockError` while a stream is open. Raises `DeadlineError` when no frame comes in `timeout` s
+        (on a fast clock see `frame_patience`), `DeviceFault` when the camera is lost.
+        """
+        with self._exclusive():
+            self._compare_clocks()
+            called = self._clock.now()
+            with self._queue(capacity=4) as frames:
+                frames.expect(self._link.request("trigger")[0].get("next_frame_id"))
+                while True:
+                    frame = frames.next(timeout)
+                    if frame.host_time >= called - self._map.uncertainty:
+                        return frame
+                    self.statistics.count("stale_frames")
+
+    @contextmanager
+    def stream(self) -> Iterator[FrameQueue]:
+        """Free-running acquisition for as long as the context is open; one at a time.
+
+        Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
+        """
+        settings = {} if self._frame_rate is None else {"frame_rate_hz": self._frame_rate}
+        height, width = self.shape
+        with self._exclusive():
+            self._compare_clocks()
+            with self._queue(capacity=max(8, _QUEUE_BYTES // (height * width))) as frames:
+                frames.expect(self._link.request("start", **settings)[0].get("next_frame_id"))
+                try:
+                    yield frames
+                finally:
+                    # A lost camera acquires nothing any more, and the frames' reader has been told.
+                    if self._link.alive:
+                        self._link.request("stop")
+
+    def stop(self) -> None:
+        """End every acquisition; whoever waits for a frame gets `Aborted`."""
+        for queue in self._queues:
+            queue.close(aborted=True)
+        self._link.request("stop")
+
+    def close(self) -> None:
+        """End acquisition and connection."""
+        for queue in self._queues:
+            queue.close(aborted=True)
+        try:
+            if self._link.alive:
+                self._link.request("stop")
+        finally:
+            self._link.close()
+
+    def _identify(self) -> _About:
+        about = self._link.request("identify")[0]
+        try:
+            if about["pixel_format"] != "mono8":
+                raise ValueError(f"pixel format {about['pixel_format']!r} instead of mono8")
+            return _About(
+                Identity(str(about["model"]), str(about["serial"]), str(about["firmware"]), self._address),
+                (int(about["height"]), int(about["width"])),
+                float(about["exposure_min_s"]),
+                float(about["exposure_max_s"]),
+                float(about["frame_rate_max_hz"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise DeviceFault(
+                self.name,
+                "camera.protocol",
+                f"the answer to 'identify' cannot be used: {error!r}",
+                recoverable=False,
+                hint="Check that the peer speaks frame stream version 1 with mono8 pictures.",
+            ) from error
+
+    def _compare_clocks(self) -> None:
+        latches: list[Latch] = []
+        good = _GOOD_LATCH_WALL_S * self._clock.rate
+        while len(latches) < _LATCHES or (
+            len(latches) < _MAX_LATCHES and min(latch.after - latch.before for latch in latches) > good
+        ):
+            reply, before, after = self._link.request("latch")
+            latches.append(Latch(before, float(reply["device_ns"]) * 1e-9, after))
+        self._map.add(latches)
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        self._link.check()
+        if not self._acquiring.acquire(blocking=False):
+            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
+        try:
+            yield
+        finally:
+            self._acquiring.release()
+
+    @contextmanager
+    def _queue(self, capacity: int) -> Iterator[FrameQueue]:
+        gap = _LONGEST_GAP_S + (2.0 / self._frame_rate if self._frame_rate else 0.0)
+        queue = FrameQueue(
+            self.name,
+            self._clock,
+            capacity=capacity,
+            longest_gap=gap,
+            check=self._link.check,
+            statistics=self.statistics,
+        )
+        self._queues = (*self._queues, queue)
+        try:
+            yield queue
+        finally:
+            self._queues = tuple(other for other in self._queues if other is not queue)
+            queue.close()
+
+    def _take(self, header: Header, payload: bytearray, received: float) -> None:
+        if not self._queues:
+            return
+        width, height = int(header["width"]), int(header["height"])
+        if (height, width) != self.shape or len(payload) != width * height:
+            raise ValueError(f"a frame of {width}x{height} pixels came with {len(payload)} bytes")
+        device_time = float(header["device_ns"]) * 1e-9
+        frame = Frame(
+            image=np.frombuffer(payload, np.uint8).reshape(height, width),
+            frame_id=int(header["frame_id"]),
+            exposure=float(header["exposure_s"]),
+            device_time=device_time,
+            host_time=self._map.host_time(device_time),
+            received=received,
+        )
+        for queue in self._queues:
+            queue.put(frame)
+
+    def _wake(self) -> None:
+        for queue in self._queues:
+            queue.wake()
