@@ -1,0 +1,229 @@
+"""The driver's end of the pipe to the child process: requests with deadlines, and one clear fault when it is lost.
+
+Whatever becomes of the child (crash, hang, kill), every waiting call ends at once with the same `DeviceFault`, and
+the process is gone afterwards. Deadlines here are in seconds on the wall: pipes do not run faster in a simulation.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from drivers.arm.messages import Ended, Lost, Reply, Request, Setup, Snapshot
+from drivers.errors import DeviceFault, NotConnectedError
+
+_SILENCE_S = 2.0
+
+
+class _Pending:
+    def __init__(self) -> None:
+        self.done = threading.Event()
+        self.problem: tuple[str, str] | None = None
+
+
+class ArmLink:
+    """A running child process, connected to the arm.
+
+    `on_snapshot` and `on_ended` are called from the link's own thread, and so is `on_lost`, once, when the link is
+    lost otherwise than by `close`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        setup: Setup,
+        connect_deadline: float,
+        on_snapshot: Callable[[Snapshot], None],
+        on_ended: Callable[[Ended], None],
+        on_lost: Callable[[DeviceFault], None],
+    ) -> None:
+        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline."""
+        self.lost: DeviceFault | None = None
+        self._name = name
+        self._address = setup.address
+        self._on_snapshot, self._on_ended, self._on_lost = on_snapshot, on_ended, on_lost
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._sending = threading.Lock()
+        up = _Pending()
+        self._pending: dict[int, _Pending] = {0: up}
+        self._closing = False
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        self._pipe, self._process = self._spawn()
+        self._connected = False
+        self._connect_deadline = connect_deadline
+        self._reader = threading.Thread(target=self._read, name=f"{name} link", daemon=True)
+        self._reader.start()
+        self._transmit(setup)
+        answered = up.done.wait(connect_deadline)
+        self._connected = answered and self.lost is None and up.problem is None
+        if not self._connected:
+            self._closing = True
+            self._kill()
+            reason = up.problem[1] if up.problem is not None else f"no answer within {connect_deadline:g} s"
+            raise NotConnectedError(
+                name,
+                f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its address "
+                "is right, that it is in remote control and that no other program controls it.",
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id of the child."""
+        return self._process.pid
+
+    def call(self, name: str, *arguments: Any, deadline: float) -> tuple[str, str] | None:
+        """Have the child do something; None, or the problem as (code, text).
+
+        Raises the link's `DeviceFault` when it is lost, or not answered within `deadline` wall seconds: then the child
+        hangs and is killed.
+        """
+        pending = _Pending()
+        number = next(self._numbers)
+        self._raise_if_lost()
+        with self._lock:
+            self._pending[number] = pending
+        self._transmit(Request(number, name, arguments))
+        if not pending.done.wait(deadline):
+            self._fail(f"its process did not answer '{name}' within {deadline:g} s")
+            self._raise_if_lost()
+        if pending.problem is not None and pending.problem[0] == "arm.link_lost":
+            self._raise_if_lost()
+        return pending.problem
+
+    def close(self, deadline: float) -> None:
+        """Let the child stop the arm, switch the safe outputs off and end; it is killed if it does not."""
+        self._closing = True
+        if self.lost is None:
+            number = next(self._numbers)
+            pending = self._pending[number] = _Pending()
+            self._transmit(Request(number, "close"))
+            pending.done.wait(deadline)
+        self._fail("it was closed")
+        self._kill()
+
+    # --- inside ---
+
+    def _raise_if_lost(self) -> None:
+        if self.lost is not None:
+            raise self.lost
+
+    def _spawn(self) -> tuple[Connection, subprocess.Popen[bytes]]:
+        ours, theirs = socket.socketpair()
+        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "drivers.arm.ur_child", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._errors,
+                env=environment,
+            )
+        return Connection(ours.detach()), process
+
+    def _transmit(self, message: Setup | Request) -> None:
+        try:
+            with self._sending:
+                self._pipe.send(message)
+        except OSError:
+            self._fail("its process has ended")
+
+    def _read(self) -> None:
+        try:
+            while self.lost is None:
+                if not self._pipe.poll(_SILENCE_S if self._connected else self._connect_deadline):
+                    if self._connected:
+                        self._fail(f"its process gave no sign of life for {_SILENCE_S:g} s")
+                        return
+                    continue
+                self._route(self._pipe.recv())
+        except (EOFError, OSError):
+            self._fail(self._death())
+
+    def _route(self, message: Reply | Snapshot | Ended | Lost) -> None:
+        match message:
+            case Snapshot():
+                self._on_snapshot(message)
+            case Reply():
+                with self._lock:
+                    pending = self._pending.pop(message.number, None)
+                if pending is not None:
+                    pending.problem = message.problem
+                    pending.done.set()
+            case Ended():
+                self._on_ended(message)
+            case Lost():
+                self._fail(message.text)
+
+    def _death(self) -> str:
+        try:
+            code = self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            return "its process closed the pipe"
+        return f"its process was ended by {signal.Signals(-code).name}" if code < 0 else f"its process ended ({code})"
+
+    def _fail(self, reason: str) -> None:
+        with self._lock:
+            if self.lost is not None:
+                return
+            self.lost = DeviceFault(
+                self._name,
+                "arm.link_lost",
+                f"the link to the arm at {self._address} was lost: {reason}",
+                recoverable=True,
+                hint="See that the arm is on and connected, then recover() or connect again.",
+            )
+            waiting = list(self._pending.values())
+            self._pending.clear()
+        for pending in waiting:
+            pending.problem = ("arm.link_lost", self._last_words() or reason)
+            pending.done.set()
+        if not self._closing:
+            self._process.kill()
+            self._on_lost(self.lost)
+
+    def _last_words(self) -> str:
+        """What the child wrote last before it died, for an error at the start."""
+        if self._connected:
+            return ""
+        self._errors.seek(0)
+        lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+    def _kill(self) -> None:
+        try:
+            self._process.wait(0.5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(2.0)
+        if threading.current_thread() is not self._reader:
+            self._reader.join(2.0)
+        self._pipe.close()
+        self._errors.close()
+
+
+def switch_off(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
+    """Switch outputs of the arm off through a process of its own that needs nothing else; False if that failed."""
+    command = [sys.executable, "-m", "drivers.arm.ur_child", "--off", address, ",".join(map(str, outputs))]
+    environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
+    begun = time.monotonic()
+    while time.monotonic() - begun < deadline:
+        try:
+            left = deadline - (time.monotonic() - begun)
+            done = subprocess.run(command, env=environment, capture_output=True, timeout=left, check=False)
+        except subprocess.TimeoutExpired:
+            return False
+        if done.returncode == 0:
+            return True
+    return False

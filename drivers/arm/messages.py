@@ -1,0 +1,101 @@
+"""What the arm driver and its child process say to each other over their pipe, pickled.
+
+The driver sends one `Setup`, then `Request`s; the child answers each with a `Reply` and sends `Snapshot`s, `Ended` and
+`Lost` by itself. Positions in m and rad, forces in N, times in s of the system's monotonic clock, which all processes
+share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+Six = tuple[float, ...]
+"""Six numbers: joints in rad, or a pose (x, y, z, rotation vector)."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How the child works: `rate` is the clock's, `safe_off` the outputs to switch off when the owner is lost.
+
+    `payload` is mass in kg and centre of gravity in the flange frame in m. The controller ends its program when it
+    hears nothing for `watchdog` seconds. `braking` is the deceleration of a stop in rad/s².
+    """
+
+    address: str
+    rate: float
+    safe_off: tuple[int, ...]
+    payload: tuple[float, tuple[float, float, float]]
+    watchdog: float
+    braking: float
+
+
+@dataclass(frozen=True)
+class Request:
+    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`."""
+
+    number: int
+    name: str
+    arguments: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The request was carried out, or `problem` says (code, text) why not. Number 0 tells that the child is up."""
+
+    number: int
+    problem: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One state packet of the arm; `stamp` is when it arrived.
+
+    `safety_bits`, `mode` and `program_running` as the controller reports them; `wrench` at the flange in base axes.
+    """
+
+    stamp: float
+    joints: Six
+    speeds: Six
+    flange: Six
+    wrench: Six
+    safety_bits: int
+    mode: int
+    program_running: bool
+    inputs: int
+    outputs: int
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`."""
+
+    motion: int
+    how: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The child has lost the arm and ends."""
+
+    text: str
+
+
+MODE_RUNNING = 7
+"""`Snapshot.mode` of an arm whose joints are powered and whose brakes are released."""
+
+AT_REST = 0.003
+"""An arm whose joints all turn slower than this, in rad/s, stands still."""
+
+_SAFETY_CODES = (
+    (0b0000_1110_0000, "arm.emergency_stop"),
+    (0b0011_0000_0000, "arm.safety_fault"),
+    (0b0000_0000_0100, "arm.protective_stop"),
+    (0b0000_0001_0000, "arm.safeguard_stop"),
+)
+
+
+def safety_code(bits: int) -> str:
+    """The fault code for the controller's safety status bits, the gravest first; empty when all is normal."""
+    return next((code for mask, code in _SAFETY_CODES if bits & mask), "")

@@ -1,0 +1,89 @@
+"""A motion of the arm as its caller holds it, and what its ways of ending mean."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, DeviceError, DeviceFault
+
+_WALL_MARGIN_S = 0.5
+
+_FAULTS: dict[str, tuple[str, bool, str]] = {
+    "arm.protective_stop": (
+        "the arm is in protective stop", True, "Look for what it ran into, clear the way, then recover().",
+    ),
+    "arm.emergency_stop": (
+        "the emergency stop is pressed", False,
+        "Make the cell safe, release the button, power the arm on and release its brakes at the pendant, then connect.",
+    ),
+    "arm.safeguard_stop": ("the safeguard is open", False, "Close and acknowledge the safeguard, then go on."),
+    "arm.safety_fault": ("the arm's safety system reports a fault", False, "Read the pendant's log; restart the arm."),
+    "arm.not_powered": (
+        "the arm is not powered", False, "Power it on and release its brakes at the pendant, then recover().",
+    ),
+    "arm.program_stopped": ("the control program does not run on the arm", True, "recover() starts it again."),
+    "arm.not_arrived": ("the motion ended away from its target", True, "See what hinders the arm, then recover()."),
+    "arm.not_stopped": ("the arm does not come to rest", False, "Use the emergency stop."),
+    "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
+}  # fmt: skip
+
+
+def fault(device: str, code: str, text: str = "") -> DeviceFault:
+    """The `DeviceFault` for a code of the child process, with its text added."""
+    what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
+    return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
+
+
+class UrMotion:
+    """A motion that was started; `contact` tells whether it ended at its force limit."""
+
+    def __init__(self, device: str, what: str, number: int, clock: Clock, stop: Callable[[], None]) -> None:
+        self.contact = False
+        self.number = number
+        self._device = device
+        self._what = what
+        self._clock = clock
+        self._stop = stop
+        self._ended = threading.Event()
+        self._error: Exception | None = None
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+        return self._ended.is_set()
+
+    def wait(self, timeout: float) -> None:
+        """Block until the arm stands at the motion's end, at most `timeout` s of the clock.
+
+        With a clock that runs faster than the wall the wire's own time is allowed on top. Raises `DeadlineError` (the
+        arm is then stopped), `DeviceFault`, or `Aborted` when a stop ended the motion.
+        """
+        margin = _WALL_MARGIN_S * max(0.0, self._clock.rate - 1.0)
+        if not self._clock.wait(self._ended, timeout + margin):
+            with suppress(DeviceError):
+                self._stop()
+            raise DeadlineError(
+                self._device,
+                f"{self._what} did not end within {timeout:g} s and was stopped. Allow more time or move faster.",
+            )
+        if self._error is not None:
+            raise self._error
+
+    def end(self, how: str, text: str = "") -> None:
+        """Note how the motion ended: arrived, contact, stopped or a fault's code."""
+        if how == "stopped":
+            self.fail(Aborted(f"{self._device}: {self._what} was stopped before its end"))
+        elif how in ("arrived", "contact"):
+            self.contact = how == "contact"
+            self._ended.set()
+        else:
+            self.fail(fault(self._device, how, text))
+
+    def fail(self, error: Exception) -> None:
+        """Note that the motion ended with an error; the first one counts."""
+        if not self._ended.is_set():
+            self._error = error
+            self._ended.set()

@@ -1,0 +1,244 @@
+"""Child side: the process in which ur-rtde lives, since it can crash or hang when its link is lost.
+
+It ends by itself, with the motion stopped and the safe outputs off, as soon as its owner is gone (the pipe ends, or
+another parent has taken over), and at once when the arm is gone. Run by the driver; with `--off ADDRESS 0,3` it only
+switches outputs off.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any
+
+from rtde_control import RTDEControlInterface
+from rtde_io import RTDEIOInterface
+from rtde_receive import RTDEReceiveInterface
+
+from drivers.arm.dashboard import Dashboard
+from drivers.arm.messages import MODE_RUNNING, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
+from drivers.arm.ur_control import PERIOD, ControlThread
+from drivers.clock import Clock
+from drivers.errors import DeviceError
+
+SILENCE_S = 1.0
+"""The arm counts as lost after this time without a packet; it sends one every 2 ms."""
+_CONSTRUCTION_S = 15.0
+_SHUT_DOWN_S = 5.0
+_PUSHES_PER_S = 125.0
+_VARIABLES = [
+    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
+    "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
+]  # fmt: skip
+_PLAYING = 2
+
+
+class _OwnerLost(Exception):
+    """The driver is gone, or has asked for the end through a signal."""
+
+
+class Child:
+    """Connects to the arm and serves the owner at the other end of `pipe`."""
+
+    def __init__(self, pipe: Connection, setup: Setup) -> None:
+        self._pipe = pipe
+        self._setup = setup
+        self._parent = os.getppid()
+        self._sending = threading.Lock()
+        self._clock = Clock()
+        address = setup.address
+        with _ends_by_itself(_CONSTRUCTION_S):
+            self._receive = RTDEReceiveInterface(address, 500.0, _VARIABLES)
+            self._snapshot = self._read()
+            ready = not safety_code(self._snapshot.safety_bits) and self._snapshot.mode == MODE_RUNNING
+            # Without a ready arm the control script cannot start: the state is still served.
+            control = RTDEControlInterface(address) if ready else None
+            self._io = RTDEIOInterface(address)
+        if control is not None:
+            _prepare(control, setup)
+            self._snapshot = self._read()
+        self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
+        threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
+
+    def serve(self) -> None:
+        """Obey the owner until it asks for the end or is gone, then end the process."""
+        self._send(self._snapshot)
+        self._send(Reply(0))
+        closing = 0
+        with suppress(EOFError, OSError):
+            while True:
+                request: Request = self._pipe.recv()
+                if request.name == "close":
+                    closing = request.number
+                    break
+                if request.name == "output":
+                    self._send(Reply(request.number, self._switch(*request.arguments)))
+                else:
+                    self._control.submit(request)
+        self.shut_down(closing)
+
+    def _switch(self, index: int, value: bool) -> tuple[str, str] | None:
+        if switch_output(self._io, index, value):
+            return None
+        return "arm.refused", f"the controller did not accept a value for output {index}"
+
+    def shut_down(self, closing: int = 0) -> None:
+        """Outputs off, motion stopped, then the end; bounded in time whatever the arm does."""
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        signal.setitimer(signal.ITIMER_REAL, _SHUT_DOWN_S)
+        for index in self._setup.safe_off:
+            switch_output(self._io, index, False)
+        self._control.submit(Request(0, "close"))
+        if not self._control.finished.wait(3.0):
+            with suppress(DeviceError):
+                Dashboard("arm", self._setup.address).ask("stop")
+        mask = sum(1 << index for index in self._setup.safe_off)
+        for _ in range(250):
+            if not self._snapshot.outputs & mask:
+                break
+            self._clock.sleep(PERIOD)
+        if closing:
+            self._send(Reply(closing))
+        # The destructors of ur-rtde may hang or abort: the kernel closes the sockets.
+        os._exit(0)
+
+    # --- state ---
+
+    def _watch_arm(self) -> None:
+        every = max(1, round(1.0 / (PERIOD * _PUSHES_PER_S * self._setup.rate)))
+        count = 0
+        while True:
+            self._clock.sleep(0.5 * PERIOD)
+            before = self._snapshot
+            if not self._receive.isConnected():
+                self._lose("the arm closed the connection")
+            if os.getppid() != self._parent:
+                os.kill(os.getpid(), signal.SIGTERM)
+                self._parent = os.getppid()
+            stamp = self._receive.getTimestamp()
+            if stamp == self._controller_time:
+                if time.monotonic() - before.stamp > SILENCE_S:
+                    self._lose(f"no packet from the arm for {SILENCE_S:g} s")
+                continue
+            snapshot = self._snapshot = self._read()
+            count += 1
+            if count % every == 0 or _urgent(snapshot) != _urgent(before):
+                self._send(snapshot)
+
+    def _read(self) -> Snapshot:
+        """The newest packet, read whole: again if another one has come in between."""
+        receive = self._receive
+        while True:
+            self._controller_time: float = receive.getTimestamp()
+            snapshot = Snapshot(
+                stamp=time.monotonic(),
+                joints=tuple(receive.getActualQ()),
+                speeds=tuple(receive.getActualQd()),
+                flange=tuple(receive.getActualTCPPose()),
+                wrench=tuple(receive.getActualTCPForce()),
+                safety_bits=receive.getSafetyStatusBits(),
+                mode=receive.getRobotMode(),
+                program_running=receive.getRuntimeState() == _PLAYING,
+                inputs=receive.getActualDigitalInputBits(),
+                outputs=receive.getActualDigitalOutputBits(),
+            )
+            if receive.getTimestamp() == self._controller_time:
+                return snapshot
+
+    def _lose(self, text: str) -> None:
+        self._send(Lost(text))
+        os._exit(3)
+
+    def _send(self, message: Reply | Ended | Snapshot | Lost) -> None:
+        try:
+            with self._sending:
+                self._pipe.send(message)
+        except OSError:
+            # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def switch_output(io: Any, index: int, value: bool) -> bool:
+    """Set output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
+    if index < 8:
+        return bool(io.setStandardDigitalOut(index, value))
+    if index < 16:
+        return bool(io.setConfigurableDigitalOut(index - 8, value))
+    return bool(io.setToolDigitalOut(index - 16, value))
+
+
+def _prepare(control: Any, setup: Setup) -> None:
+    mass, centre = setup.payload
+    steps: list[tuple[str, Callable[[], bool]]] = [
+        ("the zero tool centre point", lambda: control.setTcp([0.0] * 6)),
+        ("the payload", lambda: control.setPayload(mass, list(centre))),
+        ("the watchdog", lambda: control.setWatchdog(1.0 / setup.watchdog)),
+    ]
+    for what, act in steps:
+        if not act():
+            raise RuntimeError(f"the controller did not accept {what}")
+
+
+def _urgent(snapshot: Snapshot) -> tuple[int, int, bool, int, int]:
+    return snapshot.safety_bits, snapshot.mode, snapshot.program_running, snapshot.inputs, snapshot.outputs
+
+
+@contextmanager
+def _ends_by_itself(seconds: float) -> Iterator[None]:
+    """Inside this context the process is killed after `seconds`: a constructor that hangs lets no thread run."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    raise _OwnerLost
+
+
+def _serve(descriptor: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    sys.setswitchinterval(0.0005)
+    end = socket.socket(fileno=descriptor)
+    # An owner that is frozen reads nothing: a full pipe must not hold up the child for ever.
+    end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", 2, 0))
+    pipe = Connection(end.detach())
+    try:
+        setup: Setup = pipe.recv()
+        child = Child(pipe, setup)
+    except (RuntimeError, ValueError, EOFError, OSError) as error:
+        with suppress(OSError):
+            pipe.send(Reply(0, ("arm.not_connected", str(error))))
+        os._exit(2)
+    try:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _end)
+        child.serve()
+    except _OwnerLost:
+        child.shut_down()
+
+
+def _switch_off(address: str, outputs: list[int]) -> None:
+    signal.setitimer(signal.ITIMER_REAL, _SHUT_DOWN_S)
+    io = RTDEIOInterface(address)
+    for index in outputs:
+        switch_output(io, index, False)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--off":
+        _switch_off(sys.argv[2], [int(index) for index in sys.argv[3].split(",")])
+    _serve(int(sys.argv[1]))
