@@ -12,6 +12,7 @@ import socket
 import threading
 import tty
 from collections.abc import Callable
+from functools import partial
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel
@@ -39,6 +40,7 @@ class TmclPeer:
         if pty:
             master, slave = os.openpty()
             tty.setraw(slave)
+            os.set_blocking(master, False)
             self._terminal, self.pty = (master, slave), os.ttyname(slave)
             self._reader = threading.Thread(target=self._serve_pty, args=(master,), name="rail-pty", daemon=True)
 
@@ -77,7 +79,7 @@ class TmclPeer:
     def _serve_pty(self, master: int) -> None:
         # The slave side is kept open here as well, so that a client may come and go without a hang-up.
         with contextlib.suppress(OSError):
-            self._serve(master, lambda: os.read(master, 4096), lambda data: _write_all(master, data))
+            self._serve(master, lambda: os.read(master, 4096), partial(_transmit, master))
 
     def _serve(self, descriptor: int, read: Callable[[], bytes], write: Callable[[bytes], object]) -> None:
         pending = b""
@@ -103,6 +105,7 @@ class TmclPeer:
             return False
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(descriptor, data) :]
+def _transmit(descriptor: int, data: bytes) -> None:
+    """Send as a serial line does: what nobody reads is lost."""
+    with contextlib.suppress(BlockingIOError):
+        os.write(descriptor, data)

@@ -13,61 +13,21 @@ from collections.abc import Callable
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailSettings
+from sim_backends.peers.tmcl_parameters import (
+    EEPROM_LOCK,
+    GLOBALS,
+    INPUTS,
+    LOCK,
+    PLAIN,
+    SEARCH_MODES,
+    SETTINGS,
+    UNLOCK,
+    USER_VARIABLES,
+)
 
-OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED, NOT_AVAILABLE = 100, 1, 2, 3, 4, 5, 6
+OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED = 100, 1, 2, 3, 4, 5
 MODEL = 1260
-SERIAL_BANK, SERIAL_VARIABLE = 2, 0
-
-_SETTINGS: dict[int, tuple[str, int, int]] = {
-    4: ("max_velocity", 0, 7_999_774),
-    5: ("max_acceleration", 0, 7_629_278),
-    12: ("right_stop", 0, 1),
-    13: ("left_stop", 0, 1),
-    26: ("soft_stop", 0, 1),
-    140: ("microsteps", 0, 8),
-    193: ("search_mode", 1, 8),
-    194: ("search_speed", 1, 7_999_774),
-    195: ("switch_speed", 1, 7_999_774),
-}
-"""Axis parameters that set the motion: number → (setting, smallest, largest value)."""
-
-_SEARCH_MODES = (1, 2, 5, 7)
-
-_PLAIN: dict[int, tuple[int, int, int]] = {
-    6: (128, 0, 255),
-    7: (8, 0, 255),
-    14: (0, 0, 1),
-    24: (0, 0, 1),
-    25: (0, 0, 1),
-    31: (0, 0, 65535),
-    153: (0, 0, 13),
-    154: (3, 0, 13),
-    181: (0, 0, 7_999_774),
-    204: (0, 0, 65535),
-    214: (200, 0, 65535),
-    251: (0, 0, 0),
-    254: (0, 0, 0),
-    255: (1, 1, 1),
-}
-"""Axis parameters that are only remembered: number → (value at power-on, smallest, largest value)."""
-
-_GLOBALS: dict[int, tuple[int, int, int]] = {
-    65: (0, 0, 11),
-    66: (1, 1, 255),
-    68: (0, 0, 65535),
-    69: (8, 2, 8),
-    70: (2, 0, 2047),
-    71: (1, 0, 2047),
-    73: (0, 0, 2**31 - 1),
-    75: (0, 0, 255),
-    76: (2, 0, 255),
-    77: (0, 0, 1),
-}
-"""Global parameters of bank 0: number → (value at power-on, smallest, largest value)."""
-
-_UNLOCK, _LOCK = 4321, 1234
-_USER_VARIABLES = 256
-_INPUTS = 4
+SERIAL_VARIABLE = 0
 
 
 class Refused(Exception):
@@ -85,10 +45,10 @@ class TmclModule:
         self.rail = rail
         self._clock = clock
         self._lock = threading.Lock()
-        self._axis = {number: value for number, (value, _, _) in _PLAIN.items()}
-        self._globals = {number: value for number, (value, _, _) in _GLOBALS.items()}
-        self._variables = [0] * _USER_VARIABLES
-        self._variables[SERIAL_VARIABLE] = rail.params.serial
+        self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
+        self._globals = {number: value for number, (value, _, _) in GLOBALS.items()}
+        self._variables = [0] * USER_VARIABLES
+        self._variables[SERIAL_VARIABLE] = rail.params.serial & 0x7FFFFFFF
         self._stored: dict[int, int] = {}
         self._outputs = [0, 0]
         self._locked = False
@@ -145,7 +105,7 @@ class TmclModule:
     # --- motion ---
 
     def _rotate(self, kind: int, motor: int, value: int) -> int:
-        _check(abs(value), 0, _SETTINGS[4][2])
+        _check(abs(value), 0, SETTINGS[4][2])
         self.rail.rotate(self._clock.now(), value)
         return value
 
@@ -159,7 +119,7 @@ class TmclModule:
         return target
 
     def _base(self, t: float) -> int:
-        return self.rail.position(t) if self._axis.get(127, 0) else self.rail.target()
+        return self.rail.position(t) if self._axis[127] else self.rail.target()
 
     def _search(self, kind: int, motor: int, value: int) -> int:
         t = self._clock.now()
@@ -177,8 +137,8 @@ class TmclModule:
 
     def _get_axis(self, kind: int, motor: int, value: int) -> int:
         rail, t = self.rail, self._clock.now()
-        if kind in _SETTINGS:
-            setting = int(getattr(rail.settings, _SETTINGS[kind][0]))
+        if kind in SETTINGS:
+            setting = int(getattr(rail.settings, SETTINGS[kind][0]))
             return 1 - setting if kind in (12, 13) else setting
         if kind in self._axis:
             return self._axis[kind]
@@ -207,15 +167,15 @@ class TmclModule:
 
     def _set_axis(self, kind: int, motor: int, value: int) -> int:
         t = self._clock.now()
-        if kind in _SETTINGS:
-            name, low, high = _SETTINGS[kind]
+        if kind in SETTINGS:
+            name, low, high = SETTINGS[kind]
             _check(value, low, high)
-            if kind == 193 and value not in _SEARCH_MODES:
+            if kind == 193 and value not in SEARCH_MODES:
                 raise Refused(BAD_VALUE)
             setting = type(getattr(RailSettings, name))(1 - value if kind in (12, 13) else value)
             self.rail.configure(t, dataclasses.replace(self.rail.settings, **{name: setting}))
-        elif kind in _PLAIN:
-            _check(value, *_PLAIN[kind][1:])
+        elif kind in PLAIN:
+            _check(value, *PLAIN[kind][1:])
             self._axis[kind] = value
         elif kind == 0:
             self.rail.move_to(t, value)
@@ -230,7 +190,7 @@ class TmclModule:
     def _store_axis(self, kind: int, motor: int, value: int) -> int:
         if self._locked:
             raise Refused(LOCKED)
-        if kind not in _SETTINGS and kind not in _PLAIN:
+        if kind not in SETTINGS and kind not in PLAIN:
             raise Refused(BAD_TYPE)
         self._stored[kind] = self._get_axis(kind, motor, 0)
         return self._stored[kind]
@@ -255,10 +215,10 @@ class TmclModule:
         if bank == 2:
             self._variables[kind] = value
         elif bank == 0 and kind in self._globals:
-            _check(value, *_GLOBALS[kind][1:])
+            _check(value, *GLOBALS[kind][1:])
             self._globals[kind] = value
-            if kind == 73 and value in (_LOCK, _UNLOCK):
-                self._locked = value == _LOCK
+            if kind == EEPROM_LOCK and value in (LOCK, UNLOCK):
+                self._locked = value == LOCK
         else:
             raise Refused(BAD_TYPE if bank == 0 else BAD_VALUE)
         return value
@@ -279,7 +239,7 @@ class TmclModule:
         return value
 
     def _get_input(self, kind: int, bank: int, value: int) -> int:
-        if bank == 0 and kind < _INPUTS:
+        if bank == 0 and kind < INPUTS:
             return 0
         if bank == 1 and kind in (0, 8, 9):
             return {0: 0, 8: 240, 9: 31}[kind]

@@ -1,0 +1,40 @@
+"""What a rail is made of, and what its controller can be told: the data of the rail's model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sim_backends.models.screw import Screw
+
+
+@dataclass(frozen=True)
+class RailParams:
+    """Hardware of one rail. Lengths in m from where the home switch's edge is; the left and right switches and the
+    mechanical ends lie beyond the usable travel. `repeatability` is the scatter (1 σ) of a switch edge per search."""
+
+    screw: Screw = field(default_factory=Screw)
+    steps_per_turn: int = 200
+    travel: tuple[float, float] = (0.0, 0.100)
+    switches: tuple[float, float] = (-0.002, 0.102)
+    ends: tuple[float, float] = (-0.004, 0.104)
+    repeatability: float = 0.0
+    start: float = 0.037
+    serial: int = 1
+    firmware: tuple[int, int] = (1, 12)
+
+
+@dataclass(frozen=True)
+class RailSettings:
+    """What the controller's axis parameters set: pps and pps² (microsteps), switches, reference search."""
+
+    max_velocity: int = 512_000
+    max_acceleration: int = 2_000_000
+    microsteps: int = 8
+    """Microsteps per full step as a power of two."""
+    search_mode: int = 1
+    """1 left switch; 2 right, then left switch; 5 or 7 home switch in negative direction."""
+    search_speed: int = 256_000
+    switch_speed: int = 51_200
+    left_stop: bool = True
+    right_stop: bool = True
+    soft_stop: bool = False

@@ -1,0 +1,62 @@
+"""Parameter tables of the simulated stepper module: number → value at power-on and allowed range.
+
+Numbers and meanings are those of the TMCM-1260 with velocities in pps.
+"""
+
+from __future__ import annotations
+
+SETTINGS: dict[int, tuple[str, int, int]] = {
+    4: ("max_velocity", 0, 7_999_774),
+    5: ("max_acceleration", 0, 7_629_278),
+    12: ("right_stop", 0, 1),
+    13: ("left_stop", 0, 1),
+    26: ("soft_stop", 0, 1),
+    140: ("microsteps", 0, 8),
+    193: ("search_mode", 1, 8),
+    194: ("search_speed", 1, 7_999_774),
+    195: ("switch_speed", 1, 7_999_774),
+}
+"""Axis parameters that set the motion: number → (setting, smallest, largest value)."""
+
+SEARCH_MODES = (1, 2, 5, 7)
+"""Values of axis parameter 193 that this module knows."""
+
+PLAIN: dict[int, tuple[int, int, int]] = {
+    6: (128, 0, 255),
+    7: (8, 0, 255),
+    14: (0, 0, 1),
+    24: (0, 0, 1),
+    25: (0, 0, 1),
+    31: (0, 0, 65535),
+    127: (0, 0, 1),
+    153: (0, 0, 13),
+    154: (3, 0, 13),
+    181: (0, 0, 7_999_774),
+    204: (0, 0, 65535),
+    214: (200, 0, 65535),
+    251: (0, 0, 0),
+    254: (0, 0, 0),
+    255: (1, 1, 1),
+}
+"""Axis parameters that are only remembered: number → (value at power-on, smallest, largest value)."""
+
+GLOBALS: dict[int, tuple[int, int, int]] = {
+    65: (0, 0, 11),
+    66: (1, 1, 255),
+    68: (0, 0, 65535),
+    69: (8, 2, 8),
+    70: (2, 0, 2047),
+    71: (1, 0, 2047),
+    73: (0, 0, 2**31 - 1),
+    75: (0, 0, 255),
+    76: (2, 0, 255),
+    77: (0, 0, 1),
+}
+"""Global parameters of bank 0: number → (value at power-on, smallest, largest value)."""
+
+EEPROM_LOCK, UNLOCK, LOCK = 73, 4321, 1234
+"""The global parameter that locks the EEPROM, and its two values."""
+USER_VARIABLES = 256
+"""Number of variables in bank 2."""
+INPUTS = 4
+"""Number of digital inputs."""
