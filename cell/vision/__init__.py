@@ -1,1 +1,23 @@
 """Images to numbers: stripe centres and board points, each with its own uncertainty or the reason of its refusal."""
+
+from cell.vision.board import BoardPose, board_pose, find_board
+from cell.vision.board_spec import BoardSpec, parse_board
+from cell.vision.board_view import BoardView
+from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
+from cell.vision.stripe import StripeProfile, StripeSettings, extract
+
+__all__ = [
+    "BoardPose",
+    "BoardSpec",
+    "BoardView",
+    "PictureRefused",
+    "Reason",
+    "StripeProfile",
+    "StripeSettings",
+    "board_pose",
+    "check_picture",
+    "extract",
+    "find_board",
+    "parse_board",
+    "read_picture",
+]

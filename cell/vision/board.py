@@ -1,0 +1,152 @@
+"""A calibration board in a picture: its points, and its pose in front of a calibrated camera.
+
+The one way in for all kinds of boards; each refusal says why. `board_spec.py` names boards, `dot_board.py` and
+`chess.py` find them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.circles import seen_centres
+from cell.geometry.poses import difference, from_parts, perturbed, transform
+from cell.vision.board_spec import DOTS, BoardSpec
+from cell.vision.board_view import BoardView
+from cell.vision.chess import find_charuco, find_chessboard
+from cell.vision.dot_board import find_dots
+from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
+
+STEPS = 30
+# The second pose that a flat board allows must fit worse by this much in χ².
+CLEAR_CHI2 = 16.0
+LEAST_SIGMA_PX = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """Pose of a board in the camera frame.
+
+    `covariance` (6, 6) of (translation, rotation) in camera axes, m and rad, from the residuals; `rms_px` of all
+    residual components; `obliquity` in rad between the board's normal and the line of sight to its middle;
+    `second_rms_px` that of the other pose that the flat board allows, NaN when there is none.
+    """
+
+    camera_from_board: pin.SE3
+    covariance: Array
+    rms_px: float
+    obliquity: float
+    second_rms_px: float
+
+
+def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None) -> BoardView:
+    """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
+
+    `size` is the expected (width, height). Raises PictureRefused with the reason: black, saturated, wrong size, no
+    board, ambiguous order, mirrored.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
+    check_picture(image, size)
+    if spec.kind in DOTS:
+        return find_dots(image, spec)
+    return find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
+
+
+def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
+    """Pose of the board of a view, by least squares on the pixels; dots are projected as circles.
+
+    Raises PictureRefused when two poses explain the picture about equally well, or none does.
+    """
+    if view.size != (camera.width, camera.height):
+        raise PictureRefused(
+            Reason.WRONG_SIZE,
+            f"the picture is {view.size[0]}×{view.size[1]} px, the camera's calibration {camera.width}×{camera.height}",
+        )
+    solutions = sorted((_refined(view, camera, start) for start in _starts(view, camera)), key=lambda s: s[1])
+    if not solutions:
+        raise PictureRefused(Reason.AMBIGUOUS, "the board's points allow no pose; are they on one line?")
+    pose, squares, normal = solutions[0]
+    freedom = max(1, 2 * len(view.ids) - 6)
+    variance = max(squares / freedom, LEAST_SIGMA_PX**2)
+    covariance: Array = np.asarray(variance * np.linalg.inv(normal), dtype=np.float64)
+    second = np.nan
+    if len(solutions) > 1:
+        apart = difference(solutions[1][0], pose)
+        second = float(np.sqrt(solutions[1][1] / (2 * len(view.ids))))
+        distinct = np.linalg.norm(apart[3:]) > 3 * np.sqrt(np.trace(covariance[3:, 3:]))
+        if distinct and (solutions[1][1] - squares) / variance < CLEAR_CHI2:
+            raise PictureRefused(
+                Reason.AMBIGUOUS,
+                f"two poses {np.degrees(np.linalg.norm(apart[3:])):.1f}° apart explain the picture of {view.spec.name} "
+                "equally well; go nearer or look at it from another side",
+            )
+        if not distinct:
+            second = np.nan
+    normal_out = pose.rotation[:, 2]
+    middle = transform(pose, view.object_points.mean(axis=0))
+    cosine = float(normal_out @ middle / np.linalg.norm(middle))
+    if cosine <= 0:
+        raise PictureRefused(Reason.MIRRORED, f"{view.spec.name} is seen from behind: the picture is mirrored")
+    rms = float(np.sqrt(squares / (2 * len(view.ids))))
+    return BoardPose(pose, covariance, rms, float(np.arccos(min(1.0, cosine))), second)
+
+
+def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_radius: float) -> Array:
+    """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
+    seen = transform(camera_from_board, points)
+    if dot_radius > 0:
+        seen = seen_centres(seen, camera_from_board.rotation[:, 2], dot_radius)
+    return camera.project(seen)
+
+
+def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
+    """The one or two poses that a flat board allows in closed form."""
+    ideal = camera.normalised(view.pixels)
+    if not np.isfinite(ideal).all():
+        return []
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        view.object_points, ideal.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    return [
+        from_parts(np.asarray(t, dtype=np.float64).ravel(), np.asarray(cv2.Rodrigues(r)[0], dtype=np.float64))
+        for r, t in zip(turns, shifts, strict=True)
+        if np.isfinite(t).all()
+    ]
+
+
+def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3) -> tuple[pin.SE3, float, Array]:
+    """Levenberg's method on the pose: the pose, the sum of squared residuals in px² and the normal matrix (6, 6)."""
+    points = view.object_points
+
+    def squares_of(candidate: pin.SE3) -> tuple[Array, float]:
+        residual = (view.pixels - predict(camera, candidate, points, view.dot_radius)).ravel()
+        total = float(residual @ residual)
+        return residual, total if np.isfinite(total) else np.inf
+
+    damping = 1e-6
+    residual, squares = squares_of(pose)
+    normal = np.eye(6)
+    for _ in range(STEPS):
+        arm = points @ pose.rotation.T
+        _, by_point, _ = camera.project_with_jacobians(arm + pose.translation)
+        jacobian = np.concatenate([by_point, np.cross(arm[:, None, :], by_point)], axis=2).reshape(-1, 6)
+        normal = jacobian.T @ jacobian
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
+        candidate = perturbed(pose, step)
+        new_residual, new_squares = squares_of(candidate)
+        if new_squares <= squares:
+            gain = squares - new_squares
+            pose, residual, squares = candidate, new_residual, new_squares
+            damping = max(1e-9, 0.1 * damping)
+            if gain <= 1e-10 * squares:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return pose, squares, normal

@@ -1,0 +1,138 @@
+"""The four kinds of calibration boards and their names, such as `marked_dots:9x7:20mm` or `charuco:8x6:15mm`.
+
+Board frame: origin at the first dot or inner corner, x along a row, y down the rows, z into the board.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from cell.geometry.camera import Array
+from drivers.errors import ConfigError
+
+Kind = Literal["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco"]
+KINDS: tuple[Kind, ...] = ("marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco")
+DOTS: tuple[Kind, ...] = ("marked_dots", "asymmetric_dots", "dots")
+
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "in": 25.4e-3}
+FORM = "a board is named KIND:COLSxROWS:PITCH with the unit, such as chessboard:7x6:10mm"
+MARKER_SHARE = 0.7
+DEFAULT_DICTIONARY = "DICT_5X5_100"
+
+
+@dataclass(frozen=True)
+class BoardSpec:
+    """A board: kind, columns and rows of its dots (inner corners; for ChArUco squares) and their pitch in m.
+
+    `asymmetric_dots` follow OpenCV: dot (i, j) lies at ((2i + j mod 2)·pitch, j·pitch). `marked_dots` have a diameter
+    of half a pitch and three rings, at (c, r), (c+2, r), (c, r+1) with c = (cols−1)//2, r = (rows−1)//2.
+    """
+
+    kind: Kind
+    cols: int
+    rows: int
+    pitch: float
+    marker: float = 0.0
+    dictionary: str = DEFAULT_DICTIONARY
+
+    @property
+    def name(self) -> str:
+        """The board's name as `parse_board` reads it."""
+        name = f"{self.kind}:{self.cols}x{self.rows}:{self.pitch * 1e3:g}mm"
+        if self.kind == "charuco":
+            name += f":{self.marker * 1e3:g}mm:{self.dictionary}"
+        return name
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Columns and rows of the points that are measured."""
+        return (self.cols - 1, self.rows - 1) if self.kind == "charuco" else (self.cols, self.rows)
+
+    def lattice(self) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+        """Places (n, 2) of the points in whole pitches, rows one after the other: their order is the points' id."""
+        cols, rows = self.grid
+        j, i = np.divmod(np.arange(cols * rows), cols)
+        x = 2 * i + j % 2 if self.kind == "asymmetric_dots" else i
+        return np.column_stack([x, j])
+
+    def points(self) -> Array:
+        """The points (n, 3) in the board frame in m, in the order of `lattice`."""
+        flat = self.lattice() * self.pitch
+        return np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        """Middle of the points in the board frame in m."""
+        x, y, z = (float(v) for v in 0.5 * (self.points().min(axis=0) + self.points().max(axis=0)))
+        return (x, y, z)
+
+    @property
+    def dot_radius(self) -> float:
+        """Radius of a dot in m where the kind of board fixes it, else 0 (corners, or dots of any size)."""
+        return 0.25 * self.pitch if self.kind == "marked_dots" else 0.0
+
+    @property
+    def rings(self) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+        """Places (column, row) of the three rings of `marked_dots`."""
+        c, r = (self.cols - 1) // 2, (self.rows - 1) // 2
+        return ((c, r), (c + 2, r), (c, r + 1))
+
+    @property
+    def symmetric(self) -> bool:
+        """True when the board turned by half a turn looks the same, so that a picture cannot tell its order."""
+        if self.kind == "dots":
+            return True
+        if self.kind == "asymmetric_dots":
+            return self.rows % 2 == 0
+        return self.kind == "chessboard" and (self.cols + self.rows) % 2 == 0
+
+
+def parse_board(text: str) -> BoardSpec:
+    """The board of a name; ConfigError says which part of the name is wrong and how it should look."""
+    parts = text.strip().split(":")
+    if len(parts) < 3:
+        raise ConfigError(f"board {text!r} has {len(parts)} of at least 3 parts: {FORM}")
+    kind = next((k for k in KINDS if k == parts[0]), None)
+    if kind is None:
+        raise ConfigError(f"board {text!r}: unknown kind {parts[0]!r}, allowed are {', '.join(KINDS)}: {FORM}")
+    size = re.fullmatch(r"(\d{1,3})[x×](\d{1,3})", parts[1])
+    if size is None:
+        raise ConfigError(f"board {text!r}: {parts[1]!r} is no number of columns x rows: {FORM}")
+    cols, rows = int(size[1]), int(size[2])
+    least = {"marked_dots": (4, 3), "charuco": (3, 3)}.get(kind, (3, 2))
+    if not (least[0] <= cols <= 100 and least[1] <= rows <= 100):
+        raise ConfigError(f"board {text!r}: {kind} needs {least[0]}x{least[1]} to 100x100, not {cols}x{rows}")
+    pitch = _length(text, parts[2], "pitch")
+    if kind != "charuco":
+        if len(parts) > 3:
+            raise ConfigError(f"board {text!r}: nothing may follow the pitch of a {kind} board: {FORM}")
+        return BoardSpec(kind, cols, rows, pitch)
+    marker, dictionary = MARKER_SHARE * pitch, DEFAULT_DICTIONARY
+    for part in parts[3:]:
+        if part.startswith("DICT_"):
+            dictionary = part
+        else:
+            marker = _length(text, part, "marker size")
+    if not hasattr(cv2.aruco, dictionary):
+        raise ConfigError(f"board {text!r}: unknown marker dictionary {dictionary!r}, for example {DEFAULT_DICTIONARY}")
+    if not marker < pitch:
+        raise ConfigError(f"board {text!r}: the marker ({marker * 1e3:g} mm) must be smaller than its square")
+    return BoardSpec(kind, cols, rows, pitch, marker, dictionary)
+
+
+def _length(board: str, text: str, what: str) -> float:
+    match = re.fullmatch(r"([0-9.]+(?:e-?\d+)?)\s*([a-zµ]+)?", text.strip())
+    if match is None or match[2] is None or match[2].replace("µ", "u") not in UNITS_M:
+        raise ConfigError(f"board {board!r}: the {what} {text!r} needs a number and a unit (mm, cm, m): {FORM}")
+    try:
+        metres = float(match[1]) * UNITS_M[match[2].replace("µ", "u")]
+    except ValueError as error:
+        raise ConfigError(f"board {board!r}: the {what} {text!r} is no length: {FORM}") from error
+    if not 1e-4 <= metres <= 10.0:
+        raise ConfigError(f"board {board!r}: the {what} {text!r} is outside 0.1 mm to 10 m")
+    return metres

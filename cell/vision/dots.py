@@ -1,0 +1,158 @@
+"""Finds dots in a picture and measures their centres from their edges, to some hundredths of a pixel.
+
+Blobs come from a local threshold at several scales; a dot's edge is then looked for along rays from its middle, so that
+a laser line across a dot spoils some rays and not the centre. Theory sheet, part 4.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.camera import Array
+from cell.vision.lattice import Blobs
+from cell.vision.pictures import Image
+
+RAYS = 32
+SAMPLES = 33
+REACH = (0.15, 1.75)
+LEAST_AREA_PX = 9.0
+ROUNDS = 4
+
+
+def find_blobs(image: Image, window: int, offset: float) -> Blobs:
+    """Dark elliptic blobs: darker by `offset` DN than the mean of a `window` × `window` px neighbourhood."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0)
+    mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REPLICATE)
+    dark = (smooth.astype(np.int16) < mean.astype(np.int16) - int(offset)).astype(np.uint8)
+    contours, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    height, width = image.shape
+    centres, shapes = [], []
+    for contour in contours:
+        if len(contour) < 8:
+            continue
+        x, y, w, h = cv2.boundingRect(contour)
+        if x == 0 or y == 0 or x + w == width or y + h == height or max(w, h) > 0.25 * max(width, height):
+            continue
+        m = cv2.moments(contour)
+        # A contour runs through pixel middles: it encloses half a pixel less all around.
+        area = m["m00"] + 0.5 * len(contour)
+        if m["m00"] < 4 or area < LEAST_AREA_PX:
+            continue
+        second = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
+        values, vectors = np.linalg.eigh(4 * second)
+        if values[0] <= 0 or values[0] < 0.03 * values[1]:
+            continue
+        # The area of an ellipse of these second moments: the ratio is 1 for ellipses and less for other shapes.
+        if not 0.87 < m["m00"] / (np.pi * np.sqrt(values[0] * values[1])) < 1.1:
+            continue
+        radii = np.sqrt(values) + 0.5
+        centres.append((m["m10"] / m["m00"], m["m01"] / m["m00"]))
+        shapes.append(vectors * radii @ vectors.T)
+    return Blobs(np.array(centres).reshape(-1, 2), np.array(shapes).reshape(-1, 2, 2))
+
+
+def measure_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
+    """Dots re-measured from their edges, one standard deviation (n,) of each centre in px, and ring scores (n,).
+
+    A dot whose edge is not found all around gets the deviation NaN. The ring score is the brightness of the middle
+    between that of the dot (0) and that of the board around (1).
+    """
+    picture = image.astype(np.float32)
+    centres, shapes = start.centres.copy(), start.shapes.copy()
+    angles = np.arange(RAYS) * 2 * np.pi / RAYS
+    unit = np.column_stack([np.cos(angles), np.sin(angles)])
+    rho = np.linspace(*REACH, SAMPLES)
+    design = np.column_stack([np.ones(RAYS), unit, np.cos(2 * angles), np.sin(2 * angles)])
+    sigma = np.full(len(centres), np.nan)
+    profiles = np.empty((len(centres), RAYS, SAMPLES))
+    for _ in range(ROUNDS):
+        profiles = _sample(picture, centres, shapes, unit, rho)
+        edge, good = _edges(profiles, rho)
+        coefficients, sigma, kept = _harmonics(edge, good, design)
+        moved = np.clip(coefficients, -0.5, 0.5)
+        moved[:, 0] = np.clip(coefficients[:, 0], 0.5, 1.6)
+        # A circle shifted by (a1, b1) and stretched by the second harmonic, in the dot's own normalised coordinates.
+        stretch = np.empty((len(centres), 2, 2))
+        stretch[:, 0, 0], stretch[:, 1, 1] = moved[:, 0] + moved[:, 3], moved[:, 0] - moved[:, 3]
+        stretch[:, 0, 1] = stretch[:, 1, 0] = moved[:, 4]
+        stretch = np.where(kept[:, None, None], stretch, np.eye(2))
+        centres = centres + np.where(kept[:, None], np.einsum("nij,nj->ni", shapes, moved[:, 1:3]), 0.0)
+        shapes = shapes @ stretch
+        sigma = np.where(kept, sigma * np.sqrt(np.abs(np.linalg.det(shapes))), np.nan)
+    # A dot that wandered off its blob measures something else.
+    wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
+    sigma[wandered > 0.7] = np.nan
+    return Blobs(centres, shapes), sigma, _ring_scores(profiles, rho)
+
+
+def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, unit: Array, rho: Array) -> Array:
+    """Grey values (n, rays, samples) along rays in the dots' normalised coordinates."""
+    directions = np.einsum("nij,kj->nki", shapes, unit)
+    places = centres[:, None, None, :] + directions[:, :, None, :] * rho[None, None, :, None]
+    flat = places.reshape(len(centres) * len(unit), len(rho), 2).astype(np.float32)
+    sampled = cv2.remap(picture, flat[:, :, 0], flat[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(len(centres), len(unit), len(rho)).astype(np.float64)
+
+
+def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where each ray (n, rays) leaves the dark, at half of the step, and whether it clearly does."""
+    inside = (rho > 0.55) & (rho < 0.8)
+    outside = (rho > 1.2) & (rho < 1.6)
+    dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
+    bright = profiles[:, :, outside].mean(axis=2)
+    # Neighbouring rays see the same board; a laser line or a neighbour dot does not move their median.
+    ring = np.stack([np.roll(bright, k, axis=1) for k in range(-3, 4)])
+    bright = np.median(ring, axis=0)
+    step = bright - dark
+    level = dark + 0.5 * step
+    start = int(np.searchsorted(rho, 0.5))
+    below = profiles[:, :, start:-1] < level[:, :, None]
+    above = profiles[:, :, start + 1 :] >= level[:, :, None]
+    crossing = below & above
+    first = crossing.argmax(axis=2) + start
+    rows, rays = np.indices(first.shape)
+    low, high = profiles[rows, rays, first], profiles[rows, rays, first + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = rho[first] + (level - low) / (high - low) * (rho[1] - rho[0])
+    good = crossing.any(axis=2) & (crossing.sum(axis=2) <= 2) & (step > 0.4 * np.median(step, axis=1)[:, None])
+    return np.where(good, edge, 1.0), good & (step > 4.0)
+
+
+def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Robust Fourier coefficients (n, 5) of the edge, the deviation (n,) of the centre, and which dots are whole."""
+    weight = good.astype(np.float64)
+    coefficients = np.zeros((len(edge), design.shape[1]))
+    scatter = np.ones(len(edge))
+    for _ in range(4):
+        normal = np.einsum("nk,ki,kj->nij", weight, design, design) + 1e-9 * np.eye(design.shape[1])
+        right = np.einsum("nk,ki,nk->ni", weight, design, edge)
+        coefficients = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        residual = edge - coefficients @ design.T
+        scatter = 1.4826 * np.median(np.where(good, np.abs(residual), np.inf), axis=1)
+        scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), 2e-3, None)
+        z = residual / (4.0 * scatter[:, None])
+        weight = np.where(good & (np.abs(z) < 1), (1 - z * z) ** 2, 0.0)
+    used = (weight > 0.2).sum(axis=1)
+    # The rays that count must surround the dot: no gap of a third of the circle.
+    gap = np.array([_widest_gap(row > 0.2) for row in weight])
+    kept = (used >= RAYS // 2) & (gap <= RAYS // 3) & (scatter < 0.15)
+    return coefficients, scatter * np.sqrt(2.0 / np.maximum(used, 1)), kept
+
+
+def _widest_gap(used: NDArray[np.bool_]) -> int:
+    """Longest run of unused rays, around the circle."""
+    places = np.flatnonzero(used)
+    if len(places) == 0:
+        return len(used)
+    return int(np.diff(np.append(places, places[0] + len(used))).max()) - 1
+
+
+def _ring_scores(profiles: Array, rho: Array) -> Array:
+    """Brightness of the middle (n,) between the dot's (0) and the board's (1)."""
+    middle = np.median(profiles[:, :, rho < 0.35].reshape(len(profiles), -1), axis=1)
+    annulus = profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2)
+    dark = np.median(annulus, axis=1)
+    bright = np.median(profiles[:, :, (rho > 1.25) & (rho < 1.6)].reshape(len(profiles), -1), axis=1)
+    return np.asarray((middle - dark) / np.maximum(bright - dark, 1.0), dtype=np.float64)

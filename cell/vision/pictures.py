@@ -1,0 +1,93 @@
+"""Whether a picture is worth looking at: readable, whole, of the right size, neither black nor blinded.
+
+Each refusal has a short reason for scripts and a text for people. What is in the picture is `board.py`'s business.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import RefusedError
+
+Image = NDArray[np.uint8]
+
+BLACK_DN = 16
+SATURATED_SHARE = 0.6
+
+
+class Reason(StrEnum):
+    """Why a picture was refused."""
+
+    UNREADABLE = "unreadable"
+    CUT = "cut"
+    WRONG_SIZE = "wrong_size"
+    BLACK = "black"
+    SATURATED = "saturated"
+    NO_BOARD = "no_board"
+    AMBIGUOUS = "ambiguous"
+    MIRRORED = "mirrored"
+    TURNED = "turned"
+    OBLIQUE = "oblique"
+    RESIDUAL = "residual"
+    NO_POSE = "no_pose"
+
+
+class PictureRefused(RefusedError):
+    """A picture cannot be used; `reason` is for scripts, the text for people."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (type(self), (self.reason, str(self)))
+
+
+def read_picture(path: Path) -> Image:
+    """The grey 8-bit image (h, w) of a file; refuses unreadable and cut files."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PictureRefused(Reason.UNREADABLE, f"{path.name} cannot be read: {error.strerror}") from error
+    if _is_cut(data):
+        raise PictureRefused(
+            Reason.CUT, f"{path.name} is cut: its end is missing after {len(data)} bytes; copy it again"
+        )
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    if image is None:
+        raise PictureRefused(Reason.UNREADABLE, f"{path.name} is no picture that can be decoded ({len(data)} bytes)")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:
+    """Refuse an image (h, w) that is black, blinded or not of `size` (width, height) in px."""
+    height, width = image.shape[:2]
+    if size is not None and (width, height) != size:
+        raise PictureRefused(
+            Reason.WRONG_SIZE, f"the picture is {width}×{height} px, expected {size[0]}×{size[1]} like the others"
+        )
+    # A thin laser line must not make a black picture pass, hence a high percentile and not the maximum.
+    bright = float(np.percentile(image, 95))
+    if bright < BLACK_DN:
+        raise PictureRefused(
+            Reason.BLACK, f"the picture is black: 95 % of it below {bright:.0f} of 255; open the shutter or add light"
+        )
+    blinded = float(np.mean(image >= 254))
+    if blinded > SATURATED_SHARE:
+        raise PictureRefused(
+            Reason.SATURATED, f"the picture is saturated: {blinded:.0%} of it is white; shorten the exposure"
+        )
+
+
+def _is_cut(data: bytes) -> bool:
+    """True for a PNG or JPEG whose end mark is missing."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data[-16:]
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" not in data[-4096:]
+    return False
