@@ -81,8 +81,9 @@ def visible_window(optics: CameraOptics, pose: Vector, pattern: Vector) -> Windo
         return 0, 0, optics.width, optics.height
     # Far outside the picture the distortion polynomial folds back, so the rays are held near the picture's cone.
     reach = 1.5 * max(optics.width / optics.fx, optics.height / optics.fy)
-    rays = np.clip(points / points[:, 2:], -reach, reach)
-    pixels = optics.project(np.ascontiguousarray(rays))
+    rays = points / points[:, 2:]
+    rays[:, :2] = np.clip(rays[:, :2], -reach, reach)
+    pixels = optics.project(rays)
     room = 2 + np.ceil(4 * float(optics.blur_px(_distance(pose, pattern))))
     low = np.maximum(np.floor(pixels.min(axis=0)) - room, 0)
     high = np.minimum(np.ceil(pixels.max(axis=0)) + room + 1, [optics.width, optics.height])

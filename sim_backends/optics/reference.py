@@ -6,11 +6,13 @@ thickness, incidence, distance and shadow, and the picture is then blurred as li
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from trimesh import Trimesh
-from trimesh.ray.ray_pyembree import RayMeshIntersector
+from trimesh.ray import ray_pyembree
 
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.profile import REFERENCE_RANGE
@@ -41,7 +43,7 @@ def reference_stripe(
     rays = np.column_stack([optics.undistort(grid.reshape(-1, 2)), np.ones(grid.shape[0] * grid.shape[1])])
     vertices = instance.mesh.vertices @ instance.camera_from_mesh[:3, :3].T + instance.camera_from_mesh[:3, 3]
     solid = Trimesh(vertices, instance.mesh.triangles, process=False)
-    tracer = RayMeshIntersector(solid)
+    tracer: Any = ray_pyembree.RayMeshIntersector(solid)
     light = _sheet_light(solid, tracer, rays, laser) * instance.albedo * laser.brightness * exposure
     centre = np.array([(optics.width - 1) / 2, (optics.height - 1) / 2])
     corner = ((grid - centre) ** 2).sum(axis=-1) / (centre**2).sum()
@@ -53,7 +55,7 @@ def reference_stripe(
     return np.asarray(pixels[pad:-pad, pad:-pad])
 
 
-def _first_hits(solid: Trimesh, tracer: RayMeshIntersector, rays: Vector) -> tuple[NDArray[np.int64], Vector]:
+def _first_hits(solid: Trimesh, tracer: Any, rays: Vector) -> tuple[NDArray[np.int64], Vector]:
     """Nearest triangle of each ray from the origin (−1 for none) and the point, in double precision."""
     found = np.asarray(tracer.intersects_first(np.zeros_like(rays), rays), dtype=np.int64)
     normals = solid.face_normals[found]
@@ -62,12 +64,12 @@ def _first_hits(solid: Trimesh, tracer: RayMeshIntersector, rays: Vector) -> tup
     return found, rays * share[:, None]
 
 
-def _depths(solid: Trimesh, tracer: RayMeshIntersector, rays: Vector) -> Vector:
+def _depths(solid: Trimesh, tracer: Any, rays: Vector) -> Vector:
     found, points = _first_hits(solid, tracer, rays)
     return np.asarray(points[found >= 0, 2])
 
 
-def _sheet_light(solid: Trimesh, tracer: RayMeshIntersector, rays: Vector, laser: LaserOptics) -> Vector:
+def _sheet_light(solid: Trimesh, tracer: Any, rays: Vector, laser: LaserOptics) -> Vector:
     """Relative light (n,) of the laser sheet where rays (n, 3) from the camera first meet the mesh."""
     normal, distance, origin = laser_frame(laser)
     found, points = _first_hits(solid, tracer, rays)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.optics.blur import blur_window
 from sim_backends.optics.camera import CameraOptics, distort
 from sim_backends.optics.compiled import compiled, compiled_fast
 from sim_backends.optics.lighting import ambient_dn, gain_parameters, pixel_gain
@@ -34,11 +35,15 @@ def render_mesh(image: Image, optics: CameraOptics, instance: MeshInstance, ligh
     splat(*leaves, np.ascontiguousarray(pose), eye, optics.intrinsics, cell, lamp, light.diffuse, depth, shade)
     level = ambient_dn(optics, light, exposure) * instance.albedo
     cover = np.isfinite(depth).astype(np.float32)
+    relative = shade.astype(np.float32)
+    whole = (0, 0, shape[1], shape[0])
+    blur_window(cover, whole, 0.8)
+    blur_window(relative, whole, 0.8)
     columns = np.arange(optics.width, dtype=np.int32)
     cell_of = columns // np.int32(cell)
     share_of = (columns / cell - cell_of).astype(np.float32)
     gain = gain_parameters(optics, light)
-    spread(image, cover, shade.astype(np.float32), cell, cell_of, share_of, level, gain)
+    spread(image, cover, relative, cell, cell_of, share_of, level, gain)
 
 
 @compiled
