@@ -1,0 +1,156 @@
+"""Laser and claw on the outputs of an arm: the interlock holds, and the feedback decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, InterlockError
+from drivers.interfaces import Arm, ArmMotion, ArmSafety, ArmState, Claw, Identity, Laser, LinkStatistics, Vector
+from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
+
+
+class BenchArm:
+    """An arm's terminal strip: outputs that can be wired to inputs; nothing moves."""
+
+    def __init__(self) -> None:
+        self.name = "arm"
+        self.statistics = LinkStatistics()
+        self.outputs = 0
+        self.history: list[tuple[int, bool]] = []
+        self.wiring: Callable[[int], int] = lambda outputs: 0
+
+    def identity(self) -> Identity:
+        return Identity("bench", "B1", "1.0", "terminals")
+
+    def ping(self) -> float:
+        return 1e-3
+
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        still = np.zeros(6)
+        return ArmState(
+            0.0, still, still, still, still, ArmSafety.NORMAL, False, self.wiring(self.outputs), self.outputs
+        )
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        self.history.append((index, value))
+        self.outputs = self.outputs | 1 << index if value else self.outputs & ~(1 << index)
+
+    def digital_input(self, index: int) -> bool:
+        return bool(self.wiring(self.outputs) >> index & 1)
+
+    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
+        raise NotImplementedError
+
+    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
+        raise NotImplementedError
+
+    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
+        raise NotImplementedError
+
+    def zero_force(self) -> None: ...
+
+    def set_payload(self, mass: float, centre: Vector) -> None: ...
+
+    def recover(self) -> None: ...
+
+
+@pytest.fixture
+def arm() -> BenchArm:
+    return BenchArm()
+
+
+def test_drivers_keep_the_promises_of_their_interfaces(arm: BenchArm) -> None:
+    terminals: Arm = arm
+    laser: Laser = ArmSwitchedLaser("laser", terminals, 0)
+    claw: Claw = ArmSwitchedClaw("claw", terminals, 1, 0)
+    assert not laser.is_on
+    assert not claw.holding
+
+
+def test_the_laser_is_on_inside_its_context_only(arm: BenchArm) -> None:
+    laser = ArmSwitchedLaser("laser", arm, 3)
+    with laser.lit():
+        assert arm.outputs == 0b1000
+        assert laser.is_on
+    assert arm.outputs == 0
+    assert not laser.is_on
+
+
+def test_the_laser_goes_off_when_its_owner_fails(arm: BenchArm) -> None:
+    laser = ArmSwitchedLaser("laser", arm, 0)
+    with pytest.raises(KeyboardInterrupt), laser.lit():
+        raise KeyboardInterrupt
+    assert not laser.is_on
+
+
+def test_the_laser_has_one_owner_at_a_time(arm: BenchArm) -> None:
+    laser = ArmSwitchedLaser("laser", arm, 0)
+    with laser.lit():
+        with pytest.raises(InterlockError, match="another owner"), laser.lit():
+            pytest.fail("two owners")
+        assert laser.is_on
+    with laser.lit():
+        assert laser.is_on
+
+
+def test_an_output_that_somebody_else_has_set_is_not_taken_over(arm: BenchArm) -> None:
+    arm.set_digital_output(0, True)
+    laser = ArmSwitchedLaser("laser", arm, 0)
+    with pytest.raises(InterlockError, match="stop"), laser.lit():
+        pytest.fail("lit")
+    assert laser.is_on
+    laser.stop()
+    with laser.lit():
+        assert laser.is_on
+
+
+def test_stop_and_close_switch_the_laser_off_over_its_owners_head(arm: BenchArm) -> None:
+    laser = ArmSwitchedLaser("laser", arm, 0)
+    with laser.lit():
+        laser.stop()
+        assert not laser.is_on
+    with laser.lit():
+        laser.close()
+        assert not laser.is_on
+
+
+def test_the_claw_holds_when_its_feedback_says_so(arm: BenchArm) -> None:
+    arm.wiring = lambda outputs: 0b100 if outputs & 0b10 else 0
+    claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
+    claw.grip()
+    assert claw.holding
+    claw.release()
+    assert not claw.holding
+    assert arm.history == [(1, True), (1, False)]
+
+
+def test_closing_on_nothing_is_a_fault(arm: BenchArm) -> None:
+    claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
+    with pytest.raises(DeviceFault, match="does not show a held part") as caught:
+        claw.grip()
+    assert caught.value.code == "claw.no_part"
+
+
+def test_a_part_that_sticks_is_a_fault(arm: BenchArm) -> None:
+    arm.wiring = lambda outputs: 0b100
+    claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
+    with pytest.raises(DeviceFault, match="still shows a held part") as caught:
+        claw.release()
+    assert caught.value.code == "claw.stuck"
+
+
+def test_stop_does_not_drop_the_part(arm: BenchArm) -> None:
+    arm.wiring = lambda outputs: 0b100 if outputs & 0b10 else 0
+    claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
+    claw.grip()
+    claw.stop()
+    claw.close()
+    assert claw.holding
