@@ -1,1 +1,8 @@
-"""Placeholder."""
+"""From the cloud to the pose of the nominal surface, with its uncertainty and a verdict."""
+
+from cell.inversion.nominal import NominalSurface
+from cell.inversion.observability import Tolerance, Verdict
+from cell.inversion.place_pose import Demands, PlacePose, invert_pose
+from cell.inversion.registration import Prior
+
+__all__ = ["Demands", "NominalSurface", "PlacePose", "Prior", "Tolerance", "Verdict", "invert_pose"]

@@ -1,0 +1,228 @@
+"""The nominal surface of a job: a triangle mesh, the closest point on it, and its own normals.
+
+Candidates come from a KD-tree over dense samples, the closest point from the triangles themselves, so that the
+distance is exact to the tessellation. Points whose foot lies on the rim say nothing about the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from drivers.errors import ConfigError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+SPACING = 0.0004
+"""Distance of the samples, m; a larger triangle carries several."""
+CANDIDATES = 4
+"""Samples whose triangles are tried for each point."""
+MOST_SAMPLES = 400_000
+
+
+@dataclass(frozen=True, eq=False)
+class Feet:
+    """Closest points of n points: `points` (n, 3) m and the model's unit `normals` (n, 3), surface frame.
+
+    `heights` (n,) are the signed distances along the normals, m; `inner` (n,) is True where the point lies over the
+    surface: its foot is not on the rim and the shortest way to it runs along the normal.
+    """
+
+    points: Array
+    normals: Array
+    heights: Array
+    inner: NDArray[np.bool_]
+
+
+class NominalSurface:
+    """A triangle mesh in the surface frame S, m, with normals by the order of the corners (counter-clockwise outside).
+
+    `rim` is the width in m along the mesh's border that is not used: a scan sees walls and mixed pixels there.
+    """
+
+    def __init__(self, vertices: ArrayLike, triangles: ArrayLike, rim: float = 0.0006) -> None:
+        self.vertices: Array = np.asarray(vertices, dtype=np.float64)
+        self.triangles: NDArray[np.int64] = np.asarray(triangles, dtype=np.int64)
+        corners = self.vertices[self.triangles]
+        if len(corners) == 0 or not np.isfinite(corners).all():
+            raise ConfigError(f"the nominal surface has {len(corners)} triangles, or corners that are not numbers")
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        twice_area = np.linalg.norm(cross, axis=1)
+        solid = twice_area > 1e-16
+        self.triangles, corners = self.triangles[solid], corners[solid]
+        self.areas: Array = 0.5 * twice_area[solid]
+        self.normals: Array = cross[solid] / twice_area[solid, None]
+        self._corners = np.ascontiguousarray(corners)
+        self.samples, self.sample_triangles = _samples(self._corners, self.areas)
+        self._tree = cKDTree(self.samples)
+        self._rim = rim
+        border = _border_points(self.vertices, self.triangles)
+        self._border = cKDTree(border) if len(border) else None
+        self._maybe_rim = self._touching_rim()
+        self.centre: Array = np.average(self.samples, axis=0, weights=self._sample_weights())
+        self.radius = float(np.sqrt(np.mean(np.sum((self.samples - self.centre) ** 2, axis=1))))
+
+    @classmethod
+    def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> NominalSurface:
+        """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh."""
+        import trimesh
+
+        try:
+            mesh = trimesh.load_mesh(path, process=True)
+            vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        except Exception as error:  # every reader of trimesh raises its own
+            raise ConfigError(
+                f"nominal surface {path} cannot be read as a mesh ({error}); give an STL or PLY"
+            ) from error
+        surface = cls(vertices * (1.0 if unit == "m" else 1e-3), faces, rim)
+        extent = np.ptp(surface.vertices, axis=0)
+        if not 0.001 < extent.max() < 5.0:
+            raise ConfigError(
+                f"nominal surface {path} measures {1e3 * extent.max():.3g} mm with mesh_unit = {unit!r}, allowed is "
+                "1 to 5000 mm; check surface.mesh_unit in the job"
+            )
+        return surface
+
+    def feet(self, points: ArrayLike, within: float = np.inf) -> tuple[Indices, Feet]:
+        """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""
+        p = np.ascontiguousarray(points, dtype=np.float64)
+        found = self._tree.query(p, k=CANDIDATES, distance_upper_bound=within + SPACING)
+        distances, nearest = np.asarray(found[0]), np.asarray(found[1])
+        chosen = np.flatnonzero(np.isfinite(distances[:, 0]))
+        nearest = np.where(np.isfinite(distances[chosen]), nearest[chosen], nearest[chosen, :1])
+        near = np.ascontiguousarray(p[chosen])
+        feet, hit = _closest(near, self._corners, self.sample_triangles[nearest])
+        normals = self.normals[hit]
+        way = near - feet
+        heights = np.einsum("ni,ni->n", way, normals)
+        aside = np.linalg.norm(way - heights[:, None] * normals, axis=1)
+        inner = aside <= 2e-5 + 0.3 * np.abs(heights)
+        if self._border is not None:
+            doubtful = np.flatnonzero(self._maybe_rim[hit])
+            inner[doubtful] &= self._border.query(feet[doubtful], distance_upper_bound=self._rim)[0] > self._rim
+        return chosen, Feet(feet, normals, heights, inner)
+
+    def deviations(self, points: ArrayLike, within: float = 0.003) -> Array:
+        """Signed distances (…,) in m of points (…, 3), surface frame, from the surface; NaN beside it or farther."""
+        p = np.asarray(points, dtype=np.float64)
+        flat = p.reshape(-1, 3)
+        found = np.full(len(flat), np.nan)
+        finite = np.flatnonzero(np.isfinite(flat).all(axis=1))
+        chosen, feet = self.feet(flat[finite], within)
+        found[finite[chosen]] = np.where(feet.inner, feet.heights, np.nan)
+        return found.reshape(p.shape[:-1])
+
+    def coverage(self, points: Array, within: float) -> float:
+        """Share of the surface's area, 0 … 1, that has one of the points (n, 3), surface frame, within `within` m."""
+        weights = self._sample_weights()
+        step = max(1, len(self.samples) // 5000)
+        seen = cKDTree(points).query(self.samples[::step], distance_upper_bound=within)[0] <= within
+        return float(np.sum(weights[::step] * seen) / np.sum(weights[::step]))
+
+    def _touching_rim(self) -> NDArray[np.bool_]:
+        """True for the triangles of which some point may lie on the rim."""
+        if self._border is None:
+            return np.zeros(len(self._corners), dtype=np.bool_)
+        middle = self._corners.mean(axis=1)
+        reach = np.linalg.norm(self._corners - middle[:, None], axis=2).max(axis=1)
+        return np.asarray(self._border.query(middle)[0] <= self._rim + reach)
+
+    def _sample_weights(self) -> Array:
+        counts = np.bincount(self.sample_triangles, minlength=len(self.areas))
+        return np.asarray(self.areas[self.sample_triangles] / counts[self.sample_triangles])
+
+
+def _samples(corners: Array, areas: Array) -> tuple[Array, Indices]:
+    """Points on the triangles at about `SPACING`, at least one in each, and the triangle of each point."""
+    edge = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
+    spacing = max(SPACING, float(np.sqrt(areas.sum() / MOST_SAMPLES)))
+    divisions = np.maximum(1, np.ceil(edge / spacing)).astype(np.intp)
+    points, owners = [], []
+    for n in np.unique(divisions):
+        mine = np.flatnonzero(divisions == n)
+        i, j = np.nonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
+        weights = [np.column_stack([i + 1 / 3, j + 1 / 3])]
+        upper = i + j < n - 1
+        weights.append(np.column_stack([i[upper] + 2 / 3, j[upper] + 2 / 3]))
+        uv = np.concatenate(weights) / n
+        bary = np.column_stack([1.0 - uv.sum(axis=1), uv])
+        points.append(np.einsum("sk,tki->tsi", bary, corners[mine]).reshape(-1, 3))
+        owners.append(np.repeat(mine, len(bary)))
+    return np.concatenate(points), np.concatenate(owners)
+
+
+def _border_points(vertices: Array, triangles: NDArray[np.int64]) -> Array:
+    """Points every 0.2 mm along the edges that belong to one triangle only."""
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    _, first_seen, count = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_index=True, return_counts=True)
+    single = edges[first_seen[count == 1]]
+    a, b = vertices[single[:, 0]], vertices[single[:, 1]]
+    steps = np.maximum(1, np.ceil(np.linalg.norm(b - a, axis=1) / 2e-4)).astype(np.intp)
+    owner = np.repeat(np.arange(len(single)), steps + 1)
+    first = np.cumsum(steps + 1) - (steps + 1)
+    share = (np.arange(len(owner)) - first[owner]) / steps[owner]
+    return np.asarray(a[owner] + share[:, None] * (b - a)[owner])
+
+
+@numba.njit(cache=True, nogil=True)
+def _closest(points: Array, corners: Array, candidates: Indices) -> tuple[Array, Indices]:
+    """For each point (n, 3) the closest point on its candidate triangles (n, k), and which triangle that is."""
+    feet = np.empty_like(points)
+    hit = np.empty(len(points), dtype=np.intp)
+    foot = np.empty(3)
+    for n in range(len(points)):
+        best = np.inf
+        for k in range(candidates.shape[1]):
+            triangle = candidates[n, k]
+            if k > 0 and triangle == candidates[n, k - 1]:
+                continue
+            distance = _to_triangle(points[n], corners, triangle, foot)
+            if distance < best:
+                best = distance
+                hit[n] = triangle
+                feet[n, 0], feet[n, 1], feet[n, 2] = foot[0], foot[1], foot[2]
+    return feet, hit
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_triangle(p: Array, corners: Array, t: int, foot: Array) -> float:
+    """Squared distance of p from triangle t, whose closest point goes into `foot` (Ericson, 2005, section 5.1.5)."""
+    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
+    for i in range(3):
+        ab, ac = corners[t, 1, i] - corners[t, 0, i], corners[t, 2, i] - corners[t, 0, i]
+        d1 += ab * (p[i] - corners[t, 0, i])
+        d2 += ac * (p[i] - corners[t, 0, i])
+        d3 += ab * (p[i] - corners[t, 1, i])
+        d4 += ac * (p[i] - corners[t, 1, i])
+        d5 += ab * (p[i] - corners[t, 2, i])
+        d6 += ac * (p[i] - corners[t, 2, i])
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    v = w = 0.0
+    if d1 <= 0.0 and d2 <= 0.0:
+        v = w = 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        v = 1.0
+    elif d6 >= 0.0 and d5 <= d6:
+        w = 1.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        v = 1.0 - w
+    else:
+        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
+    squared = 0.0
+    for i in range(3):
+        a = corners[t, 0, i]
+        foot[i] = a + v * (corners[t, 1, i] - a) + w * (corners[t, 2, i] - a)
+        squared += (p[i] - foot[i]) ** 2
+    return squared

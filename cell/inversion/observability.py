@@ -1,0 +1,135 @@
+"""Is the place pose known well enough in every direction, and which motion is not?
+
+The covariance is judged in units of the job's tolerances; the motion that exceeds them, or that only the board and not
+the scan determines, is put into words.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.inversion.nominal import Array
+from drivers.errors import NotObservable
+
+FREE = 1e-3
+"""Smallest eigenvalue of the scan's information, per point and σ, below which a motion counts as not determined by the
+scan (theory sheet, part 5)."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What the job allows: translation in m, rotation in rad."""
+
+    translation: float
+    rotation: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.translation < 1.0 and 0.0 < self.rotation < 1.0):
+            raise ValueError(
+                f"tolerances {self.translation} m and {self.rotation} rad must lie between 0 and 1 m, 0 and 1 rad"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A small motion of the surface: `shift` (3,) m of its origin and `turn` (3,) rad, in the surface frame, at three
+    standard deviations; `excess` is its size in units of the tolerance; `words` name it.
+    """
+
+    shift: Array
+    turn: Array
+    excess: float
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is known of the pose.
+
+    worst: the least certain motion, in units of the tolerance. weak: the motions beyond tolerance, worst first.
+    unseen: motions that the scan alone does not determine, so that the board decides them. spectrum: (6,) eigenvalues
+    of the scan's information per point, with the surface's rms radius as unit of length, rising.
+    """
+
+    worst: Motion
+    weak: tuple[Motion, ...]
+    unseen: tuple[str, ...]
+    spectrum: Array
+
+    @property
+    def observable(self) -> bool:
+        """True when every motion is known to within the tolerance at three standard deviations."""
+        return not self.weak
+
+    def require(self) -> None:
+        """Raise `NotObservable` that names every motion that is not known well enough."""
+        if self.weak:
+            motions = "; ".join(motion.words for motion in self.weak)
+            raise NotObservable(
+                f"{motions}. Scan more of the surface, one with more relief, or photograph the board more often"
+            )
+
+
+def judge(
+    covariance: Array, scan_information: Array, mean_variance: float, points: int, radius: float, tolerance: Tolerance
+) -> Verdict:
+    """Judge a 6×6 `covariance` (translation, rotation; surface frame) against `tolerance`.
+
+    `scan_information` is the 6×6 information of the scan alone in the same frame, `mean_variance` (m²) and `points` what
+    it was made of, `radius` the surface's rms radius in m.
+    """
+    unit = np.array([tolerance.translation] * 3 + [tolerance.rotation] * 3)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    motions = []
+    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+        excess = 3.0 * float(np.sqrt(max(value, 0.0)))
+        motions.append(_motion(excess * vector * unit, excess, tolerance, radius))
+    length = np.array([1.0] * 3 + [radius] * 3)
+    spectrum, ways = np.linalg.eigh(scan_information / np.outer(length, length) * (mean_variance / max(1, points)))
+    unseen = tuple(_name(way / length, radius) for value, way in zip(spectrum, ways.T, strict=True) if value < FREE)
+    weak = tuple(motion for motion in motions if motion.excess > 1.0)
+    return Verdict(motions[0], weak, unseen, np.asarray(spectrum))
+
+
+def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -> Motion:
+    shift, turn = motion[:3], motion[3:]
+    parts = []
+    size, angle = float(np.linalg.norm(shift)), float(np.linalg.norm(turn))
+    if angle * radius > 0.2 * size:
+        parts.append(_against(1e3 * angle, 1e3 * tolerance.rotation, "mrad"))
+    if size > 0.2 * angle * radius:
+        parts.append(_against(1e3 * size, 1e3 * tolerance.translation, "mm"))
+    state = "is not determined" if excess > 1.0 else "is known"
+    return Motion(shift, turn, excess, f"{_name(motion, radius)} {state}: 3σ {' and '.join(parts)}")
+
+
+def _against(value: float, allowed: float, unit: str) -> str:
+    return f"{value:.3g} {unit} {'>' if value > allowed else '≤'} {allowed:.3g} {unit}"
+
+
+def _name(motion: Array, radius: float) -> str:
+    """A motion (shift, turn) of the surface frame in words: a shift along an axis, or a turn about a line."""
+    shift, turn = motion[:3], motion[3:]
+    angle = float(np.linalg.norm(turn))
+    if angle * radius <= 0.2 * float(np.linalg.norm(shift)):
+        return f"translation along {_axis(shift)}"
+    axis = turn / angle
+    along = float(shift @ axis)
+    # The line that stays where it is: shift = −turn × point for the point nearest to the origin.
+    point = np.cross(axis, shift - along * axis) / angle
+    where = ""
+    if np.linalg.norm(point) > 0.05 * radius:
+        x, y, z = 1e3 * point
+        where = f" through ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+    return f"rotation about {_axis(axis)}{where}"
+
+
+def _axis(vector: Array) -> str:
+    direction = vector / np.linalg.norm(vector)
+    largest = int(np.argmax(np.abs(direction)))
+    if abs(direction[largest]) > 0.97:
+        return f"the {'xyz'[largest]} axis of the surface frame"
+    x, y, z = direction * np.sign(direction[largest])
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) in the surface frame"

@@ -1,0 +1,192 @@
+"""From the cloud to the place pose: registration, its whole uncertainty, and the reasons to refuse it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.geometry.poses import difference
+from cell.inversion.nominal import Array, NominalSurface
+from cell.inversion.observability import Tolerance, Verdict, judge
+from cell.inversion.registration import Prior, Registration, Scan, register
+from cell.reconstruction.cloud import Cloud
+from drivers.errors import RefusedError
+
+BOARD_DISAGREES = 40.0
+"""Squared Mahalanobis distance between scan and board from which on they contradict each other (6 degrees of freedom:
+five in ten million by chance)."""
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What a scan has to be like to be believed.
+
+    coverage: share of the surface that has points; share: points over the surface that fit it; rms: of those, m.
+    """
+
+    coverage: float = 0.35
+    share: float = 0.6
+    rms: float = 0.0003
+
+
+@dataclass(frozen=True, eq=False)
+class PlacePose:
+    """Where the surface is, and how well that is known.
+
+    base_from_surface: the pose. random, systematic, covariance (their sum): 6×6 of (translation, rotation) in base axes
+    about the surface's origin, m² and rad²; random from the stripe, the rail and the prior, systematic from what the
+    caller said of the calibration.
+    verdict: is every direction known well enough; its words are in the surface frame.
+    rms: of the accepted points' distances, m; chi2_per_dof: the same in units of their noise; n_points: accepted;
+    share: accepted among those over the surface; coverage: share of the surface that was seen.
+    correction: (6,) from the board's pose to this one, base axes, m and rad; disagreement: squared Mahalanobis distance
+    between the two.
+    """
+
+    base_from_surface: pin.SE3
+    random: Array
+    systematic: Array
+    covariance: Array
+    verdict: Verdict
+    rms: float
+    chi2_per_dof: float
+    n_points: int
+    share: float
+    coverage: float
+    correction: Array
+    disagreement: float
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (6,): translation in m, rotation in rad, base axes."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def summary(self) -> dict[str, object]:
+        """Figures for the journal."""
+        return {
+            "points": self.n_points,
+            "rms_mm": round(1e3 * self.rms, 4),
+            "chi2_per_dof": round(self.chi2_per_dof, 3),
+            "share": round(self.share, 4),
+            "coverage": round(self.coverage, 3),
+            "correction_mm": [round(1e3 * float(v), 3) for v in self.correction[:3]],
+            "correction_mrad": [round(1e3 * float(v), 3) for v in self.correction[3:]],
+            "sigma_mm": [round(1e3 * float(v), 4) for v in self.sigma[:3]],
+            "sigma_mrad": [round(1e3 * float(v), 4) for v in self.sigma[3:]],
+            "least_known": self.verdict.worst.words,
+            "decided_by_board": list(self.verdict.unseen),
+        }
+
+
+Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
+"""Gives, for points at (line, row), how one standard deviation of each independent calibration parameter moves them:
+(n, 3, m) in m, base axes."""
+
+
+def invert_pose(
+    cloud: Cloud,
+    nominal: NominalSurface,
+    prior: Prior,
+    tolerance: Tolerance,
+    *,
+    systematic: Array | None = None,
+    calibration: Resolve | None = None,
+    start: pin.SE3 | None = None,
+    demands: Demands | None = None,
+    most_points: int = 10_000,
+) -> PlacePose:
+    """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
+
+    `systematic` (6×6, base axes) is an uncertainty of the pose that all points share, such as the arm's; `calibration`
+    says how the calibration's uncertainty moves each point, and is propagated through the registration. `start` is
+    where the search begins unless at the prior.
+
+    Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
+    `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
+    """
+    demands = demands or Demands()
+    scan = Scan.of(cloud, most_points)
+    found = register(scan, nominal, prior, start)
+    pose = found.base_from_surface
+    local = (scan.points[found.used] - pose.translation) @ pose.rotation
+    coverage = nominal.coverage(local, 0.0025)
+    _demand(found, coverage, demands)
+    shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
+    if calibration is not None:
+        lines, rows = cloud.subsample(most_points)
+        moved = _propagate(found, calibration(lines[found.used], rows[found.used]), prior)
+        shared = shared + moved @ moved.T
+    covariance = found.covariance + shared
+    correction = difference(pose, prior.base_from_surface)
+    disagreement = _disagreement(shared, prior, correction)
+    turn = np.kron(np.eye(2), pose.rotation.T)
+    verdict = judge(
+        turn @ covariance @ turn.T,
+        turn @ found.scan_information @ turn.T,
+        float(1.0 / np.mean(1.0 / found.sigmas**2)),
+        len(found.used),
+        nominal.radius,
+        tolerance,
+    )
+    verdict.require()
+    return PlacePose(
+        base_from_surface=pose,
+        random=found.covariance,
+        systematic=np.asarray(shared),
+        covariance=np.asarray(covariance),
+        verdict=verdict,
+        rms=found.rms,
+        chi2_per_dof=found.chi2_per_dof,
+        n_points=len(found.used),
+        share=found.share,
+        coverage=coverage,
+        correction=correction,
+        disagreement=disagreement,
+    )
+
+
+def _propagate(found: Registration, moved_points: Array, prior: Prior) -> Array:
+    """(6, m) motion of the pose for displacements (m used points, 3, m parameters) of the points, in m and rad."""
+    jacobian = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1)
+    weighted = jacobian / found.sigmas[:, None] ** 2
+    along = np.einsum("ni,nim->nm", found.normals, moved_points)
+    total = found.scan_information + prior.information()
+    return np.asarray(np.linalg.solve(total, weighted.T @ along))
+
+
+def _demand(found: Registration, coverage: float, demands: Demands) -> None:
+    """Refuse a scan that is not like the surface."""
+    if coverage < demands.coverage:
+        raise RefusedError(
+            f"the scan covers {100 * coverage:.0f} % of the nominal surface, at least {100 * demands.coverage:.0f} % is "
+            "needed. Lengthen the sweep or check where the surface lies"
+        )
+    if found.share < demands.share:
+        raise RefusedError(
+            f"{100 * found.share:.0f} % of the points over the nominal surface fit it, at least "
+            f"{100 * demands.share:.0f} % must. Is it the right surface, clean and whole?"
+        )
+    if found.rms > demands.rms:
+        raise RefusedError(
+            f"the points lie {1e3 * found.rms:.3f} mm (rms) off the nominal surface, at most {1e3 * demands.rms:.3f} mm is "
+            "allowed. Is the surface deformed, or the calibration disturbed?"
+        )
+
+
+def _disagreement(shared: Array, prior: Prior, correction: Array) -> float:
+    """Squared Mahalanobis distance of the pose found from the prior's; `RefusedError` when they contradict each other.
+
+    A direction that the scan does not determine stays where the board put it and adds nothing.
+    """
+    distance = float(correction @ np.linalg.solve(prior.covariance + shared, correction))
+    if distance > BOARD_DISAGREES:
+        raise RefusedError(
+            f"scan and board disagree: the surface lies {1e3 * float(np.linalg.norm(correction[:3])):.2f} mm and "
+            f"{np.degrees(np.linalg.norm(correction[3:])):.2f} deg from where the board puts it (squared distance "
+            f"{distance:.0f} in units of the prior, allowed {BOARD_DISAGREES:.0f}). Was the board or the surface moved?"
+        )
+    return distance

@@ -1,0 +1,282 @@
+"""Where the nominal surface lies in the scan: robust point-to-plane Gauss–Newton with the board's pose as a prior.
+
+Distances and normals are the model's own. The prior is anchored: its gradient pulls to the board's pose, so that a
+direction that the scan does not determine stays where the board put it (theory sheet, part 5). Correspondences are
+gated from coarse to fine. What the uncertainty means for the job is judged in `observability`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.geometry.poses import difference, perturbed
+from cell.inversion.nominal import Array, NominalSurface
+from cell.reconstruction.cloud import Cloud
+from drivers.errors import RefusedError
+
+SIGMA_FLOOR = 3e-6
+"""Smallest standard deviation of a point along a normal, m: what a tessellation leaves."""
+COARSE_POINTS = 1200
+FINE_GATE = 0.0005
+"""Correspondences farther than this are not used once the pose is nearly found, m."""
+CHI_GATE = 3.5
+"""A point is accepted within so many standard deviations of the surface."""
+GOOD_SHARE = 0.75
+"""Share of the points over the surface that fit it, from which on no other start is tried."""
+LEAST_POINTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Points (n, 3) of a scan in the arm base, m.
+
+    `stripe_spread` and `rail_spread` (n, 3) m: what one standard deviation of the stripe centre and of the rail moves
+    each point by. The rail's error is common to the points with the same number in `lines` (n,).
+    """
+
+    points: Array
+    stripe_spread: Array
+    rail_spread: Array
+    lines: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, cloud: Cloud, most: int = 10_000) -> Scan:
+        """At most `most` points, spread evenly over the cloud."""
+        lines, rows = cloud.subsample(most)
+        spread = cloud.stripe_spread[lines, rows].astype(np.float64)
+        return cls(cloud.points[lines, rows], spread, cloud.rail_spread[lines], lines)
+
+    def thinned(self, most: int) -> Scan:
+        """Every k-th point, at most `most`."""
+        k = max(1, -(-len(self.points) // most))
+        return Scan(self.points[::k], self.stripe_spread[::k], self.rail_spread[::k], self.lines[::k])
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the scan: base_from_surface and its 6×6 covariance (translation, rotation; base axes)."""
+
+    base_from_surface: pin.SE3
+    covariance: Array
+
+    def information(self) -> Array:
+        """Inverse of the covariance."""
+        return np.asarray(np.linalg.inv(self.covariance))
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The pose found. All 6×6 matrices are of (translation, rotation) in base axes, about the surface's origin.
+
+    base_from_surface: the pose; scan_information: what the scan alone says, from stripe noise; covariance: random part,
+    scan and prior together; gain: how the pose follows a displacement of the scan, I where the scan decides.
+    used: indices of the accepted points of the scan; heights: their distances from the surface (m);
+    normals, arms: (m, 3) their normals and places relative to the surface's origin, in base axes; sigmas: m.
+    share: accepted points among those over the surface; offered: points of the scan.
+    """
+
+    base_from_surface: pin.SE3
+    scan_information: Array
+    covariance: Array
+    gain: Array
+    used: NDArray[np.intp]
+    heights: Array
+    normals: Array
+    arms: Array
+    sigmas: Array
+    share: float
+    offered: int
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the accepted points' distances from the surface, m."""
+        return float(np.sqrt(np.mean(self.heights**2)))
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """Mean square of the distances in units of their standard deviation."""
+        return float(np.sum((self.heights / self.sigmas) ** 2) / max(1, len(self.heights) - 6))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Linearised correspondences: indices of the points, heights (m), normals, arms and Jacobian (n, 6)."""
+
+    index: NDArray[np.intp]
+    heights: Array
+    normals: Array
+    arms: Array
+    jacobian: Array
+
+
+def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 | None = None) -> Registration:
+    """Find base_from_surface from `start` (the prior's pose unless given) in the light of scan and prior.
+
+    Raises `RefusedError` when too few points lie over the surface.
+    """
+    thin = scan.thinned(COARSE_POINTS)
+    begin = prior.base_from_surface if start is None else start
+    first = _first_gate(nominal, prior, begin)
+    best, best_score = begin, -1.0
+    for attempt in _starts(begin, nominal, first):
+        pose = _coarse(attempt, thin, nominal, prior, first)
+        score, share = _fit(pose, thin, nominal)
+        if score > best_score:
+            best, best_score = pose, score
+        if share > GOOD_SHARE:
+            break
+    return _fine(best, scan, nominal, prior)
+
+
+def _first_gate(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> float:
+    """How far points may lie from the surface at the start: three standard deviations of the prior, at the rim."""
+    sigma = np.sqrt(np.diag(prior.covariance))
+    off = difference(start, prior.base_from_surface)
+    reach = 3 * sigma[:3].max() + 3 * nominal.radius * sigma[3:].max()
+    gap = float(np.linalg.norm(off[:3])) + nominal.radius * float(np.linalg.norm(off[3:]))
+    return float(np.clip(reach + gap, 0.002, 0.5 * nominal.radius))
+
+
+def _starts(begin: pin.SE3, nominal: NominalSurface, gate: float) -> Iterator[pin.SE3]:
+    """The start itself, then turns about the surface's mean normal and shifts across it, by what the gate allows."""
+    yield begin
+    normal = np.average(nominal.normals, axis=0, weights=nominal.areas)
+    normal /= np.linalg.norm(normal)
+    side = np.linalg.svd(normal[None])[2][1:]
+    turn, shift = 0.7 * gate / nominal.radius, 0.5 * gate
+    pivot = pin.SE3(np.eye(3), nominal.centre)
+    for angle in (0.0, 0.5 * turn, -0.5 * turn, turn, -turn):
+        for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+            if angle or u or v:
+                moved = pin.SE3(pin.exp3(angle * normal), shift * (u * side[0] + v * side[1]))
+                yield begin * pivot * moved * pivot.inverse()
+
+
+def _coarse(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, first: float) -> pin.SE3:
+    """Gauss–Newton while the gate shrinks by half from `first`, with a weight that falls off with the distance."""
+    gate = first
+    while gate > 0.6 * FINE_GATE:
+        scale = gate / 2.5
+        for _ in range(4):
+            rows = _correspondences(pose, scan, nominal, gate)
+            if len(rows.index) < LEAST_POINTS / 2:
+                break
+            weights = (scale**2 / (scale**2 + rows.heights**2)) ** 2 / (0.5 * scale) ** 2
+            pose, step = _update(pose, rows, weights, prior)
+            if step < 0.03 * gate:
+                break
+        gate *= 0.5
+    return pose
+
+
+def _fit(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> tuple[float, float]:
+    """How well a pose explains the scan: share of all points that fit, and share of those over the surface."""
+    rows = _correspondences(pose, scan, nominal, 0.003)
+    if len(rows.index) < LEAST_POINTS / 2:
+        return 0.0, 0.0
+    fitting = np.abs(rows.heights) < np.maximum(4 * _sigmas(scan, rows), 1e-4)
+    return float(fitting.sum() / len(scan.points)), float(fitting.mean())
+
+
+def _fine(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:
+    """All points: first with a weight that rejects far ones, then with those that pass the χ² gate."""
+    for _ in range(3):
+        rows = _correspondences(pose, scan, nominal, FINE_GATE)
+        _require_points(rows, scan)
+        sigmas = _sigmas(scan, rows)
+        ratio = rows.heights / (4.7 * _scale(rows.heights / sigmas) * sigmas)
+        pose, step = _update(pose, rows, np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0) / sigmas**2, prior)
+        if step < 2e-7:
+            break
+    for _ in range(8):
+        rows = _correspondences(pose, scan, nominal, FINE_GATE)
+        sigmas = _sigmas(scan, rows)
+        scale = _scale(rows.heights / sigmas)
+        accepted = np.abs(rows.heights) < CHI_GATE * scale * sigmas
+        # Where the fit is worse than the noise says, the scan is believed less.
+        pose, step = _update(pose, rows, accepted / (scale * sigmas) ** 2, prior)
+        if step < 2e-8:
+            break
+    rows = _correspondences(pose, scan, nominal, FINE_GATE)
+    _require_points(rows, scan)
+    sigmas = _sigmas(scan, rows)
+    scale = _scale(rows.heights / sigmas)
+    return _result(pose, scan, nominal, prior, rows, sigmas * scale, CHI_GATE)
+
+
+def _result(
+    pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, rows: _Rows, sigmas: Array, gate: float
+) -> Registration:
+    """Collect the outcome and propagate the noise: each point's own, and the rail's, common to a line."""
+    keep = np.flatnonzero(np.abs(rows.heights) < gate * sigmas)
+    weighted = rows.jacobian[keep] / sigmas[keep, None] ** 2
+    information = weighted.T @ rows.jacobian[keep]
+    total = np.linalg.inv(information + prior.information())
+    index = rows.index[keep]
+    by_rail = np.einsum("ni,ni->n", scan.rail_spread[index], rows.normals[keep])
+    _, line = np.unique(scan.lines[index], return_inverse=True)
+    per_line = np.zeros((int(line.max()) + 1, 6))
+    np.add.at(per_line, line, weighted * by_rail[:, None])
+    over = _correspondences(pose, scan, nominal, 0.003)
+    return Registration(
+        base_from_surface=pose,
+        scan_information=information,
+        covariance=np.asarray(total + total @ per_line.T @ per_line @ total, dtype=np.float64),
+        gain=total @ information,
+        used=index,
+        heights=rows.heights[keep],
+        normals=rows.normals[keep],
+        arms=rows.arms[keep],
+        sigmas=sigmas[keep],
+        share=len(keep) / max(1, len(over.index)),
+        offered=len(scan.points),
+    )
+
+
+def _correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> _Rows:
+    """Points within `gate` m of the surface and over it, with the derivative of their heights by the pose."""
+    local = (scan.points - pose.translation) @ pose.rotation
+    index, feet = nominal.feet(local, gate)
+    keep = feet.inner & (np.abs(feet.heights) < gate)
+    index = index[keep]
+    normals = feet.normals[keep] @ pose.rotation.T
+    arms = scan.points[index] - pose.translation
+    jacobian = -np.concatenate([normals, np.cross(arms, normals)], axis=1)
+    return _Rows(index, feet.heights[keep], normals, arms, jacobian)
+
+
+def _sigmas(scan: Scan, rows: _Rows) -> Array:
+    """Standard deviations along the normals from the stripe's noise, m."""
+    along = np.einsum("ni,ni->n", scan.stripe_spread[rows.index], rows.normals)
+    return np.asarray(np.hypot(along, SIGMA_FLOOR))
+
+
+def _scale(ratios: Array) -> float:
+    """How many times larger the deviations are than their σ says, at least 1, from their median absolute value."""
+    return max(1.0, float(np.median(np.abs(ratios))) / 0.6745) if len(ratios) else 1.0
+
+
+def _update(pose: pin.SE3, rows: _Rows, weights: Array, prior: Prior) -> tuple[pin.SE3, float]:
+    """One Gauss–Newton step with weights 1/σ²; also the largest displacement at the surface that it makes, m."""
+    off = difference(pose, prior.base_from_surface)
+    by_pose = np.eye(6)
+    by_pose[3:, 3:] = pin.Jlog3(pin.exp3(off[3:])).T
+    anchored = by_pose.T @ prior.information()
+    weighted = rows.jacobian * weights[:, None]
+    hessian = weighted.T @ rows.jacobian + anchored @ by_pose
+    step = -np.linalg.solve(hessian, weighted.T @ rows.heights + anchored @ off)
+    reach = float(np.abs(rows.arms).max()) if len(rows.arms) else 0.0
+    return perturbed(pose, step), float(np.abs(step[:3]).max() + np.abs(step[3:]).max() * reach)
+
+
+def _require_points(rows: _Rows, scan: Scan) -> None:
+    if len(rows.index) < LEAST_POINTS:
+        raise RefusedError(
+            f"{len(rows.index)} of {len(scan.points)} scanned points lie within {1e3 * FINE_GATE:.1f} mm of the "
+            f"nominal surface, at least {LEAST_POINTS} are needed. Is it the right surface, and is the scan over it?"
+        )
