@@ -77,8 +77,8 @@ def judge(
 ) -> Verdict:
     """Judge a 6×6 `covariance` (translation, rotation; surface frame) against `tolerance`.
 
-    `scan_information` is the 6×6 information of the scan alone in the same frame, `mean_variance` (m²) and `points` what
-    it was made of, `radius` the surface's rms radius in m.
+    `scan_information` is the 6×6 information of the scan alone in the same frame, made of `points` points of variance
+    `mean_variance` (m²); `radius` is the surface's rms radius in m.
     """
     unit = np.array([tolerance.translation] * 3 + [tolerance.rotation] * 3)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))

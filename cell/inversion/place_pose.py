@@ -172,8 +172,8 @@ def _demand(found: Registration, coverage: float, demands: Demands) -> None:
         )
     if found.rms > demands.rms:
         raise RefusedError(
-            f"the points lie {1e3 * found.rms:.3f} mm (rms) off the nominal surface, at most {1e3 * demands.rms:.3f} mm is "
-            "allowed. Is the surface deformed, or the calibration disturbed?"
+            f"the points lie {1e3 * found.rms:.3f} mm (rms) off the nominal surface, at most "
+            f"{1e3 * demands.rms:.3f} mm is allowed. Is the surface deformed, or the calibration disturbed?"
         )
 
 
@@ -187,6 +187,7 @@ def _disagreement(shared: Array, prior: Prior, correction: Array) -> float:
         raise RefusedError(
             f"scan and board disagree: the surface lies {1e3 * float(np.linalg.norm(correction[:3])):.2f} mm and "
             f"{np.degrees(np.linalg.norm(correction[3:])):.2f} deg from where the board puts it (squared distance "
-            f"{distance:.0f} in units of the prior, allowed {BOARD_DISAGREES:.0f}). Was the board or the surface moved?"
+            f"{distance:.0f} in units of the prior, allowed {BOARD_DISAGREES:.0f}). Was the board or the surface "
+            "moved?"
         )
     return distance

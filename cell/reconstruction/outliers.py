@@ -116,7 +116,7 @@ def _deviation(values: Array, kept: Array, noise: Array, line: int, row: int, bu
         off_pairs = own - _median(buffer, count)
         if abs(off_pairs) < abs(off):
             off = off_pairs
-    return off / noise[line, row]
+    return float(off / noise[line, row])
 
 
 @numba.njit(cache=True, nogil=True)
