@@ -1,20 +1,29 @@
 """What runs on the controller: script texts as they are uploaded, and the program that serves commands in registers.
 
 The program follows ur_rtde's control script (MIT, version 1.6): the command in input register 0, progress and results
-in the output registers. What each command does is in `script_commands`; this module is the loop around them.
+in the output registers. What each command does is in `script_motion` and `script_queries`; this is the loop around.
 """
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from enum import IntEnum
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.peers.rtde_registers import Registers
-from sim_backends.peers.script_commands import IMMEDIATE, STOP_SCRIPT, Commands, Job, ProgramError
+from sim_backends.peers.script_context import Context, Job, ProgramError
+from sim_backends.peers.script_motion import MOTION_COMMANDS, tool_contact
+from sim_backends.peers.script_queries import QUERY_COMMANDS
+from sim_backends.peers.script_statements import path_statements, run_statement, statements, understood
+
+COMMANDS: dict[int, Callable[[Context], Job | None]] = {**MOTION_COMMANDS, **QUERY_COMMANDS}
+"""Every command that does something; other numbers are answered as done."""
+IMMEDIATE = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
+"""Commands that are carried out in every cycle while they stand in the register."""
+_STOP_SCRIPT, _CONTACT_DETECTED = 255, 254
 
 _log = logging.getLogger(__name__)
 _TEXT_LIMIT = 1 << 20
@@ -40,12 +49,12 @@ class ScriptText:
         self._buffer += data
         texts = []
         while self._buffer:
-            stripped = self._buffer.lstrip()
-            is_program = stripped.startswith((b"def ", b"sec "))
-            end = self._buffer.find(b"\nend\n") + 5 if is_program else self._buffer.find(b"\n") + 1
-            if end <= (4 if is_program else 0):
+            is_program = self._buffer.lstrip().startswith((b"def ", b"sec "))
+            mark = b"\nend\n" if is_program else b"\n"
+            end = self._buffer.find(mark)
+            if end < 0:
                 break
-            text, self._buffer = self._buffer[:end], self._buffer[end:]
+            text, self._buffer = self._buffer[: end + len(mark)], self._buffer[end + len(mark) :]
             if text.strip():
                 texts.append(text.decode("utf-8", "replace"))
         if len(self._buffer) > _TEXT_LIMIT:
@@ -62,29 +71,33 @@ class ControlProgram:
         self._model = model
         self._registers = registers
         self._clock = clock
-        self._commands = Commands(model, registers, 0, "")
+        self._context = Context(model, registers, 0, [])
         self._job: Job | None = None
         self._serves_commands = False
         self._executing = False
 
     def load(self, text: str) -> None:
-        """Run `text` in place of any other program; ignored, like on the controller, while the arm cannot move."""
-        if not self._model.ready:
-            self.message = "a script was not started: the arm is not ready"
-            _log.info("%s", self.message)
-            return
-        if not text.lstrip().startswith(("def ", "sec ")) and self.runtime_state is RuntimeState.PLAYING:
-            self.stop("replaced by a single command")
-        self._model.halt()
+        """Run `text` in place of any other program.
+
+        Like on the controller, nothing changes while the arm cannot move or when the text does not compile.
+        """
         found = _OFFSET.search(text)
+        if not self._model.ready:
+            self._note("a script was not started: the arm is not ready")
+            return
+        if not found and not all(map(understood, statements(text))):
+            self._note(f"a script was not started: compile error in {text.strip()[:60]!r}")
+            return
+        self._context.end_background()
+        self._model.halt()
         self._serves_commands = found is not None
-        self._commands = Commands(self._model, self._registers, int(found[1]) if found else 0, text)
         self._executing = False
-        self._job = None if self._serves_commands else self._commands.run_text(text)
+        self._context = Context(self._model, self._registers, int(found[1]) if found else 0, path_statements(text))
+        self._job = None if self._serves_commands else self._run_text(text)
         self.runtime_state = RuntimeState.PLAYING
         self.message = ""
         if self._serves_commands:
-            self._commands.signal_async(-1)
+            self._context.signal_async(-1)
 
     def play(self) -> bool:
         """Continue a paused program; False when there is none or the arm is not ready."""
@@ -107,11 +120,10 @@ class ControlProgram:
         if self.runtime_state is RuntimeState.STOPPED:
             return
         self.runtime_state = RuntimeState.STOPPED
-        self.message = reason
         self._job = None
-        self._commands.end_background()
+        self._context.end_background()
         self._model.halt()
-        _log.info("program stopped: %s", reason)
+        self._note(f"program stopped: {reason}")
 
     def tick(self) -> None:
         """One cycle of the controller: follow the safety system, then the program."""
@@ -128,42 +140,72 @@ class ControlProgram:
             self.stop(str(error))
 
     def _cycle(self) -> None:
-        commands = self._commands
         self._check_watchdog()
-        commands.advance_background()
+        self._context.advance_background()
+        self._watch_contact()
         if self._job is not None:
             self._continue(self._job)
             return
-        command = commands.requested()
+        command = self._next_command()
         if command in IMMEDIATE:
-            commands.process(command)
-            commands.signal(1)
+            self._process(command)
+            self._context.signal(1)
         elif command == 0:
             self._executing = False
-            commands.signal(1)
+            self._context.signal(1)
         elif not self._executing:
             self._executing = True
-            if command == STOP_SCRIPT:
+            if command == _STOP_SCRIPT:
                 self.stop("ended by its client")
                 return
-            job = commands.process(command)
-            self._continue(job if job is not None else iter(()))
+            job = self._process(command)
+            self._continue(iter(()) if job is None else job)
 
-    def _continue(self, job: Iterator[None]) -> None:
+    def _next_command(self) -> int:
+        """The client's command; while there is none, one that the program gives itself."""
+        command = self._context.requested()
+        if command == 0 and self._context.contact_seen:
+            self._context.contact_seen = False
+            return _CONTACT_DETECTED
+        return command
+
+    def _process(self, command: int) -> Job | None:
+        action = COMMANDS.get(command)
+        return None if action is None else action(self._context)
+
+    def _continue(self, job: Job) -> None:
         """Advance a job that takes several cycles; tell the client once it is done."""
         self._job = job
         if next(job, True) is None:
             return
         self._job = None
         if self._serves_commands:
-            self._commands.signal(2)
+            self._context.signal(2)
         else:
             self.stop("ended")
 
+    def _run_text(self, text: str) -> Job:
+        for line in statements(text):
+            yield from run_statement(self._context, line)
+
+    def _watch_contact(self) -> None:
+        context = self._context
+        if context.contact_direction is None:
+            return
+        steps = tool_contact(context, context.contact_direction)
+        if steps:
+            context.contact_direction = None
+            context.contact_steps = steps
+            context.contact_seen = True
+
     def _check_watchdog(self) -> None:
-        limit = self._commands.watchdog_period
+        limit = self._context.watchdog_period
         if limit is None:
             return
         silence = self._clock.wall(self._model.time) - self._registers.commanded_at
         if silence > limit:
             raise ProgramError(f"watchdog: no input for {silence:.3f} s, at most {limit:.3f} s allowed")
+
+    def _note(self, message: str) -> None:
+        self.message = message
+        _log.info("%s", message)
