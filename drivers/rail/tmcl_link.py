@@ -133,7 +133,7 @@ class TmclLink:
                 "tmcl.refused",
                 f"the module refused command {request.command}, type {request.type}, value {request.value}: {reason}",
                 recoverable=False,
-                hint="Check that the module takes velocities in pulses per second and has this axis.",
+                hint="Check that the value is in the module's range (pulses per second) and that it has this axis.",
             )
         return reply
 

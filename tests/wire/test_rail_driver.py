@@ -1,0 +1,384 @@
+"""The rail's driver on the simulated rail's wire, its motions against the simulated carriage."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import (
+    Aborted,
+    ConfigError,
+    DeadlineError,
+    DeviceFault,
+    InterlockError,
+    LimitError,
+    NotConnectedError,
+)
+from drivers.interfaces import Rail
+from drivers.rail.motion import move_duration, run_up_distance
+from drivers.rail.sweep import fit_line
+from drivers.rail.tmcl import TmclRail
+from sim_backends.clock import WorldClock
+from sim_backends.models.rail import RailModel, RailParams
+from sim_backends.peers.tmcl import TmclPeer
+
+SPEED = 5.0
+MAX_SPEED = 0.05
+ACCELERATION = 0.25
+
+
+@dataclass
+class Bench:
+    """A rail on its wire: the driver, the carriage's truth and the two clocks' difference."""
+
+    rail: TmclRail
+    model: RailModel
+    peer: TmclPeer
+    world: WorldClock
+    clock: Clock
+
+    def carriage(self, host_time: float | None = None) -> float:
+        """True place of the carriage in m, at a host time of the past or now."""
+        if host_time is None:
+            return self.model.carriage(self.world.now())
+        return self.model.carriage(host_time + self.world.now() - self.clock.now())
+
+
+def connect(url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1) -> TmclRail:
+    return TmclRail(
+        "rail",
+        url,
+        lead=0.002,
+        steps_per_turn=200,
+        microsteps=256,
+        travel=travel,
+        max_speed=MAX_SPEED,
+        acceleration=ACCELERATION,
+        address=address,
+        motor=0,
+        clock=clock,
+    )
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    world, clock = WorldClock(SPEED), Clock(SPEED)
+    model = RailModel(RailParams(), np.random.default_rng(3))
+    peer = TmclPeer(model, world)
+    peer.start()
+    rail = connect(peer.url, clock)
+    try:
+        yield Bench(rail, model, peer, world, clock)
+    finally:
+        try:
+            rail.close()
+        finally:
+            peer.stop()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("rail motion")]
+
+
+@pytest.fixture
+def homed(bench: Bench) -> Bench:
+    bench.rail.home().wait(20.0)
+    return bench
+
+
+# --- helpers with closed forms ---
+
+
+def test_ramps_follow_from_speed_and_acceleration() -> None:
+    assert run_up_distance(0.2, 0.5) == pytest.approx(0.04)
+    assert move_duration(0.2, 0.2, 0.5) == pytest.approx(2 * 0.4 + (0.2 - 0.08) / 0.2)
+    assert move_duration(-0.02, 0.2, 0.5) == pytest.approx(2 * np.sqrt(0.02 / 0.5))
+
+
+def test_one_late_sample_does_not_bend_the_line() -> None:
+    times = np.linspace(10.0, 12.0, 40)
+    positions = 0.01 + 0.02 * (times - 10.0)
+    trips = np.full(40, 0.001)
+    times[30] += 0.25
+    trips[30] = 0.5
+    origin, velocity = fit_line(times, positions, trips)
+    assert velocity == pytest.approx(0.02, rel=1e-4)
+    assert origin + velocity * 11.0 == pytest.approx(0.03, abs=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"lead": 0.0}, {"microsteps": 100}, {"travel": (0.1, 0.0)}, {"acceleration": -1.0}])
+def test_impossible_parameters_are_refused_before_the_port_is_opened(wrong: dict[str, object]) -> None:
+    settings: dict[str, object] = {
+        "lead": 0.002,
+        "steps_per_turn": 200,
+        "microsteps": 256,
+        "travel": (0.0, 0.1),
+        "max_speed": 0.05,
+        "acceleration": 0.5,
+        **wrong,
+    }
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        TmclRail("rail", "socket://127.0.0.1:1", clock=Clock(), **settings)  # type: ignore[arg-type]
+
+
+# --- on the wire ---
+
+
+@pytest.mark.wire
+def test_the_rail_says_who_it_is_and_how_fast_it_answers(bench: Bench) -> None:
+    rail: Rail = bench.rail
+    identity = rail.identity()
+    assert (identity.model, identity.serial, identity.firmware) == ("TMCM-1260", "1", "1260V112")
+    assert identity.address == bench.peer.url
+    assert 0.0 < rail.ping() < 0.5
+    assert len(rail.statistics.round_trips_s) > 5
+    assert not rail.statistics.errors
+
+
+@pytest.mark.wire
+def test_nothing_moves_before_homing(bench: Bench) -> None:
+    before = bench.carriage()
+    with pytest.raises(InterlockError, match="home"):
+        bench.rail.move_to(0.05)
+    assert not bench.rail.state().homed
+    assert bench.carriage() == before
+
+
+@pytest.mark.wire
+def test_homing_puts_zero_at_the_switch(homed: Bench) -> None:
+    state = homed.rail.state()
+    assert state.homed
+    assert not state.moving
+    assert state.position == 0.0
+    assert homed.carriage() == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.wire
+def test_a_move_ends_where_it_was_sent(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.0421, speed=0.03)
+    assert not motion.done
+    motion.wait(10.0)
+    assert motion.done
+    assert homed.rail.state().position == pytest.approx(0.0421, abs=1e-8)
+    assert homed.carriage() == pytest.approx(0.0421, abs=1e-6)
+
+
+@pytest.mark.wire
+def test_limits_are_checked_before_anything_is_sent(homed: Bench) -> None:
+    sent = len(homed.rail.statistics.round_trips_s)
+    with pytest.raises(LimitError, match=r"position 120 mm is outside 0 mm to 100 mm"):
+        homed.rail.move_to(0.12)
+    with pytest.raises(LimitError, match=r"position nan"):
+        homed.rail.move_to(float("nan"))
+    with pytest.raises(LimitError, match=r"speed 60 mm/s .* 50 mm/s"):
+        homed.rail.move_to(0.05, speed=0.06)
+    with pytest.raises(LimitError, match="start-up"):
+        homed.rail.sweep_start(0.0, 0.05, 0.02)
+    with pytest.raises(LimitError, match="run-out"):
+        homed.rail.sweep_start(0.05, 0.1, 0.02)
+    assert len(homed.rail.statistics.round_trips_s) == sent
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
+def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench, start: float, stop: float) -> None:
+    speed = 0.04
+    homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
+    sweep = homed.rail.sweep(start, stop, speed)
+    with pytest.raises(InterlockError, match="still runs"):
+        sweep.position_at(homed.clock.now())
+    sweep.wait(10.0)
+    begin, end = sweep.window
+    assert end - begin == pytest.approx(abs(stop - start) / speed, rel=1e-3)
+    times = np.linspace(begin, end, 50)[1:-1]
+    errors = [sweep.position_at(time) - homed.carriage(time) for time in times]
+    assert np.max(np.abs(errors)) < 30e-6
+    assert len(sweep.samples) > 20
+    assert sweep.samples.shape[1] == 2
+    with pytest.raises(ValueError, match="outside the sweep"):
+        sweep.position_at(end + 0.1)
+    # Outside of start and stop there is room for the ramps, and the rail has come to rest behind them.
+    assert abs(homed.carriage() - stop) > run_up_distance(speed, ACCELERATION)
+
+
+@pytest.mark.wire
+def test_a_sweep_starts_only_where_its_start_up_fits(homed: Bench) -> None:
+    with pytest.raises(InterlockError, match="sweep_start"):
+        homed.rail.sweep(0.03, 0.06, 0.02)
+
+
+@pytest.mark.wire
+def test_stop_overtakes_a_running_motion(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.09, speed=0.01)
+    with pytest.raises(InterlockError, match="another motion"):
+        homed.rail.move_to(0.01)
+    homed.clock.sleep(1.0)
+    homed.rail.stop()
+    homed.rail.stop()
+    with pytest.raises(Aborted):
+        motion.wait(5.0)
+    homed.clock.sleep(0.5)
+    stands = homed.carriage()
+    assert 0.005 < stands < 0.05
+    homed.clock.sleep(0.5)
+    assert homed.carriage() == stands
+    homed.rail.move_to(0.01).wait(10.0)
+    assert homed.carriage() == pytest.approx(0.01, abs=1e-6)
+
+
+@pytest.mark.wire
+def test_a_stopped_search_leaves_the_rail_unhomed(bench: Bench) -> None:
+    motion = bench.rail.home()
+    bench.rail.stop()
+    with pytest.raises(Aborted):
+        motion.wait(5.0)
+    assert not bench.rail.state().homed
+    bench.rail.home().wait(20.0)
+    assert bench.rail.state().homed
+
+
+@pytest.mark.wire
+def test_a_wait_that_runs_out_stops_the_rail(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.09, speed=0.005)
+    with pytest.raises(DeadlineError, match="was stopped"):
+        motion.wait(1.0)
+    homed.clock.sleep(0.5)
+    assert homed.rail.state().velocity == 0.0
+    assert homed.carriage() < 0.05
+
+
+@pytest.mark.wire
+def test_a_lost_reply_is_asked_for_once_more_and_counted(homed: Bench) -> None:
+    homed.peer.fault("rail.drop_reply")
+    homed.rail.move_to(0.03).wait(20.0)
+    assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
+    assert homed.rail.statistics.errors["retries"] == 1
+    assert homed.rail.statistics.errors["timeouts"] == 1
+
+
+@pytest.mark.wire
+def test_a_limit_switch_on_the_way_is_a_fault_that_names_it(bench: Bench) -> None:
+    rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    rail.home().wait(20.0)
+    with pytest.raises(DeviceFault, match="right limit switch") as caught:
+        rail.move_to(0.11).wait(20.0)
+    assert caught.value.code == "rail.limit_switch"
+    with pytest.raises(InterlockError, match="home"):
+        rail.move_to(0.05)
+    rail.close()
+
+
+@pytest.mark.wire
+def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.05, speed=0.02)
+    homed.model.move_to(homed.world.now(), 1000)
+    with pytest.raises(DeviceFault, match="changed the module's target"):
+        motion.wait(20.0)
+
+
+@pytest.mark.wire
+def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.09, speed=0.005)
+    homed.peer.stop()
+    with pytest.raises(DeviceFault) as caught:
+        motion.wait(100.0)
+    assert caught.value.code == "rail.link_lost"
+    with pytest.raises(DeviceFault):
+        homed.rail.close()
+    homed.rail.close()
+    with pytest.raises(NotConnectedError):
+        homed.rail.state()
+
+
+@pytest.mark.wire
+def test_a_pseudo_terminal_does_as_well() -> None:
+    clock = Clock(SPEED)
+    peer = TmclPeer(RailModel(RailParams(), np.random.default_rng(1)), WorldClock(SPEED), pty=True)
+    peer.start()
+    try:
+        assert peer.pty is not None
+        rail = connect(peer.pty, clock)
+        rail.home().wait(20.0)
+        assert rail.state().position == 0.0
+        rail.close()
+    finally:
+        peer.stop()
+
+
+def test_a_port_that_is_not_there_is_named() -> None:
+    with pytest.raises(NotConnectedError, match="/dev/no-such-port"):
+        connect("/dev/no-such-port", Clock())
+
+
+@pytest.mark.wire
+def test_a_silent_module_is_a_deadline(bench: Bench) -> None:
+    with pytest.raises(DeadlineError, match="module address 9"):
+        connect(bench.peer.url, bench.clock, address=9)
+
+
+# --- a module that answers badly ---
+
+
+@pytest.fixture
+def module() -> Iterator[Callable[[Callable[[bytes], bytes]], str]]:
+    """Starts a module that gives `answer(request)` to each request; returns its URL."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    threads: list[threading.Thread] = []
+
+    def start(answer: Callable[[bytes], bytes]) -> str:
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                while request := connection.recv(9):
+                    connection.sendall(answer(request))
+
+        threads.append(threading.Thread(target=serve, daemon=True))
+        threads[-1].start()
+        return f"socket://127.0.0.1:{listener.getsockname()[1]}"
+
+    yield start
+    for thread in threads:
+        thread.join(2.0)
+        assert not thread.is_alive()
+    listener.close()
+
+
+def reply(request: bytes, value: int = 0, status: int = 100) -> bytes:
+    if request[1] == 136:
+        return b"\x021260V112"
+    body = bytes([2, request[0], status, request[1]]) + value.to_bytes(4, "big", signed=True)
+    return body + bytes([sum(body) & 0xFF])
+
+
+@pytest.mark.wire
+def test_a_left_over_answer_is_never_taken_for_the_next_ones(module: Callable[..., str]) -> None:
+    # To every request this module sends its answer and, unasked, an older position of 51.2 mm behind it.
+    def answer(request: bytes) -> bytes:
+        return reply(request, 0) + reply(bytes([1, 6, 1, 0]), 1_310_720)
+
+    rail = connect(module(answer), Clock())
+    assert [rail.state().position for _ in range(3)] == [0.0, 0.0, 0.0]
+    assert rail.statistics.errors["stale_input"] >= 3
+    rail.close()
+
+
+@pytest.mark.wire
+def test_answers_to_another_command_are_refused_twice_then_reported(module: Callable[..., str]) -> None:
+    def answer(request: bytes) -> bytes:
+        return reply(request) if request[1] != 6 else reply(bytes([1, 5]), 7)
+
+    rail = connect(module(answer), Clock())
+    with pytest.raises(DeadlineError, match="answer to command 5 instead of 6"):
+        rail.state()
+    assert rail.statistics.errors["bad_replies"] == 2
+    rail.close()
+
+
+@pytest.mark.wire
+def test_a_refusal_of_the_module_is_a_fault_in_words(module: Callable[..., str]) -> None:
+    with pytest.raises(DeviceFault, match="invalid value") as caught:
+        connect(module(lambda request: reply(request, status=4)), Clock())
+    assert caught.value.code == "tmcl.refused"
