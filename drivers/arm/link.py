@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -65,12 +64,12 @@ class ArmLink:
         self._reader = threading.Thread(target=self._read, name=f"{name} link", daemon=True)
         self._reader.start()
         self._transmit(setup)
-        answered = up.done.wait(connect_deadline)
-        self._connected = answered and self.lost is None and up.problem is None
-        if not self._connected:
+        up.done.wait(connect_deadline)
+        reason = f"no answer within {connect_deadline:g} s" if not up.done.is_set() else (up.problem or ("", ""))[1]
+        if reason:
             self._closing = True
-            self._kill()
-            reason = up.problem[1] if up.problem is not None else f"no answer within {connect_deadline:g} s"
+            self._process.kill()
+            self._end()
             raise NotConnectedError(
                 name,
                 f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its address "
@@ -110,7 +109,7 @@ class ArmLink:
             self._transmit(Request(number, "close"))
             pending.done.wait(deadline)
         self._fail("it was closed")
-        self._kill()
+        self._end()
 
     # --- inside ---
 
@@ -158,6 +157,7 @@ class ArmLink:
             case Reply():
                 with self._lock:
                     pending = self._pending.pop(message.number, None)
+                self._connected = self._connected or message.problem is None
                 if pending is not None:
                     pending.problem = message.problem
                     pending.done.set()
@@ -201,7 +201,7 @@ class ArmLink:
         lines = self._errors.read().decode("utf-8", "replace").strip().splitlines()
         return lines[-1] if lines else ""
 
-    def _kill(self) -> None:
+    def _end(self) -> None:
         try:
             self._process.wait(0.5)
         except subprocess.TimeoutExpired:
@@ -217,13 +217,8 @@ def switch_off(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
     """Switch outputs of the arm off through a process of its own that needs nothing else; False if that failed."""
     command = [sys.executable, "-m", "drivers.arm.ur_child", "--off", address, ",".join(map(str, outputs))]
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
-    begun = time.monotonic()
-    while time.monotonic() - begun < deadline:
-        try:
-            left = deadline - (time.monotonic() - begun)
-            done = subprocess.run(command, env=environment, capture_output=True, timeout=left, check=False)
-        except subprocess.TimeoutExpired:
-            return False
-        if done.returncode == 0:
-            return True
-    return False
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=deadline, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0

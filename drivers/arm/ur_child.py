@@ -163,6 +163,9 @@ class Child:
     def _send(self, message: Reply | Ended | Snapshot | Lost) -> None:
         try:
             with self._sending:
+                if isinstance(message, Ended):
+                    # The owner must not see a state from before the end of a motion that it knows to have ended.
+                    self._pipe.send(self._snapshot)
                 self._pipe.send(message)
         except OSError:
             # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.

@@ -25,6 +25,7 @@ _KICK_S = 0.1
 _SLIP_S = 0.02
 _BLIND_S = 0.1
 _SETTLE_S = 1.0
+_REST_S = 0.02
 _JOINT_TOLERANCE, _PLACE_TOLERANCE, _TURN_TOLERANCE = 2e-3, 1e-3, 2e-3
 
 End = tuple[str, str]
@@ -166,12 +167,15 @@ class ControlThread:
             self._clock.sleep(PERIOD)
 
     def _settled(self, missed: Callable[[Snapshot], str]) -> End:
-        """Wait for standstill at the target."""
-        deadline = time.monotonic() + _SETTLE_S
+        """Wait until the arm has stood at the target for a moment."""
+        standing = time.monotonic()
+        deadline = standing + _SETTLE_S
         while True:
             snapshot = self._latest()
             text = missed(snapshot) or ("" if _at_rest(snapshot) else "the arm does not come to rest")
-            if not text:
+            if text:
+                standing = time.monotonic()
+            elif snapshot.stamp - standing > _REST_S:
                 return "arrived", ""
             if time.monotonic() > deadline:
                 return self._problem() or ("arm.not_arrived", text)
@@ -250,9 +254,21 @@ class ControlThread:
             return code, ""
         if snapshot.mode != MODE_RUNNING:
             return "arm.not_powered", f"robot mode {snapshot.mode}"
-        if self._control is None or not self._control.isProgramRunning():
+        if self._control is None:
             return "arm.program_stopped", ""
-        return None
+        return None if self._control.isProgramRunning() else self._why_ended()
+
+    def _why_ended(self) -> tuple[str, str]:
+        """Why the program does not run: its end may be seen a few packets before its cause."""
+        deadline = time.monotonic() + _BLIND_S
+        while time.monotonic() < deadline:
+            snapshot = self._latest()
+            if code := safety_code(snapshot.safety_bits):
+                return code, ""
+            if snapshot.mode != MODE_RUNNING:
+                return "arm.not_powered", f"robot mode {snapshot.mode}"
+            self._clock.sleep(PERIOD)
+        return "arm.program_stopped", ""
 
     def _brake(self) -> tuple[str, str] | None:
         """Bring the arm to rest; None once it is."""

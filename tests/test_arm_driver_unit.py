@@ -1,0 +1,208 @@
+"""What the arm driver refuses before anything is sent, and the small pieces under it."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.arm.dashboard import Dashboard
+from drivers.arm.limits import ArmLimits
+from drivers.arm.messages import safety_code
+from drivers.arm.motion import UrMotion, fault
+from drivers.arm.trajectory import Trajectory, pose_difference
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
+
+LIMITS = ArmLimits()
+REST = np.array([0.0, -1.5, -1.5, -1.5, 1.5, 0.0])
+
+
+def test_angles_inside_the_limits_pass_and_others_are_named_with_value_range_and_unit():
+    assert LIMITS.check_joints("arm", REST) is not None
+    with pytest.raises(LimitError, match=r"angle of joint 3 400 deg is outside -360 deg to 360 deg"):
+        LIMITS.check_joints("arm", np.radians([0, 0, 400, 0, 0, 0]))
+
+
+@pytest.mark.parametrize("joints", [np.zeros(5), np.full(6, np.nan), np.zeros((2, 6))])
+def test_anything_but_six_finite_angles_is_refused(joints):
+    with pytest.raises(LimitError, match="6 finite numbers"):
+        LIMITS.check_joints("arm", joints)
+
+
+def test_a_pose_out_of_reach_is_refused():
+    with pytest.raises(LimitError, match=r"distance of the flange from the base 2000 mm is outside 0 mm to 1450 mm"):
+        LIMITS.check_pose("arm", np.array([2.0, 0, 0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "message"),
+    [
+        (0.0, 1.0, "joint speed 0 deg/s"),
+        (-1.0, 1.0, "joint speed"),
+        (4.0, 1.0, "to 180 deg/s"),
+        (1.0, 9.0, "acceleration"),
+    ],
+)
+def test_speeds_and_accelerations_have_limits(speed, acceleration, message):
+    with pytest.raises(LimitError, match=message):
+        LIMITS.check_joint_move("arm", speed, acceleration)
+
+
+def test_a_payload_too_heavy_is_refused():
+    with pytest.raises(LimitError, match=r"payload 13 kg is outside 0 kg to 12\.5 kg"):
+        LIMITS.check_payload("arm", 13.0, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("times", "joints", "message"),
+    [
+        ([0.0], [REST], "at least 2"),
+        ([0.0, 1.0], [REST[:5], REST[:5]], "at least 2"),
+        ([0.1, 1.0], [REST, REST], "begin at 0 s"),
+        ([0.0, 1.0, 1.0], [REST, REST, REST], "increase"),
+        ([0.0, np.inf], [REST, REST], "not finite"),
+        ([0.0, 1.0], [REST, REST + 8], "angle of joint 1 on the trajectory"),
+        (
+            [0.0, 0.01],
+            [REST, REST + np.array([0, 0.1, 0, 0, 0, 0])],
+            r"joint 2 would turn at 572\.958 deg/s at 0\.000 s",
+        ),
+    ],
+)
+def test_a_trajectory_that_cannot_be_driven_is_refused(times, joints, message):
+    with pytest.raises(LimitError, match=message):
+        LIMITS.check_trajectory("arm", np.array(times), np.array(joints))
+
+
+def test_a_trajectory_is_straight_between_its_points_and_ends_at_its_last():
+    trajectory = Trajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0,) * 6])
+    assert trajectory.at(-1.0) == (0.0,) * 6
+    assert trajectory.at(0.25) == pytest.approx((0.25,) * 6)
+    assert trajectory.at(2.0) == pytest.approx((3.0,) * 6)
+    assert trajectory.at(99.0) == (5.0,) * 6
+
+
+def test_pose_difference_agrees_with_an_independent_one():
+    generator = np.random.default_rng(1)
+    for _ in range(50):
+        a, b = generator.normal(size=(2, 6))
+        way, turn = pose_difference(tuple(a), tuple(b))
+        assert way == pytest.approx(np.linalg.norm(a[:3] - b[:3]))
+        between = Rotation.from_rotvec(a[3:]).inv() * Rotation.from_rotvec(b[3:])
+        assert turn == pytest.approx(between.magnitude(), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("bit", "code"),
+    [
+        (2, "arm.protective_stop"),
+        (4, "arm.safeguard_stop"),
+        (5, "arm.emergency_stop"),
+        (6, "arm.emergency_stop"),
+        (7, "arm.emergency_stop"),
+        (8, "arm.safety_fault"),
+        (9, "arm.safety_fault"),
+    ],
+)
+def test_safety_bits_have_the_meaning_of_the_protocol_sheet(bit, code):
+    assert safety_code(1 << bit) == code
+    assert safety_code(1) == ""
+
+
+def test_an_emergency_stop_outranks_a_protective_stop():
+    assert safety_code(1 << 2 | 1 << 6) == "arm.emergency_stop"
+
+
+def test_only_some_faults_can_be_cleared_by_the_driver():
+    assert fault("arm", "arm.protective_stop").recoverable
+    assert not fault("arm", "arm.emergency_stop").recoverable
+    assert "release the button" in str(fault("arm", "arm.emergency_stop"))
+
+
+def motion(stops):
+    return UrMotion("arm", "move", 1, Clock(), lambda: stops.append("stop"))
+
+
+def test_a_motion_that_arrived_can_be_waited_for_twice():
+    moving = motion([])
+    assert not moving.done
+    moving.end("arrived")
+    moving.wait(0.0)
+    moving.wait(0.0)
+    assert moving.done
+    assert not moving.contact
+
+
+def test_a_motion_that_ended_at_its_force_limit_says_so_without_an_error():
+    moving = motion([])
+    moving.end("contact")
+    moving.wait(0.0)
+    assert moving.contact
+
+
+def test_a_motion_that_takes_too_long_is_stopped():
+    stops = []
+    with pytest.raises(DeadlineError, match=r"did not end within 0\.01 s and was stopped"):
+        motion(stops).wait(0.01)
+    assert stops == ["stop"]
+
+
+def test_a_stopped_or_failed_motion_never_returns():
+    stopped, failed = motion([]), motion([])
+    stopped.end("stopped")
+    failed.end("arm.protective_stop")
+    failed.end("arrived")
+    with pytest.raises(Aborted):
+        stopped.wait(1.0)
+    with pytest.raises(DeviceFault) as caught:
+        failed.wait(1.0)
+    assert caught.value.code == "arm.protective_stop"
+
+
+@pytest.fixture
+def server():
+    """A dashboard server on a free loopback address whose behaviour a test sets."""
+    for number in itertools.count(200):
+        listener = socket.socket()
+        try:
+            listener.bind((f"127.0.0.{number}", 29999))
+            break
+        except OSError:
+            listener.close()
+    listener.listen()
+    yield listener
+    listener.close()
+
+
+def test_the_dashboard_answers_line_by_line_over_one_connection(server):
+    def serve():
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Connected\n")
+            for question in client.makefile("rb"):
+                client.sendall(b"you said " + question)
+
+    threading.Thread(target=serve, daemon=True).start()
+    dashboard = Dashboard("arm", server.getsockname()[0])
+    assert dashboard.ask("robotmode") == "you said robotmode"
+    assert dashboard.ask("stop") == "you said stop"
+    dashboard.close()
+
+
+def test_a_silent_dashboard_is_a_deadline_and_a_missing_one_is_not_connected(server):
+    dashboard = Dashboard("arm", server.getsockname()[0], timeout=0.05)
+    with pytest.raises(DeadlineError, match=r"did not answer 'stop' within 0\.05 s"):
+        dashboard.ask("stop")
+    with pytest.raises(NotConnectedError, match=r"127\.255\.0\.9:29999 is not reachable"):
+        Dashboard("arm", "127.255.0.9").ask("stop")
+
+
+def test_a_clock_that_runs_faster_leaves_the_wire_its_time():
+    moving = UrMotion("arm", "move", 1, Clock(rate=100.0), lambda: None)
+    threading.Timer(0.1, lambda: moving.end("arrived")).start()
+    moving.wait(1.0)

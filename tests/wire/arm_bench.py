@@ -1,0 +1,99 @@
+"""A simulated arm in a process of its own for the tests of the arm driver, above a stiff table if asked.
+
+Commands come on standard input, one a line, and are answered by one JSON line each: the name of a fault, `reset`
+(as after switching on), `input INDEX 0|1`, or `show` for what the arm itself knows.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.peers.rtde import RtdePeer
+
+STIFFNESS = 2e4
+
+
+class ArmBench:
+    """Starts the process; `address` is where the arm answers. To be used as a context."""
+
+    def __init__(self, *, speed: float = 1.0, table: float | None = None) -> None:
+        arguments = [str(speed), "none" if table is None else str(table)]
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, *arguments],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path)),
+        )  # fmt: skip
+        self.address = self._line()["address"]
+
+    def __enter__(self) -> ArmBench:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.process.send_signal(signal.SIGCONT)
+        self.process.kill()
+        self.process.communicate(timeout=10)
+
+    def ask(self, command: str) -> dict:
+        """Send one command and return its answer."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(command + "\n")
+        self.process.stdin.flush()
+        return self._line()
+
+    def kill(self) -> None:
+        """End the arm as a power loss would."""
+        self.process.kill()
+        self.process.wait(10)
+
+    def _line(self) -> dict:
+        assert self.process.stdout is not None
+        return json.loads(self.process.stdout.readline())
+
+
+def _table(height: float):
+    def contact(base_from_flange):
+        depth = height - base_from_flange[2, 3]
+        return np.array([0.0, 0.0, max(0.0, STIFFNESS * depth), 0.0, 0.0, 0.0])
+
+    return contact
+
+
+def _main(speed: float, table: float | None) -> None:
+    clock = WorldClock(speed)
+    model = ArmModel(ArmParams(unlock_delay=0.3, force_noise=(0.2, 0.02)), np.random.default_rng(0), clock)
+    if table is not None:
+        model.contact = _table(table)
+    peer = RtdePeer(model, clock)
+    peer.start()
+    print(json.dumps({"address": peer.address}), flush=True)
+    for line in sys.stdin:
+        answer: dict[str, object] = {}
+        match line.split():
+            case ["reset"]:
+                model.clear()
+                model.halt()
+                model.drive.q, model.drive.qd = model.params.initial_q.copy(), np.zeros(6)
+                model.write_digital_outputs(-1, 0)
+            case ["input", index, value]:
+                model.set_digital_input(int(index), value == "1")
+            case ["show"]:
+                answer = {
+                    "outputs": model.digital_outputs, "moving": model.moving, "q": model.drive.q.tolist(),
+                    "payload": model.payload[0], "tcp": model.drive.flange_from_tcp.tolist(),
+                }  # fmt: skip
+            case [fault]:
+                model.fault(fault)
+        print(json.dumps(answer), flush=True)
+    peer.stop()
+
+
+if __name__ == "__main__":
+    _main(float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]))
