@@ -1,0 +1,260 @@
+"""The vehicle's driver on the simulated CAN bus, its odometry and its stops against the simulated vehicle."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import can
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
+from drivers.interfaces import Vehicle
+from drivers.vehicle.agilex import AgilexVehicle
+from sim_backends.clock import WorldClock
+from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.peers.agilex import AgilexPeer
+
+pytestmark = pytest.mark.wire
+
+SPEED = 5.0
+TRACK = 0.583
+
+
+@dataclass
+class Bench:
+    """A vehicle on its bus: the driver and the vehicle's truth."""
+
+    vehicle: AgilexVehicle
+    model: VehicleModel
+    peer: AgilexPeer
+    world: WorldClock
+    clock: Clock
+
+    def truth(self) -> tuple[float, float, float]:
+        """True x, y in m and yaw in rad."""
+        return self.model.planar(self.world.now())
+
+    def true_speed(self) -> float:
+        """True wheel speed in m/s."""
+        return self.model.feedback(self.world.now()).speed
+
+    def drive_for(self, seconds: float, speed: float, yaw_rate: float = 0.0) -> None:
+        """Keep driving as a controller does, renewing the command."""
+        end = self.clock.now() + seconds
+        while self.clock.now() < end:
+            self.vehicle.drive(speed, yaw_rate)
+            self.clock.sleep(0.05)
+
+    def until(self, happened: Callable[[], bool], timeout: float = 5.0) -> None:
+        """Wait for something, at most `timeout` s."""
+        end = self.clock.now() + timeout
+        while not happened():
+            assert self.clock.now() < end
+            self.clock.sleep(0.02)
+
+
+def connect(peer: AgilexPeer, clock: Clock) -> AgilexVehicle:
+    return AgilexVehicle(
+        "vehicle", peer.interface, peer.channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=clock
+    )
+
+
+def threads() -> list[str]:
+    return [
+        thread.name for thread in threading.enumerate() if thread.name in ("vehicle receiver", "vehicle keep-alive")
+    ]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    world, clock = WorldClock(SPEED), Clock(SPEED)
+    model = VehicleModel(VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK), np.random.default_rng(5))
+    peer = AgilexPeer(model, world)
+    peer.start()
+    vehicle = connect(peer, clock)
+    try:
+        yield Bench(vehicle, model, peer, world, clock)
+    finally:
+        try:
+            vehicle.close()
+        finally:
+            peer.stop()
+    assert threads() == []
+
+
+@pytest.fixture
+def enabled(bench: Bench) -> Bench:
+    bench.vehicle.enable()
+    return bench
+
+
+def test_the_vehicle_says_which_versions_it_has(bench: Bench) -> None:
+    vehicle: Vehicle = bench.vehicle
+    identity = vehicle.identity()
+    assert identity.firmware == "controller 204, drivers 110"
+    assert identity.address == f"slcan:{bench.peer.channel}"
+    assert 0.0 < vehicle.ping() < 0.5
+    assert vehicle.statistics.round_trips_s
+
+
+def test_it_starts_in_standby_and_does_not_move_before_it_is_enabled(bench: Bench) -> None:
+    assert not bench.vehicle.state().command_mode
+    with pytest.raises(InterlockError, match="enable"):
+        bench.vehicle.drive(0.1, 0.0)
+    bench.vehicle.enable()
+    state = bench.vehicle.state()
+    assert state.command_mode
+    assert not state.braked
+    assert state.battery_volts == pytest.approx(26.4)
+
+
+def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
+    enabled.drive_for(3.0, 0.3, 0.4)
+    state = enabled.vehicle.state()
+    assert (state.speed, state.yaw_rate) == pytest.approx((0.3, 0.4), abs=0.005)
+    enabled.vehicle.stop()
+    assert enabled.true_speed() == 0.0
+    x, y, yaw = enabled.truth()
+    assert math.hypot(x, y) > 0.5
+    enabled.until(lambda: abs(enabled.vehicle.state().x - x) < 0.003)
+    state = enabled.vehicle.state()
+    assert (state.x, state.y) == pytest.approx((x, y), abs=0.005)
+    assert state.yaw == pytest.approx(yaw, abs=0.005)
+
+
+def test_limits_are_checked_before_anything_is_sent(enabled: Bench) -> None:
+    with pytest.raises(LimitError, match=r"speed 600 mm/s is outside -500 mm/s to 500 mm/s"):
+        enabled.vehicle.drive(0.6, 0.0)
+    with pytest.raises(LimitError, match=r"yaw rate .* deg/s"):
+        enabled.vehicle.drive(0.0, -1.0)
+    with pytest.raises(LimitError):
+        enabled.vehicle.drive(float("nan"), 0.0)
+    enabled.clock.sleep(0.3)
+    assert enabled.true_speed() == 0.0
+
+
+def test_a_velocity_that_nobody_renews_is_dropped(enabled: Bench) -> None:
+    enabled.vehicle.drive(0.3, 0.0)
+    enabled.until(lambda: enabled.true_speed() > 0.0)
+    enabled.until(lambda: enabled.true_speed() == 0.0)
+    assert enabled.vehicle.statistics.errors["dead_man"] == 1
+    # The keep-alive goes on, so it was the driver's dead-man and not the vehicle's own time-out.
+    assert enabled.truth()[0] < 0.3
+
+
+def test_stop_returns_when_the_vehicle_stands(enabled: Bench) -> None:
+    enabled.drive_for(1.5, 0.5)
+    enabled.vehicle.stop()
+    assert enabled.true_speed() == 0.0
+    enabled.vehicle.stop()
+    assert enabled.vehicle.state().speed == 0.0
+
+
+def test_the_brake_holds_until_it_is_released(enabled: Bench) -> None:
+    enabled.drive_for(0.5, 0.3)
+    enabled.vehicle.brake()
+    enabled.until(lambda: enabled.model.feedback(enabled.world.now()).braked)
+    assert enabled.vehicle.state().braked
+    with pytest.raises(InterlockError, match="brake is locked"):
+        enabled.vehicle.drive(0.1, 0.0)
+    enabled.vehicle.enable()
+    enabled.drive_for(0.5, 0.3)
+    assert enabled.true_speed() > 0.0
+
+
+def test_an_emergency_stop_is_a_fault_that_names_it(enabled: Bench) -> None:
+    enabled.drive_for(0.5, 0.3)
+    enabled.peer.fault("vehicle.emergency_stop")
+    enabled.until(lambda: enabled.vehicle.state().emergency_stop)
+    with pytest.raises(DeviceFault, match="emergency stop") as caught:
+        enabled.vehicle.drive(0.1, 0.0)
+    assert caught.value.code == "vehicle.emergency_stop"
+    with pytest.raises(DeviceFault):
+        enabled.vehicle.enable()
+    enabled.peer.clear()
+    enabled.vehicle.enable()
+    enabled.drive_for(0.3, 0.2)
+    assert enabled.true_speed() > 0.0
+
+
+def test_a_motor_fault_is_reported_with_its_bits_and_cleared_by_enabling(enabled: Bench) -> None:
+    enabled.peer.fault("vehicle.motor_fault")
+    enabled.until(lambda: enabled.vehicle.state().error_bits == 1)
+    with pytest.raises(DeviceFault, match="0x0001") as caught:
+        enabled.vehicle.drive(0.1, 0.0)
+    assert caught.value.code == "vehicle.error"
+    assert caught.value.recoverable
+    enabled.vehicle.enable()
+    assert enabled.vehicle.state().error_bits == 0
+
+
+def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> None:
+    enabled.drive_for(0.5, 0.3)
+    enabled.peer.fault("can.bus_off")
+    with pytest.raises(DeviceFault, match="CAN bus") as caught:
+        enabled.drive_for(2.0, 0.3)
+    assert caught.value.code == "vehicle.link_lost"
+    with pytest.raises(DeviceFault):
+        enabled.vehicle.state()
+    with pytest.raises(DeviceFault):
+        enabled.vehicle.stop()
+    # Without commands the vehicle stops by itself.
+    enabled.until(lambda: enabled.true_speed() == 0.0)
+    enabled.vehicle.enable()
+    enabled.drive_for(0.5, 0.3)
+    assert enabled.true_speed() > 0.0
+    x, _, _ = enabled.truth()
+    # Odometry has counted the way that was rolled while the bus was down.
+    assert enabled.vehicle.state().x == pytest.approx(x, abs=0.05)
+    assert enabled.vehicle.statistics.errors["link_lost"] == 1
+    assert enabled.vehicle.statistics.errors["reopened"] == 1
+
+
+def test_silence_is_never_taken_for_a_fresh_reading(enabled: Bench) -> None:
+    enabled.peer._stopping.set()  # the vehicle falls silent while the bus stays up
+    enabled.clock.sleep(3.0)
+    with pytest.raises(DeadlineError, match="old"):
+        enabled.vehicle.state()
+    with pytest.raises(DeviceFault, match="no feedback") as caught:
+        enabled.vehicle.drive(0.1, 0.0)
+    assert caught.value.code == "vehicle.silent"
+    with pytest.raises(DeadlineError, match="standstill"):
+        enabled.vehicle.close()
+
+
+def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
+    world = WorldClock(1.0)
+    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), world)
+    peer.start()
+    observer = can.Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0, timeout=0.005)
+    try:
+        vehicle = connect(peer, Clock())
+        vehicle.enable()
+        stamps = []
+        while len(stamps) < 20:
+            message = observer.recv(1.0)
+            assert message is not None
+            if message.arbitration_id == 0x111:
+                stamps.append(message.timestamp)
+        assert np.median(np.diff(stamps)) == pytest.approx(0.020, abs=0.006)
+        vehicle.close()
+        assert threads() == []
+    finally:
+        observer.shutdown()
+        peer.stop()
+
+
+def test_nobody_on_the_bus_is_named() -> None:
+    with pytest.raises(NotConnectedError, match="no vehicle reports on virtual:empty"):
+        AgilexVehicle("vehicle", "virtual", "empty", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
+    with pytest.raises(NotConnectedError, match="cannot be opened"):
+        AgilexVehicle(
+            "vehicle", "slcan", "socket://127.0.0.1:1", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock()
+        )
+    with pytest.raises(ConfigError, match="carrier-pigeon"):
+        AgilexVehicle("vehicle", "carrier-pigeon", "x", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
