@@ -33,11 +33,11 @@ def read_image(path: Path, shape: tuple[int, int] | None = None) -> Image:
         data = path.read_bytes()
     except OSError as error:
         raise RefusedError(f"{path}: cannot be read: {error.strerror}. Check the file") from error
+    if _is_cut(data):
+        raise RefusedError(f"{path}: is cut off after {len(data)} bytes. Copy it again")
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     if decoded is None:
         raise RefusedError(f"{path}: is not a picture that can be read ({len(data)} bytes). Take it again")
-    if _is_cut(data):
-        raise RefusedError(f"{path}: is cut off after {len(data)} bytes. Copy it again")
     image: Image = decoded.astype(np.uint8, copy=False)
     if shape is not None and image.shape != shape:
         raise RefusedError(

@@ -1,0 +1,336 @@
+"""The camera driver on the simulated camera's wire: fresh frames, true times, known losses; and folders of pictures."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera.clock_map import ClockMap, Latch
+from drivers.camera.folder import FolderCamera, image_files, read_image
+from drivers.camera.stream import StreamCamera
+from drivers.clock import Clock
+from drivers.errors import (
+    Aborted,
+    ConfigError,
+    DeadlineError,
+    DeviceFault,
+    InterlockError,
+    LimitError,
+    NotConnectedError,
+    RefusedError,
+)
+from drivers.interfaces import Camera, Frame, FrameStream
+from sim_backends.clock import WorldClock
+from sim_backends.peers.frames import CameraSpec, FramePeer
+
+SPEED = 4.0
+SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)
+
+
+@dataclass
+class Bench:
+    """A camera on its wire whose pictures carry the world time that they show."""
+
+    camera: StreamCamera
+    peer: FramePeer
+    world: WorldClock
+    clock: Clock
+
+    def shown(self, frame: Frame) -> float:
+        """Host time that the picture shows, as drawn into its first pixels."""
+        world = float(np.frombuffer(frame.image[0, :8].tobytes(), np.float64)[0])
+        return world + self.clock.now() - self.world.now()
+
+
+def render(t_mid: float, exposure: float) -> NDArray[np.uint8]:
+    image = np.full((48, 64), 100, np.uint8)
+    image[0, :8] = np.frombuffer(np.float64(t_mid).tobytes(), np.uint8)
+    image[47, 63] = 200
+    return image
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    world, clock = WorldClock(SPEED), Clock(SPEED)
+    peer = FramePeer("scan_camera", world, render, SPEC)
+    peer.start()
+    camera = StreamCamera("scan_camera", peer.address, clock=clock, shape=(48, 64))
+    try:
+        yield Bench(camera, peer, world, clock)
+    finally:
+        camera.close()
+        peer.stop()
+    assert not [thread for thread in threading.enumerate() if thread.name == "scan_camera reader"]
+
+
+# --- clocks ---
+
+
+def test_clocks_are_mapped_by_the_shortest_round_trip() -> None:
+    device = ClockMap()
+    device.add([Latch(10.0, 500.0, 10.4), Latch(11.0, 501.002, 11.004), Latch(12.0, 502.0, 12.9)])
+    assert device.host_time(501.002) == pytest.approx(11.002)
+    assert device.uncertainty == pytest.approx(0.002)
+
+
+def test_the_devices_drift_is_learned_from_latches_far_apart() -> None:
+    device, drift = ClockMap(), 60e-6
+    for host in (0.0, 30.0, 120.0):
+        device.add([Latch(host - 1e-4, 7.0 + host * (1.0 + drift), host + 1e-4)])
+    assert device.drift == pytest.approx(-drift, rel=0.05)
+    assert device.host_time(7.0 + 150.0 * (1.0 + drift)) == pytest.approx(150.0, abs=3e-4)
+
+
+# --- frame stream ---
+
+
+@pytest.mark.wire
+def test_the_camera_says_who_it_is(bench: Bench) -> None:
+    camera: Camera = bench.camera
+    identity = camera.identity()
+    assert (identity.model, identity.serial, identity.firmware) == ("SimCam", "SIM000007-SCAN", "1.0")
+    assert identity.address == bench.peer.address
+    assert camera.shape == (48, 64)
+    assert 0.0 < camera.ping() < 0.5
+
+
+@pytest.mark.wire
+def test_a_grabbed_frame_was_exposed_after_the_call_and_its_time_is_true(bench: Bench) -> None:
+    bench.camera.configure(exposure=0.004, frame_rate=50.0)
+    for _ in range(3):
+        called = bench.clock.now()
+        frame = bench.camera.grab()
+        assert frame.image.shape == (48, 64)
+        assert frame.image.dtype == np.uint8
+        assert frame.image[47, 63] == 200
+        assert frame.exposure == 0.004
+        assert bench.shown(frame) > called
+        assert frame.mid_exposure == pytest.approx(bench.shown(frame), abs=0.002)
+        assert frame.received > frame.host_time
+
+
+@pytest.mark.wire
+def test_a_stream_is_complete_in_order_and_evenly_spaced(bench: Bench) -> None:
+    bench.camera.configure(exposure=0.002, frame_rate=100.0)
+    frames: list[Frame] = []
+    with bench.camera.stream() as stream:
+        reader: FrameStream = stream
+        for frame in reader:
+            frames.append(frame)
+            if len(frames) == 100:
+                break
+    assert np.all(np.diff([frame.frame_id for frame in frames]) == 1)
+    assert stream.lost == 0
+    assert np.diff([frame.host_time for frame in frames]) == pytest.approx(np.full(99, 0.01), abs=1e-5)
+    errors = [frame.mid_exposure - bench.shown(frame) for frame in frames]
+    assert np.max(np.abs(errors)) < 0.002
+    with pytest.raises(Aborted):
+        stream.next(0.1)
+
+
+@pytest.mark.wire
+def test_lost_frames_are_known(bench: Bench) -> None:
+    bench.camera.configure(exposure=0.002, frame_rate=100.0)
+    bench.peer.fault("camera.frame_loss", 2)
+    with bench.camera.stream() as stream:
+        first = stream.next(2.0)
+        assert (first.lost_before, stream.lost) == (2, 2)
+        bench.peer.fault("camera.frame_loss", 3)
+        gaps = [stream.next(2.0).lost_before for _ in range(50)]
+    assert [gap for gap in gaps if gap] == [3]
+    assert stream.lost == 5
+    assert bench.camera.statistics.errors["frames_lost"] == 5
+
+
+@pytest.mark.wire
+def test_pictures_that_nobody_takes_are_counted_as_lost_and_not_kept_for_ever(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.camera.stream._QUEUE_BYTES", 0)
+    bench.camera.configure(exposure=0.002, frame_rate=100.0)
+    with bench.camera.stream() as stream:
+        bench.clock.sleep(1.0)
+        frames = [stream.next(1.0) for _ in range(9)]
+        assert [frame.lost_before for frame in frames[:8]] == [0] * 8
+        assert frames[8].lost_before > 20
+        assert stream.lost == frames[8].lost_before
+
+
+@pytest.mark.wire
+def test_one_acquisition_at_a_time(bench: Bench) -> None:
+    with bench.camera.stream():
+        with pytest.raises(InterlockError, match="acquired already"):
+            bench.camera.grab()
+        with pytest.raises(InterlockError):
+            bench.camera.configure(0.002, 50.0)
+        with pytest.raises(InterlockError), bench.camera.stream():
+            pytest.fail("two streams")
+    assert bench.camera.grab().frame_id > 0
+
+
+@pytest.mark.wire
+def test_settings_are_checked_before_anything_is_sent(bench: Bench) -> None:
+    sent = len(bench.camera.statistics.round_trips_s)
+    with pytest.raises(LimitError, match=r"exposure 2000 ms is outside 0.02 ms to 1000 ms"):
+        bench.camera.configure(2.0, 0.1)
+    with pytest.raises(LimitError, match=r"frame rate 500 Hz"):
+        bench.camera.configure(0.001, 500.0)
+    with pytest.raises(LimitError, match=r"exposure 50 ms does not fit .* at most 10 ms"):
+        bench.camera.configure(0.05, 100.0)
+    assert len(bench.camera.statistics.round_trips_s) == sent
+
+
+@pytest.mark.wire
+def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
+    bench.camera.configure(exposure=0.5, frame_rate=0.5)
+    with bench.camera.stream() as stream:
+        stream.next(10.0)
+        stopper = threading.Timer(0.1, bench.camera.stop)
+        stopper.start()
+        with pytest.raises(Aborted):
+            stream.next(60.0)
+        stopper.join(2.0)
+
+
+@pytest.mark.wire
+def test_a_silent_camera_is_a_deadline(bench: Bench) -> None:
+    bench.camera.configure(exposure=0.002, frame_rate=100.0)
+    with bench.camera.stream() as stream:
+        stream.next(1.0)
+        bench.peer.fault("camera.silent")
+        with pytest.raises(DeadlineError, match=r"no frame within 0\.5 s"):
+            while True:
+                stream.next(0.5)
+        bench.peer.clear()
+        assert stream.next(2.0).frame_id > 1
+
+
+@pytest.mark.wire
+def test_a_camera_that_dies_is_lost_at_once(bench: Bench) -> None:
+    with bench.camera.stream() as stream:
+        stream.next(2.0)
+        bench.peer.stop()
+        before = bench.clock.now()
+        with pytest.raises(DeviceFault, match="camera lost") as caught:
+            while True:
+                stream.next(100.0)
+        assert bench.clock.now() - before < 10.0
+    assert caught.value.code == "camera.lost"
+    with pytest.raises(DeviceFault, match="camera lost"):
+        bench.camera.grab()
+    bench.camera.close()
+    with pytest.raises(NotConnectedError):
+        bench.camera.grab()
+
+
+@pytest.mark.wire
+def test_a_second_client_and_a_wrong_size_are_refused(bench: Bench) -> None:
+    with pytest.raises(DeviceFault, match="in use by another client"):
+        StreamCamera("second", bench.peer.address, clock=Clock())
+    assert bench.camera.grab().frame_id > 0
+    bench.camera.close()
+    with pytest.raises(ConfigError, match="64x48 pixels, configured are 1280x1024"):
+        StreamCamera("scan_camera", bench.peer.address, clock=Clock(), shape=(1024, 1280))
+
+
+@pytest.mark.wire
+def test_a_port_without_a_camera_is_named() -> None:
+    with pytest.raises(NotConnectedError, match=r"127\.0\.0\.1:1"):
+        StreamCamera("scan_camera", "127.0.0.1:1", clock=Clock())
+    with pytest.raises(ConfigError, match="HOST:PORT"):
+        StreamCamera("scan_camera", "nowhere", clock=Clock())
+
+
+@pytest.mark.wire
+def test_a_peer_of_another_protocol_is_recognised() -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.recv(1000)
+            connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+    server = threading.Thread(target=serve, daemon=True)
+    server.start()
+    with pytest.raises(DeviceFault, match="instead of b'CFS1'"):
+        StreamCamera("scan_camera", f"127.0.0.1:{listener.getsockname()[1]}", clock=Clock())
+    server.join(2.0)
+    listener.close()
+
+
+# --- folder ---
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for number in (1, 2, 10):
+        cv2.imwrite(str(tmp_path / f"frame{number}.png"), np.full((40, 60), number, np.uint8))
+    (tmp_path / "poses.csv").write_text("not a picture")
+    return tmp_path
+
+
+def test_a_folder_delivers_its_pictures_in_the_order_of_their_numbers(folder: Path) -> None:
+    camera: Camera = FolderCamera("recording", folder, clock=Clock())
+    assert camera.shape == (40, 60)
+    assert [path.name for path in image_files(folder)] == ["frame1.png", "frame2.png", "frame10.png"]
+    assert camera.grab().image[0, 0] == 1
+    with camera.stream() as stream:
+        assert [(frame.frame_id, int(frame.image[0, 0])) for frame in stream] == [(1, 2), (2, 10)]
+    with pytest.raises(DeviceFault, match="all 3 pictures"):
+        camera.grab()
+
+
+def test_bad_pictures_are_refused_by_name_one_by_one(folder: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 255, (40, 60), dtype=np.uint8)
+    cv2.imwrite(str(folder / "frame3.png"), noise)
+    whole = (folder / "frame3.png").read_bytes()
+    (folder / "frame3.png").write_bytes(whole[: len(whole) // 2])
+    cv2.imwrite(str(folder / "frame4.jpg"), noise)
+    whole = (folder / "frame4.jpg").read_bytes()
+    (folder / "frame4.jpg").write_bytes(whole[: 2 * len(whole) // 3])
+    (folder / "frame5.png").write_text("this is text")
+    (folder / "frame6.png").write_bytes(b"")
+    cv2.imwrite(str(folder / "frame7.png"), np.zeros((20, 30), np.uint8))
+    camera = FolderCamera("recording", folder, clock=Clock())
+    delivered, refused = [], []
+    for _ in range(8):
+        try:
+            delivered.append(int(camera.grab().image[0, 0]))
+        except RefusedError as error:
+            refused.append(str(error).replace(str(folder), "").lstrip("/"))
+    assert delivered == [1, 2, 10]
+    assert [text.split(":")[0] for text in refused] == [
+        "frame3.png",
+        "frame4.jpg",
+        "frame5.png",
+        "frame6.png",
+        "frame7.png",
+    ]
+    assert "cut off" in refused[0]
+    assert "cut off" in refused[1]
+    assert "not a picture" in refused[2]
+    assert "0 bytes" in refused[3]
+    assert "30x20 pixels instead of 60x40" in refused[4]
+
+
+def test_a_colour_picture_becomes_grey(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "colour.png"), np.full((5, 5, 3), (0, 0, 255), np.uint8))
+    assert read_image(tmp_path / "colour.png").shape == (5, 5)
+
+
+def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NotConnectedError, match="no pictures"):
+        FolderCamera("recording", tmp_path, clock=Clock())
+    with pytest.raises(NotConnectedError, match="not a folder"):
+        FolderCamera("recording", tmp_path / "missing", clock=Clock())
+    with pytest.raises(RefusedError, match=r"missing\.png"):
+        read_image(tmp_path / "missing.png")
