@@ -50,8 +50,10 @@ def _attempt(image: Image, spec: BoardSpec, window: int, offset: float, scale: i
     if grown is None:
         raise PictureRefused(Reason.NO_BOARD, f"no board: {len(blobs.centres)} dot-like spots, none in a lattice")
     index, places = grown
-    dots, sigma, scores = measure_dots(image, blobs.take(index))
-    board_places, assumed = identify(spec, _upright(places, dots.centres), np.where(np.isnan(sigma), 0.0, scores))
+    dots, sigma, scores = measure_dots(image, blobs.take(index), rounds=2)
+    board_places, assumed = identify(
+        spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
+    )
     known = np.asarray((board_places >= 0).all(axis=1), dtype=np.bool_)
     return _complete(image, spec, dots.take(known), board_places[known], assumed, scale)
 

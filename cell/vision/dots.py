@@ -26,11 +26,12 @@ def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
     mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REPLICATE)
     dark = (smooth.astype(np.int16) < mean.astype(np.int16) - int(offset)).astype(np.uint8)
-    contours, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     height, width = image.shape
     centres, shapes = [], []
-    for contour in contours:
-        if len(contour) < 8:
+    for number, contour in enumerate(contours):
+        # A contour with a parent is a hole, such as the middle of a ring.
+        if len(contour) < 8 or hierarchy[0, number, 3] >= 0:
             continue
         x, y, w, h = cv2.boundingRect(contour)
         if x == 0 or y == 0 or x + w == width or y + h == height or max(w, h) > 0.25 * max(width, height):
@@ -53,11 +54,11 @@ def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     return Blobs(np.array(centres).reshape(-1, 2), np.array(shapes).reshape(-1, 2, 2))
 
 
-def measure_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
-    """Dots re-measured from their edges, one standard deviation (n,) of each centre in px, and ring scores (n,).
+def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array, Array]:
+    """Dots re-measured from their edges, one standard deviation (n,) of each centre in px, and ring scores (n, 2).
 
-    A dot whose edge is not found all around gets the deviation NaN. The ring score is the brightness of the middle
-    between that of the dot (0) and that of the board around (1).
+    A dot whose edge is not found all around gets the deviation NaN. `rounds` of refinement: two to tell dots apart,
+    more to measure them.
     """
     picture = image.astype(np.float32)
     centres, shapes = start.centres.copy(), start.shapes.copy()
@@ -67,7 +68,7 @@ def measure_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
     design = np.column_stack([np.ones(RAYS), unit, np.cos(2 * angles), np.sin(2 * angles)])
     sigma = np.full(len(centres), np.nan)
     profiles = np.empty((len(centres), RAYS, SAMPLES))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         profiles = _sample(picture, centres, shapes, unit, rho)
         edge, good = _edges(profiles, rho)
         coefficients, sigma, kept = _harmonics(edge, good, design)
@@ -136,23 +137,33 @@ def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Arr
         weight = np.where(good & (np.abs(z) < 1), (1 - z * z) ** 2, 0.0)
     used = (weight > 0.2).sum(axis=1)
     # The rays that count must surround the dot: no gap of a third of the circle.
-    gap = np.array([_widest_gap(row > 0.2) for row in weight])
+    gap = _widest_gaps(weight > 0.2)
     kept = (used >= RAYS // 2) & (gap <= RAYS // 3) & (scatter < 0.15)
     return coefficients, scatter * np.sqrt(2.0 / np.maximum(used, 1)), kept
 
 
-def _widest_gap(used: NDArray[np.bool_]) -> int:
-    """Longest run of unused rays, around the circle."""
-    places = np.flatnonzero(used)
-    if len(places) == 0:
-        return len(used)
-    return int(np.diff(np.append(places, places[0] + len(used))).max()) - 1
+def _widest_gaps(used: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Longest run of unused rays (n,) around the circle, for rays (n, rays)."""
+    twice = np.concatenate([used, used], axis=1)
+    run = np.zeros(len(used), dtype=np.intp)
+    longest = np.zeros(len(used), dtype=np.intp)
+    for column in twice.T:
+        run = np.where(column, 0, run + 1)
+        longest = np.maximum(longest, run)
+    return longest
 
 
 def _ring_scores(profiles: Array, rho: Array) -> Array:
-    """Brightness of the middle (n,) between the dot's (0) and the board's (1)."""
+    """Two signs of a ring (n, 2): brightness of the middle between dot (0) and board (1), and missing darkness.
+
+    The second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it.
+    """
     middle = np.median(profiles[:, :, rho < 0.35].reshape(len(profiles), -1), axis=1)
     annulus = profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2)
     dark = np.median(annulus, axis=1)
     bright = np.median(profiles[:, :, (rho > 1.25) & (rho < 1.6)].reshape(len(profiles), -1), axis=1)
-    return np.asarray((middle - dark) / np.maximum(bright - dark, 1.0), dtype=np.float64)
+    near = rho < 1.5
+    mean = np.median(profiles[:, :, near], axis=1)
+    darkness = ((bright[:, None] - mean) * rho[near]).sum(axis=1) / np.maximum(bright, 1.0)
+    missing = 1 - darkness / max(float(np.median(darkness)), 1e-9)
+    return np.column_stack([(middle - dark) / np.maximum(bright - dark, 1.0), missing])

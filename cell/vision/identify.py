@@ -16,7 +16,8 @@ from cell.vision.pictures import PictureRefused, Reason
 
 Places = NDArray[np.intp]
 
-RING_SCORE = 0.30
+# Least ring scores of the three rings: brightness of the middle, missing darkness.
+RING_SCORES = (0.30, 0.12)
 RING_LEAD = 1.6
 MISSING_SHARE = 0.12
 
@@ -24,17 +25,24 @@ MISSING_SHARE = 0.12
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
     """Board places (n, 2) of lattice places (n, 2), and whether the order rests on an assumption.
 
-    `ring_scores` (n,) say how bright the middle of each dot is, 0 like a dot and 1 like the board. Entries that do
-    not belong to the board get (−1, −1). Raises PictureRefused.
+    `ring_scores` (n, 2) are the signs of rings of `measure_dots`. Entries that do not belong to the board get
+    (−1, −1). Raises PictureRefused.
     """
-    if spec.kind == "marked_dots":
-        return _by_rings(spec, places, ring_scores), False
-    return _by_edges(spec, places)
+    if spec.kind != "marked_dots":
+        return _by_edges(spec, places)
+    refused: PictureRefused | None = None
+    for scores, least in zip(ring_scores.T, RING_SCORES, strict=True):
+        try:
+            return _by_rings(spec, places, scores, least), False
+        except PictureRefused as reason:
+            refused = refused or reason
+    assert refused is not None
+    raise refused
 
 
-def _by_rings(spec: BoardSpec, places: Places, scores: Array) -> Places:
+def _by_rings(spec: BoardSpec, places: Places, scores: Array, least: float) -> Places:
     order = np.argsort(scores)[::-1]
-    if len(order) < 4 or scores[order[2]] < RING_SCORE or scores[order[2]] < RING_LEAD * max(scores[order[3]], 0.05):
+    if len(order) < 4 or scores[order[2]] < least or scores[order[2]] < RING_LEAD * max(scores[order[3]], 0.3 * least):
         raise PictureRefused(
             Reason.AMBIGUOUS,
             "the board's three rings are not all seen clearly, so its order is not certain; move nearer",

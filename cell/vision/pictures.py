@@ -16,7 +16,7 @@ from drivers.errors import RefusedError
 
 Image = NDArray[np.uint8]
 
-BLACK_DN = 16
+BLACK_DN = 10
 SATURATED_SHARE = 0.6
 
 
