@@ -17,7 +17,8 @@ from sim_backends.models.arm_kinematics import (
     pose_from_matrix,
     rotation_vector,
 )
-from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 
 TICK = 0.002
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ from enum import Enum, IntEnum
 import numpy as np
 
 from sim_backends.clock import WorldClock
-from sim_backends.history import History
-from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics, Matrix, Vector, rotation_matrix
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics, Matrix, Vector
 from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
+from sim_backends.models.arm_truth import TruePose
 
 Contact = Callable[[Matrix], Vector]
 """Wrench (6,) on the arm at the flange, base axes, N and N·m, for a true base_from_flange (4, 4)."""
@@ -86,7 +86,6 @@ class ArmModel:
         self.wrench = np.zeros(6)
         self.time = clock.now()
         self._speed_limits = (1.02 * params.speed_limits).tolist()
-        self._true_kinematics = Kinematics(params.dh + params.dh_error)
         self._rng = rng
         self._lock = threading.RLock()
         self._queue: deque[Motion] = deque()
@@ -95,14 +94,8 @@ class ArmModel:
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
-        self._error_from = self._draw_error()
-        self._error_to = self._error_from
-        self._error = self._error_from
-        self._error_turn = rotation_matrix(self._error[3:])
-        self._blend = 1.0
-        self._true_q: Vector | None = None
-        self._history = History()
-        self._remember_true_pose()
+        self._truth = TruePose(Kinematics(params.dh + params.dh_error), params.repeatability, params.blend_time, rng)
+        self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     # --- the world's side ---
 
@@ -115,8 +108,12 @@ class ArmModel:
             self.time = t
             if self.power is Power.RUNNING:
                 self._advance(dt)
-            self._wander(dt)
-            self._remember_true_pose()
+            moving = self.moving
+            if moving:
+                self._rest_since = math.inf
+            elif self._rest_since == math.inf:
+                self._rest_since = t
+            self._truth.update(t, dt, self.drive.q, moving)
             self._feel()
             noise = self.params.force_noise
             if noise[0] or noise[1]:
@@ -129,7 +126,7 @@ class ArmModel:
 
     def base_from_flange(self, t: float) -> Matrix:
         """True flange pose (4, 4) in the base at world time `t` (the last 10 s are kept)."""
-        return self._history.at(t)
+        return self._truth.at(t)
 
     def reported_flange(self) -> Matrix:
         """Flange pose (4, 4) in the base as the controller computes it from the encoders, now."""
@@ -276,7 +273,6 @@ class ArmModel:
         for _ in range(steps):
             self._step(dt / steps)
             if steps > 1:
-                self._remember_true_pose(keep=False)
                 self._feel()
         if self.safety is Safety.EMERGENCY_STOP and not self._queue:
             self.power = Power.OFF
@@ -316,39 +312,7 @@ class ArmModel:
     def _feel(self) -> None:
         if self.contact is None:
             return
-        self.drive.wrench = np.asarray(self.contact(self._true_pose), dtype=float)
+        self.drive.wrench = np.asarray(self.contact(self._truth.look(self.drive.q)), dtype=float)
         force = math.hypot(*self.drive.wrench[:3])
         if force > self.params.force_limit:
             self.protective_stop(f"force of {force:.0f} N exceeds {self.params.force_limit:.0f} N")
-
-    def _draw_error(self) -> Vector:
-        error = self._rng.normal(size=6)
-        error[:3] *= self.params.repeatability[0]
-        error[3:] *= self.params.repeatability[1]
-        return error
-
-    def _wander(self, dt: float) -> None:
-        """Carry the repeatability error over from the last rest's to the next one's, its variance unchanged."""
-        if not self.moving:
-            return
-        if self._rest_since < math.inf:
-            self._error_from, self._error_to, self._blend = self._error, self._draw_error(), 0.0
-            self._rest_since = math.inf
-        if self._blend < 1.0:
-            self._blend = min(1.0, self._blend + dt / self.params.blend_time)
-            angle = 0.5 * math.pi * self._blend
-            self._error = math.cos(angle) * self._error_from + math.sin(angle) * self._error_to
-            self._error_turn = rotation_matrix(self._error[3:])
-            self._true_q = None
-
-    def _remember_true_pose(self, keep: bool = True) -> None:
-        if self._rest_since == math.inf and not self.moving:
-            self._rest_since = self.time
-        if self._true_q is not self.drive.q:
-            pose = self._true_kinematics.forward(self.drive.q)
-            pose[:3, 3] += self._error[:3]
-            pose[:3, :3] = self._error_turn.dot(pose[:3, :3])
-            self._true_pose = pose
-            self._true_q = self.drive.q
-        if keep:
-            self._history.append(self.time, self._true_pose)

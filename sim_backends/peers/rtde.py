@@ -12,19 +12,18 @@ import logging
 import os
 import select
 import signal
-import struct
 import sys
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.peers.controller_ports import Client, TcpPorts
-from sim_backends.peers.dashboard import BANNER, VERSION, Dashboard
-from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, Getter, InputRecipe, Registers, View
+from sim_backends.peers.dashboard import BANNER, Dashboard
+from sim_backends.peers.rtde_recipes import InputRecipe
+from sim_backends.peers.rtde_registers import Registers, View
+from sim_backends.peers.rtde_session import Session
 from sim_backends.peers.script import ControlProgram, ScriptText
 
 PERIOD = 0.002
@@ -34,114 +33,6 @@ _CATCH_UP = 25
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 
 _log = logging.getLogger(__name__)
-_HEADER = struct.Struct(">HB")
-
-
-@dataclass(frozen=True)
-class _OutputRecipe:
-    number: int
-    every: int
-    packer: struct.Struct
-    getters: tuple[Getter, ...]
-
-    def packet(self, view: View) -> bytes:
-        """One data packet."""
-        values: list[float] = []
-        for getter in self.getters:
-            values += getter(view)
-        return self.packer.pack(self.packer.size, ord("U"), self.number, *values)
-
-
-class _Session:
-    """One RTDE connection: its recipes and whether it has been started."""
-
-    def __init__(self, peer: RtdePeer, client: Client) -> None:
-        self._peer = peer
-        self._client = client
-        self._buffer = b""
-        self._inputs: dict[int, InputRecipe] = {}
-        self._outputs: list[_OutputRecipe] = []
-        self.started = False
-
-    def feed(self, data: bytes) -> None:
-        """Handle what arrived; a header that cannot be one ends the connection."""
-        self._buffer += data
-        while len(self._buffer) >= _HEADER.size:
-            size, kind = _HEADER.unpack_from(self._buffer)
-            if size < _HEADER.size:
-                self._client.close()
-                return
-            if len(self._buffer) < size:
-                return
-            payload, self._buffer = self._buffer[_HEADER.size : size], self._buffer[size:]
-            handler = self._HANDLERS.get(chr(kind))
-            if handler is not None:
-                handler(self, payload)
-
-    def send_state(self, view: View, tick: int) -> None:
-        """Send a data packet for every output recipe that is due at this tick."""
-        for recipe in self._outputs:
-            if tick % recipe.every == 0:
-                self._client.send(recipe.packet(view))
-
-    def _reply(self, kind: str, payload: bytes) -> None:
-        self._client.send(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)
-
-    def _on_protocol(self, payload: bytes) -> None:
-        self._reply("V", bytes([payload[:2] in (b"\0\1", b"\0\2")]))
-
-    def _on_version(self, payload: bytes) -> None:
-        self._reply("v", struct.pack(">4I", *VERSION))
-
-    def _on_outputs(self, payload: bytes) -> None:
-        frequency = struct.unpack(">d", payload[:8])[0] if len(payload) >= 8 else 0.0
-        names = _names(payload[8:])
-        kinds = [OUTPUTS[name][0] if name in OUTPUTS else "NOT_FOUND" for name in names]
-        number = len(self._outputs) + 1
-        known = "NOT_FOUND" not in kinds and names
-        self._reply("O", bytes([number if known else 0]) + ",".join(kinds).encode())
-        if known:
-            every = max(1, round(500.0 / frequency)) if frequency > 0 else 1
-            code = ">HBB" + "".join(FORMATS[kind] for kind in kinds)
-            getters = tuple(OUTPUTS[name][1] for name in names)
-            self._outputs.append(_OutputRecipe(number, every, struct.Struct(code), getters))
-
-    def _on_inputs(self, payload: bytes) -> None:
-        names = _names(payload)
-        kinds = [self._claim(name) for name in names]
-        usable = names and not {"NOT_FOUND", "IN_USE"} & set(kinds)
-        number = len(self._inputs) + 1 if usable else 0
-        if usable:
-            self._inputs[number] = self._peer.input_recipe(names)
-        self._reply("I", bytes([number & 255]) + ",".join(kinds).encode())
-
-    def _claim(self, name: str) -> str:
-        if name not in INPUTS:
-            return "NOT_FOUND"
-        return INPUTS[name] if self._peer.claim(name, self) else "IN_USE"
-
-    def _on_start(self, payload: bytes) -> None:
-        self.started = True
-        self._reply("S", b"\1")
-
-    def _on_pause(self, payload: bytes) -> None:
-        self.started = False
-        self._reply("P", b"\1")
-
-    def _on_data(self, payload: bytes) -> None:
-        recipe = self._inputs.get(payload[0]) if payload else None
-        if recipe is not None:
-            recipe.apply(payload[1:], self._peer.wall_time)
-
-    _HANDLERS: dict[str, Callable[[_Session, bytes], None]] = {  # noqa: RUF012
-        "V": _on_protocol,
-        "v": _on_version,
-        "O": _on_outputs,
-        "I": _on_inputs,
-        "S": _on_start,
-        "P": _on_pause,
-        "U": _on_data,
-    }
 
 
 class RtdePeer:
@@ -158,8 +49,8 @@ class RtdePeer:
         self._view = View(model, self._registers)
         self._program = ControlProgram(model, self._registers, clock)
         self._dashboard = Dashboard(model, self._program)
-        self._owners: dict[str, _Session] = {}
-        self._sessions: dict[Client, _Session] = {}
+        self._owners: dict[str, Session] = {}
+        self._sessions: dict[Client, Session] = {}
         self._scripts: dict[Client, ScriptText] = {}
         self._lines: dict[Client, bytes] = {}
         self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT), host)
@@ -167,6 +58,7 @@ class RtdePeer:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm controller", daemon=True)
         self.lateness: list[float] = []
+        """How late the newest ticks began, in seconds on the wall."""
 
     @property
     def address(self) -> str:
@@ -184,7 +76,7 @@ class RtdePeer:
             self._thread.join(5.0)
         self._ports.close()
 
-    def claim(self, name: str, session: _Session) -> bool:
+    def claim(self, name: str, session: Session) -> bool:
         """Give an input variable to a connection; False when another one holds it."""
         return self._owners.setdefault(name, session) is session
 
@@ -239,7 +131,7 @@ class RtdePeer:
             self._owners = {name: owner for name, owner in self._owners.items() if owner is not session}
             return
         if client not in self._sessions:
-            self._sessions[client] = _Session(self, client)
+            self._sessions[client] = Session(self, client)
         self._sessions[client].feed(data)
 
     def _serve_dashboard(self, client: Client, data: bytes | None) -> None:
@@ -262,10 +154,6 @@ class RtdePeer:
             return
         for text in self._scripts.setdefault(client, ScriptText()).feed(data):
             self._program.load(text)
-
-
-def _names(payload: bytes) -> list[str]:
-    return [name.strip() for name in payload.decode("ascii", "replace").split(",") if name.strip()]
 
 
 def main(arguments: list[str] | None = None) -> None:

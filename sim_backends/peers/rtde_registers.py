@@ -6,8 +6,6 @@ Names and types follow the maker's RTDE guide; a `View` computes what is costly 
 from __future__ import annotations
 
 import math
-import re
-import struct
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -201,56 +199,3 @@ INPUTS: dict[str, str] = {
     **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
 }
 """Writable variables and their types."""
-
-_COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
-_REGISTER = re.compile(r"input_(int|double)_register_(\d+)")
-
-
-class InputRecipe:
-    """The variables that one kind of data packet carries, in order."""
-
-    def __init__(self, names: list[str], model: ArmModel, registers: Registers) -> None:
-        """`names` are keys of `INPUTS`."""
-        self._model = model
-        self._registers = registers
-        self._names = frozenset(names)
-        self._unpacker = struct.Struct(">" + "".join(FORMATS[INPUTS[name]] for name in names))
-        self._slots: list[tuple[list[int] | list[float], int]] = []
-        self._others: list[tuple[str, int]] = []
-        place = 0
-        for name in names:
-            match = _REGISTER.fullmatch(name)
-            if match is None:
-                self._others.append((name, place))
-                self._slots += [([0.0], 0)] * (6 if INPUTS[name] == "VECTOR6D" else 1)
-            elif match[1] == "int":
-                self._slots.append((registers.int_in, int(match[2])))
-            else:
-                self._slots.append((registers.double_in, int(match[2])))
-            place = len(self._slots)
-
-    def apply(self, payload: bytes, wall_time: float) -> None:
-        """Write one packet's values; real clients send packets too long or too short, which are cut or padded."""
-        size = self._unpacker.size
-        numbers = self._unpacker.unpack(payload if len(payload) == size else payload[:size].ljust(size, b"\0"))
-        for (bank, index), number in zip(self._slots, numbers, strict=True):
-            bank[index] = number
-        if self._names & _COMMANDS:
-            self._registers.commanded_at = wall_time
-            self._registers.command_fields = self._names
-        if self._others:
-            self._write_outputs({name: numbers[place] for name, place in self._others})
-
-    def _write_outputs(self, values: dict[str, float]) -> None:
-        """Masked outputs change only where their mask says so."""
-        for kind, first, bits in (("standard", 0, 255), ("configurable", 8, 255), ("tool", 16, 3)):
-            mask = int(values.get(f"{kind}_digital_output_mask", 0)) & bits
-            levels = int(values.get(f"{kind}_digital_output", 0))
-            if mask:
-                self._model.write_digital_outputs(mask << first, levels << first)
-        if int(values.get("speed_slider_mask", 0)) & 1:
-            self._model.drive.speed_fraction = min(1.0, max(0.0, values.get("speed_slider_fraction", 1.0)))
-        mask = int(values.get("standard_analog_output_mask", 0))
-        for i in (0, 1):
-            if mask >> i & 1:
-                self._registers.analog_out[i] = values.get(f"standard_analog_output_{i}", 0.0)

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from sim_backends.models.arm_kinematics import Matrix, Vector, matrix_from_pose
-from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 from sim_backends.peers.script_context import Context, Job
 from sim_backends.peers.script_statements import run_statement
 

@@ -1,0 +1,124 @@
+"""One RTDE connection: the handshakes, the recipes and the packets. Source: the maker's RTDE guide, version 2."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Protocol
+
+from sim_backends.peers.controller_ports import Client
+from sim_backends.peers.dashboard import VERSION
+from sim_backends.peers.rtde_recipes import InputRecipe, OutputRecipe
+from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, View
+
+_HEADER = struct.Struct(">HB")
+
+
+class Controller(Protocol):
+    """What a connection needs of the controller."""
+
+    @property
+    def wall_time(self) -> float:
+        """Seconds on the wall at the newest tick."""
+
+    def claim(self, name: str, session: Session) -> bool:
+        """Give an input variable to a connection; False when another one holds it."""
+
+    def input_recipe(self, names: list[str]) -> InputRecipe:
+        """A recipe that writes to this controller's inputs."""
+
+
+class Session:
+    """One RTDE connection: its recipes and whether it has been started."""
+
+    def __init__(self, controller: Controller, client: Client) -> None:
+        self._controller = controller
+        self._client = client
+        self._buffer = b""
+        self._inputs: dict[int, InputRecipe] = {}
+        self._outputs: list[OutputRecipe] = []
+        self.started = False
+
+    def feed(self, data: bytes) -> None:
+        """Handle what arrived; a header that cannot be one ends the connection."""
+        self._buffer += data
+        while len(self._buffer) >= _HEADER.size:
+            size, kind = _HEADER.unpack_from(self._buffer)
+            if size < _HEADER.size:
+                self._client.close()
+                return
+            if len(self._buffer) < size:
+                return
+            payload, self._buffer = self._buffer[_HEADER.size : size], self._buffer[size:]
+            handler = self._HANDLERS.get(chr(kind))
+            if handler is not None:
+                handler(self, payload)
+
+    def send_state(self, view: View, tick: int) -> None:
+        """Send a data packet for every output recipe that is due at this tick."""
+        for recipe in self._outputs:
+            if tick % recipe.every == 0:
+                self._client.send(recipe.packet(view))
+
+    def _reply(self, kind: str, payload: bytes) -> None:
+        self._client.send(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)
+
+    def _on_protocol(self, payload: bytes) -> None:
+        self._reply("V", bytes([payload[:2] in (b"\0\1", b"\0\2")]))
+
+    def _on_version(self, payload: bytes) -> None:
+        self._reply("v", struct.pack(">4I", *VERSION))
+
+    def _on_outputs(self, payload: bytes) -> None:
+        frequency = struct.unpack(">d", payload[:8])[0] if len(payload) >= 8 else 0.0
+        names = _names(payload[8:])
+        kinds = [OUTPUTS[name][0] if name in OUTPUTS else "NOT_FOUND" for name in names]
+        number = len(self._outputs) + 1
+        known = "NOT_FOUND" not in kinds and names
+        self._reply("O", bytes([number if known else 0]) + ",".join(kinds).encode())
+        if known:
+            every = max(1, round(500.0 / frequency)) if frequency > 0 else 1
+            code = ">HBB" + "".join(FORMATS[kind] for kind in kinds)
+            getters = tuple(OUTPUTS[name][1] for name in names)
+            self._outputs.append(OutputRecipe(number, every, struct.Struct(code), getters))
+
+    def _on_inputs(self, payload: bytes) -> None:
+        names = _names(payload)
+        kinds = [self._claim(name) for name in names]
+        usable = names and not {"NOT_FOUND", "IN_USE"} & set(kinds)
+        number = len(self._inputs) + 1 if usable else 0
+        if usable:
+            self._inputs[number] = self._controller.input_recipe(names)
+        self._reply("I", bytes([number & 255]) + ",".join(kinds).encode())
+
+    def _claim(self, name: str) -> str:
+        if name not in INPUTS:
+            return "NOT_FOUND"
+        return INPUTS[name] if self._controller.claim(name, self) else "IN_USE"
+
+    def _on_start(self, payload: bytes) -> None:
+        self.started = True
+        self._reply("S", b"\1")
+
+    def _on_pause(self, payload: bytes) -> None:
+        self.started = False
+        self._reply("P", b"\1")
+
+    def _on_data(self, payload: bytes) -> None:
+        recipe = self._inputs.get(payload[0]) if payload else None
+        if recipe is not None:
+            recipe.apply(payload[1:], self._controller.wall_time)
+
+    _HANDLERS: dict[str, Callable[[Session, bytes], None]] = {  # noqa: RUF012
+        "V": _on_protocol,
+        "v": _on_version,
+        "O": _on_outputs,
+        "I": _on_inputs,
+        "S": _on_start,
+        "P": _on_pause,
+        "U": _on_data,
+    }
+
+
+def _names(payload: bytes) -> list[str]:
+    return [name.strip() for name in payload.decode("ascii", "replace").split(",") if name.strip()]
