@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-import numpy as np
+from cell.config import CameraConfig, CellConfig
+from drivers.arm.limits import ArmLimits
 from drivers.arm.ur import UrArm
 from drivers.camera.stream import StreamCamera
-
-from cell.config import CameraConfig, CellConfig
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
 from drivers.rail.tmcl import TmclRail
@@ -91,11 +90,12 @@ def connect_arm(config: CellConfig, clock: Clock) -> UrArm:
         "arm",
         config.arm.address,
         clock=clock,
-        max_joint_speed=config.arm.max_joint_speed,
-        max_joint_acceleration=config.arm.max_joint_acceleration,
-        max_tool_speed=config.arm.max_tool_speed,
-        payload=config.arm.payload,
-        payload_centre=np.array(config.arm.payload_centre),
+        limits=ArmLimits(
+            joint_speeds=(config.arm.max_joint_speed,) * 6,
+            joint_acceleration=config.arm.max_joint_acceleration,
+            linear_speed=config.arm.max_tool_speed,
+        ),
+        payload=(config.arm.payload, config.arm.payload_centre),
         safe_off_outputs=(config.laser.output,),
     )
 

@@ -189,7 +189,7 @@ class CellConfig(Table):
 
 def checked_board(text: str) -> str:
     """A board's name, once it is known to be well formed."""
-    from cell.vision import parse_board
+    from cell.vision.board_spec import parse_board
 
     try:
         parse_board(text)

@@ -16,6 +16,7 @@ from cell.config import CellConfig
 from cell.geometry.poses import from_parts, transform
 from cell.job import Job
 from cell.vision import BoardSpec
+from drivers.interfaces import Vector
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,15 @@ def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
     return place_from_base.inverse()
 
 
+def centre_of(board: BoardSpec) -> Vector:
+    """The middle (3,) of the board's points in its own frame, m."""
+    points = board.points()
+    return 0.5 * (points.min(axis=0) + points.max(axis=0))
+
+
 def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:
     """base_from_camera that looks square at the board's centre from `stand_off` m, image x along the board's x."""
-    return base_from_board * from_parts(board.centre) * from_parts((0.0, 0.0, -stand_off))
+    return base_from_board * from_parts(centre_of(board)) * from_parts((0.0, 0.0, -stand_off))
 
 
 def look_pose(config: CellConfig, job: Job, board: BoardSpec, flange_from_camera: pin.SE3) -> pin.SE3:
@@ -111,7 +118,7 @@ def _tilted(
     base_from_board: pin.SE3, board: BoardSpec, offset: np.ndarray, depth: float, rx: float, ry: float, rz: float
 ) -> pin.SE3:
     rotation = pin.rpy.rpyToMatrix(*np.deg2rad([rx, ry, rz]))
-    centre = base_from_board * from_parts(np.asarray(board.centre))
+    centre = base_from_board * from_parts(centre_of(board))
     return centre * from_parts(np.zeros(3), rotation) * from_parts(offset - np.array([0.0, 0.0, depth]))
 
 

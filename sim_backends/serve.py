@@ -135,7 +135,7 @@ def _spec(world: World, camera: str) -> CameraSpec:
     timing: CameraClock = world.scene.scan_clock if scan else world.scene.target_clock
     return CameraSpec(
         model=f"SIM-{camera.upper()}",
-        serial=f"SIM{world.scene.seed:06d}-{camera.upper()}",
+        serial=f"SIM{world.scene.serial}-{camera.upper()}",
         width=size[0],
         height=size[1],
         frame_rate_max=rate,

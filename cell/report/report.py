@@ -130,8 +130,9 @@ def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, re
     if isinstance(made, Cloud) and isinstance(pose, PlacePose):
         lines, rows = made.valid.nonzero()
         points = transform(pose.base_from_surface.inverse(), made.points[lines, rows])
-        points = points[nominal.inside(points)]
-        cloud = (points, nominal.deviations(points))
+        deviations = nominal.deviations(points)
+        on_surface = np.isfinite(deviations)
+        cloud = (points[on_surface], deviations[on_surface])
     title = f"run {report['run']}: job {job.job.name}, {report['outcome']}"
     if report["simulated"]:
         title += f" · simulated, seed {report['seed']}, level {report['level']}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial import cKDTree
 
 from cell.geometry.poses import from_matrix, from_parts, transform
 from cell.inversion import NominalSurface, PlacePose
@@ -29,10 +30,10 @@ def ask_truth(address: str) -> dict[str, Any]:
         with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
             file.write(b'{"op": "truth"}\n')
             file.flush()
-            answer: dict[str, Any] = json.loads(file.readline())
-    except (OSError, ValueError) as error:
+            truth: dict[str, Any] = json.loads(file.readline())["truth"]
+    except (OSError, ValueError, KeyError) as error:
         raise CellError(f"the simulated cell's truth at {address} does not answer: {error}") from error
-    return answer
+    return truth
 
 
 class Witness:
@@ -55,22 +56,25 @@ def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:
 
 def part_points(nominal: NominalSurface) -> Vector:
     """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each."""
-    (x_low, x_high), (y_low, y_high) = nominal.footprint
-    x = np.linspace(x_low, x_high, SEGMENTS * POINTS_PER_SEGMENT + 2)[1:-1]
-    across = np.tile(np.linspace(0.8 * y_low, 0.8 * y_high, POINTS_PER_SEGMENT), SEGMENTS)
-    return np.column_stack([x, across, nominal.height(x, across)])
+    low, high = nominal.vertices[:, :2].min(axis=0), nominal.vertices[:, :2].max(axis=0)
+    count = SEGMENTS * POINTS_PER_SEGMENT
+    along = low[0] + (high[0] - low[0]) * (np.arange(count) + 0.5) / count
+    across = np.tile(
+        np.linspace(0.9 * low[1] + 0.1 * high[1], 0.1 * low[1] + 0.9 * high[1], POINTS_PER_SEGMENT), SEGMENTS
+    )
+    _, nearest = cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
+    return nominal.samples[nearest]
 
 
 def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, float] | None:
     """Distance of 1000 cloud points from the true surface, the arm's and the hand-eye's error included; mm."""
     lines, rows = cloud.valid.nonzero()
     points = transform(pose_of(truth, "base_from_surface").inverse(), cloud.points[lines, rows])
-    inside = nominal.inside(points)
-    points = points[inside]
-    if len(points) < SENSOR_POINTS:
+    deviations = nominal.deviations(points)
+    deviations = deviations[np.isfinite(deviations)]
+    if len(deviations) < SENSOR_POINTS:
         return None
-    chosen = points[np.linspace(0, len(points) - 1, SENSOR_POINTS).astype(int)]
-    distance = 1e3 * np.abs(nominal.deviations(chosen))
+    distance = 1e3 * np.abs(deviations[np.linspace(0, len(deviations) - 1, SENSOR_POINTS).astype(int)])
     return {"mean": float(distance.mean()), "p85": float(np.percentile(distance, 85))}
 
 

@@ -83,6 +83,7 @@ def drive_to_target(
     vehicle.brake()
     raise RefusedError(
         f"the vehicle stands {1e3 * error.x:.1f} mm along, {1e3 * error.y:.1f} mm across and "
-        f"{math.degrees(error.yaw):.2f} deg from its target after {count} photographs, "
-        f"allowed {1e3 * approach.tolerance:.0f} mm and {math.degrees(approach.tolerance_angle):.1f} deg; check the floor and the wheels"
+        f"{math.degrees(error.yaw):.2f} deg from its target after {count} photographs, allowed "
+        f"{1e3 * approach.tolerance:.0f} mm and {math.degrees(approach.tolerance_angle):.1f} deg; "
+        "check the floor and the wheels"
     )

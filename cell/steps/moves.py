@@ -15,6 +15,7 @@ from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
+from cell.planning import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
 from drivers.interfaces import Arm
@@ -40,7 +41,7 @@ class Mover:
 
     def meet_station(self, base_from_place: pin.SE3, job: Job, board: BoardSpec) -> None:
         """From now on avoid the station as well, where it was measured."""
-        centre = job.place_from_board * from_parts(board.centre)
+        centre = job.place_from_board * from_parts(centre_of(board))
         self._planner = self._plan_among(station_bodies(base_from_place, centre))
 
     def leave_part(self) -> None:
@@ -100,7 +101,7 @@ def _plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, 
     plates = []
     for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
         board = parse_board(plate.board)
-        width, height = board.size
-        below = from_parts((*board.centre[:2], PLATE_THICKNESS / 2))
+        width, height = np.ptp(board.points()[:, :2], axis=0) + 2 * board.pitch
+        below = from_parts(centre_of(board) + (0.0, 0.0, PLATE_THICKNESS / 2))
         plates.append((name, plate.base_from_board.se3() * below, (width, height, PLATE_THICKNESS)))
     return plates

@@ -111,13 +111,17 @@ class RtdePeer:
 
     def _tick(self, t: float) -> None:
         self._tick_count += 1
+        waiting = set(self._sessions)
         for port, client, data in self._ports.poll():
             if port == RTDE_PORT:
+                waiting.discard(client)
                 self._serve_rtde(client, data)
             elif port == DASHBOARD_PORT:
                 self._serve_dashboard(client, data)
             else:
                 self._serve_script(client, data)
+        for client in waiting:
+            self._sessions[client].feed(b"")
         self._program.tick()
         self._model.tick(t)
         self._view.runtime_state = self._program.runtime_state

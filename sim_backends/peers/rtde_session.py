@@ -12,6 +12,8 @@ from sim_backends.peers.rtde_recipes import InputRecipe, OutputRecipe
 from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, View
 
 _HEADER = struct.Struct(">HB")
+_BACKLOG = 4096
+"""Bytes from which on data packets are no longer taken one a tick: a client that sends faster is not held up."""
 
 
 class Controller(Protocol):
@@ -40,7 +42,11 @@ class Session:
         self.started = False
 
     def feed(self, data: bytes) -> None:
-        """Handle what arrived; a header that cannot be one ends the connection."""
+        """Handle what arrived; a header that cannot be one ends the connection.
+
+        At most one data packet is taken each tick: a stream of targets that piled up while the machine was busy is
+        then followed as it was sent, not as one jump. Call with no data in ticks in which nothing arrived.
+        """
         self._buffer += data
         while len(self._buffer) >= _HEADER.size:
             size, kind = _HEADER.unpack_from(self._buffer)
@@ -53,6 +59,8 @@ class Session:
             handler = self._HANDLERS.get(chr(kind))
             if handler is not None:
                 handler(self, payload)
+            if chr(kind) == "U" and len(self._buffer) < _BACKLOG:
+                return
 
     def send_state(self, view: View, tick: int) -> None:
         """Send a data packet for every output recipe that is due at this tick."""

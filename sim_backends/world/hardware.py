@@ -25,7 +25,7 @@ def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
         dh_error=scene.dh_error,
         repeatability=(sigma.arm_repeatability / math.sqrt(3.0), sigma.arm_repeatability_rotation),
         force_noise=(sigma.arm_force_noise, _TORQUE_PER_FORCE * sigma.arm_force_noise),
-        serial=f"2023{scene.seed:07d}",
+        serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)
     closed = 1 << nominal.CLAW_OUTPUT
@@ -42,7 +42,7 @@ def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
         backlash=scene.rail_backlash,
     )
     start = float(stream(scene.seed, "rail.start").uniform(0.01, 0.09))
-    params = RailParams(screw=screw, repeatability=scene.deviations.rail_homing, start=start, serial=scene.seed + 1)
+    params = RailParams(screw=screw, repeatability=scene.deviations.rail_homing, start=start, serial=int(scene.serial))
     return RailModel(params, stream(scene.seed, "rail"))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.world import nominal
-from sim_backends.world.levels import CUT, Deviations, deviations
+from sim_backends.world.levels import CUT, LEVELS, Deviations, deviations
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -89,6 +89,11 @@ class Scene:
     light_gradient: Vector
     scan_clock: CameraClock
     target_clock: CameraClock
+
+    @property
+    def serial(self) -> str:
+        """Seven digits that tell this world's hardware from that of every other seed and level."""
+        return f"{self.seed:06d}{list(LEVELS).index(self.level)}"
 
 
 class _Draws:

@@ -73,7 +73,11 @@ def truth(world: World) -> dict[str, Any]:
             "speed": vehicle.speed,
             "yaw_rate": vehicle.yaw_rate,
         },
-        "arm": {"moving": world.arm.moving, "safety": world.arm.safety.name.lower()},
+        "arm": {
+            "moving": world.arm.moving,
+            "safety": world.arm.safety.name.lower(),
+            "fault": world.arm.fault_text,
+        },
         "rail_moving": world.rail.velocity(t) != 0,
     }
 

@@ -110,8 +110,8 @@ def test_every_device_answers_at_its_endpoint_in_its_own_protocol(served: Served
     endpoints = served.endpoints
     scan = camera_request(endpoints["scan_camera"]["address"], "identify")
     target = camera_request(endpoints["target_camera"]["address"], "identify")
-    assert (scan["width"], scan["height"], scan["serial"]) == (640, 480, "SIM000003-SCAN")
-    assert (target["width"], target["height"], target["serial"]) == (1280, 1024, "SIM000003-TARGET")
+    assert (scan["width"], scan["height"], scan["serial"]) == (640, 480, "SIM0000031-SCAN")
+    assert (target["width"], target["height"], target["serial"]) == (1280, 1024, "SIM0000031-TARGET")
 
     host, port = endpoints["rail"]["url"].removeprefix("socket://").split(":")
     with socket.create_connection((host, int(port)), 5.0) as rail:
