@@ -17,7 +17,7 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
     ),
     "arm.emergency_stop": (
         "the emergency stop is pressed", False,
-        "Make the cell safe, release the button, power the arm on and release its brakes at the pendant, then connect.",
+        "Make the cell safe, release the button, switch the arm on at the pendant, brakes too, then recover().",
     ),
     "arm.safeguard_stop": ("the safeguard is open", False, "Close and acknowledge the safeguard, then go on."),
     "arm.safety_fault": ("the arm's safety system reports a fault", False, "Read the pendant's log; restart the arm."),

@@ -31,7 +31,7 @@ _CLOSE_S = 4.0
 _UNLOCK_S = 20.0
 _STATE_FLOOR_S = 0.25
 _FIRST_POINT = 0.02
-_WATCHDOG_S = 1.0
+_WATCHDOG_S = 1.5
 _OUTPUTS = 18
 _SAFETY = {
     "": ArmSafety.NORMAL,
@@ -200,12 +200,12 @@ class UrArm:
         """
         if self._closed:
             raise NotConnectedError(self.name, "the driver was closed. Open a new one.")
-        self._link.close(_CLOSE_S)
-        self._snapshot = None
-        self._end_motion(fault(self.name, "arm.program_stopped", "the arm was recovered"))
-        self._join_safing()
         self._dashboard.ask("stop")
         self._unlock()
+        self._link.close(_CLOSE_S)
+        self._end_motion(fault(self.name, "arm.program_stopped", "the arm was recovered"))
+        self._join_safing()
+        self._snapshot = None
         self._link = self._connect()
         self._require_ready()
 

@@ -31,7 +31,7 @@ from drivers.arm.ur_control import PERIOD, ControlThread
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 
-SILENCE_S = 1.0
+SILENCE_S = 1.5
 """The arm counts as lost after this time without a packet; it sends one every 2 ms."""
 _CONSTRUCTION_S = 15.0
 _SHUT_DOWN_S = 5.0

@@ -18,12 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Arm, ArmSafety
 
 pytestmark = pytest.mark.wire
 
 LASER = 0
+HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +39,27 @@ def bench(running):
     return running
 
 
-@pytest.fixture
-def arm(bench):
-    arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), payload=(1.5, (0.0, 0.0, 0.06)), clock=Clock())
+@pytest.fixture(scope="module")
+def connected(running):
+    arm = UrArm("arm", running.address, safe_off_outputs=(LASER,), payload=(1.5, (0.0, 0.0, 0.06)), clock=Clock())
     yield arm
     arm.close()
+
+
+@pytest.fixture
+def arm(bench, connected):
+    """The driver, connected and ready, with the arm back where it began."""
+    try:
+        stand_at_home(connected)
+    except CellError:
+        connected.recover()
+        stand_at_home(connected)
+    return connected
+
+
+def stand_at_home(arm):
+    assert soon(lambda: np.abs(arm.state().joints - HOME).max() < 1e-9)
+    arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
 
 
 def joints_away(arm, radians):
@@ -104,11 +121,13 @@ def test_it_knows_who_the_arm_is_and_how_long_a_round_trip_takes(arm, bench):
     assert len(arm.statistics.round_trips_s) == 1
 
 
-def test_it_sets_a_zero_tool_and_the_payload_when_it_connects(arm, bench):
+def test_it_sets_a_zero_tool_and_the_payload_and_keeps_them_through_a_recovery(arm, bench):
     shown = bench.ask("show")
     assert np.array_equal(shown["tcp"], np.eye(4))
     assert shown["payload"] == 1.5
     arm.set_payload(2.5, np.array([0.0, 0.0, 0.1]))
+    assert bench.ask("show")["payload"] == 2.5
+    arm.recover()
     assert bench.ask("show")["payload"] == 2.5
 
 
@@ -287,6 +306,7 @@ def test_an_emergency_stop_is_a_fault_that_only_the_operator_can_clear():
         assert (caught.value.code, caught.value.recoverable) == ("arm.emergency_stop", False)
         with pytest.raises(DeviceFault, match="emergency stop is pressed"):
             arm.recover()
+        assert arm.state().safety is ArmSafety.EMERGENCY_STOP
         arm.close()
         # With the button still pressed the driver connects, shows the state and refuses to move.
         again = UrArm("arm", bench.address, clock=Clock())
@@ -393,7 +413,12 @@ threading.Event().wait(60)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGTERM])
-def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends(bench, way):
+def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends(way):
+    with ArmBench() as bench:
+        owner_dies(bench, way)
+
+
+def owner_dies(bench, way):
     owner = subprocess.Popen(
         [sys.executable, "-c", OWNER, bench.address],
         stdout=subprocess.PIPE,
@@ -415,14 +440,15 @@ def test_ctrl_c_does_not_reach_the_child(arm):
     arm.move_joints(joints_away(arm, -0.02), 1.0, 2.0).wait(5.0)
 
 
-def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated(bench):
-    arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
-    arm.set_digital_output(LASER, True)
-    child = arm._link.pid
-    arm.close()
-    arm.close()
-    assert not bench.ask("show")["outputs"] & 1 << LASER
-    assert gone(child)
+def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated():
+    with ArmBench() as bench:
+        arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
+        arm.set_digital_output(LASER, True)
+        child = arm._link.pid
+        arm.close()
+        arm.close()
+        assert not bench.ask("show")["outputs"] & 1 << LASER
+        assert gone(child)
     with pytest.raises(NotConnectedError, match="was closed"):
         arm.state()
     with pytest.raises(NotConnectedError, match="was closed"):
