@@ -1,7 +1,8 @@
 """Boards and plain rectangles as the camera sees them in ambient light: perspective, distortion, edges, shading.
 
 Every pixel whose footprint is crossed by an edge is averaged over eight scan lines, each with the exact chord of the
-dot or square; all others take the albedo at their centre. The centroid of a dot is then true to 0.002 px.
+dot or square; all others take the albedo at their centre. The centroid of a dot is then true to 0.002 px,
+which is what integrating over square pixels costs by itself.
 """
 
 from __future__ import annotations
@@ -178,17 +179,29 @@ def edge_pixel(ray_x: Image, ray_y: Image, u: int, v: int, inverse: Vector, patt
     bxv = (inverse[0, 0] * xv + inverse[0, 1] * yv - bx * wv) * depth
     byv = (inverse[1, 0] * xv + inverse[1, 1] * yv - by * wv) * depth
     wide, tall = abs(bxu) + abs(bxv), abs(byu) + abs(byv)
-    white = pattern[8]
+    # Scan lines have to run across the edge, not along it: swap the pixel's sides if need be.
     if not (pattern[4] + wide < bx < pattern[5] - wide and pattern[6] + tall < by < pattern[7] - tall):
         # No detail of a pattern reaches the rim.
-        return rectangle_share(bx, by, bxu, byu, bxv, byv, pattern), white
+        to_x = min(abs(bx - pattern[4]), abs(bx - pattern[5])) / wide
+        to_y = min(abs(by - pattern[6]), abs(by - pattern[7])) / tall
+        if (abs(bxu) < abs(bxv)) if to_x < to_y else (abs(byu) < abs(byv)):
+            bxu, byu, bxv, byv = bxv, byv, bxu, byu
+        return rectangle_share(bx, by, bxu, byu, bxv, byv, pattern), pattern[8]
     kind = int(pattern[0])
     if kind == PLAIN:
-        return 1.0, white
+        return 1.0, pattern[8]
     if kind == CHESS:
+        p = pattern[3]
+        to_x = abs(bx - p * np.floor(bx / p + 0.5)) / wide
+        to_y = abs(by - p * np.floor(by / p + 0.5)) / tall
+        if (abs(bxu) < abs(bxv)) if to_x < to_y else (abs(byu) < abs(byv)):
+            bxu, byu, bxv, byv = bxv, byv, bxu, byu
         return 1.0, chess_share(bx, by, bxu, byu, bxv, byv, pattern)
     dot_x, dot_y, ring = nearest_dot(bx, by, pattern)
-    dark = disc_share(bx - dot_x, by - dot_y, bxu, byu, bxv, byv, pattern[10])
+    dx, dy = bx - dot_x, by - dot_y
+    if abs(dx * bxu + dy * byu) < abs(dx * bxv + dy * byv):
+        bxu, byu, bxv, byv = bxv, byv, bxu, byu
+    dark = disc_share(dx, dy, bxu, byu, bxv, byv, pattern[10])
     if ring:
-        dark -= disc_share(bx - dot_x, by - dot_y, bxu, byu, bxv, byv, pattern[11])
-    return 1.0, white + dark * (pattern[9] - white)
+        dark -= disc_share(dx, dy, bxu, byu, bxv, byv, pattern[11])
+    return 1.0, pattern[8] + dark * (pattern[9] - pattern[8])
