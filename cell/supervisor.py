@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 from cell.assembly import Devices, connect
 from cell.calibration import CellCalibration, load_calibration, save_calibration
-from cell.calibration.collect import collect_scan, collect_target
 from cell.config import CellConfig, load_config
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface
@@ -24,6 +23,7 @@ from cell.report.report import make_report
 from cell.report.truth import Witness
 from cell.runs import REPORT, CellLock, new_run, write_json
 from cell.simulation import SimulatedCell, with_endpoints
+from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
 from cell.work import JobWork
 from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError, DeviceError, DeviceFault, RefusedError
@@ -250,11 +250,11 @@ class Cell:
             if observer is not None:
                 observer(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
 
-        def work() -> CellCalibration:
+        def work(check: Callable[[], None]) -> CellCalibration:
             mover = self.mover(part_of)
             self.devices.vehicle.brake()
-            scan = collect_scan(self.config, self.devices, mover, lambda f, t: tell(0.65 * f, t))
-            target = collect_target(self.config, self.devices, mover, lambda f, t: tell(0.65 + 0.3 * f, t))
+            scan = collect_scan(self.config, self.devices, mover, check, lambda f, t: tell(0.65 * f, t))
+            target = collect_target(self.config, self.devices, mover, check, lambda f, t: tell(0.65 + 0.3 * f, t))
             tell(0.96, "solving")
             return CellCalibration.solve(scan, target, self._identities(), self.config)
 
@@ -266,27 +266,37 @@ class Cell:
     def home(self) -> None:
         """Home the rail and fold the arm above the deck."""
 
-        def work() -> None:
+        def work(check: Callable[[], None]) -> None:
             self.devices.rail.home().wait(60.0)
             self.mover(None).to_joints(HOME)
 
         self.guarded("homing", work)
 
-    def guarded(self, what: str, work: Callable[[], Made]) -> Made:
-        """Do `work` in a thread; on Ctrl-C or any error stop the cell first, then raise. For work outside a job."""
+    def guarded(self, what: str, work: Callable[[Callable[[], None]], Made]) -> Made:
+        """Do `work` in a thread; on Ctrl-C or any error stop the cell first, then raise. For work outside a job.
+
+        `work` is given a function that raises once the work is to end, to be called between motions.
+        """
         made: list[Made] = []
         with SignalWatch() as signals:
-            call = Call(what, lambda: made.append(work()))
-            while not call.done.wait(0.05):
+
+            def check() -> None:
                 if signals.reason is not None:
-                    self.devices.stop()
-                    call.done.wait(5.0)
-                    break
-            if signals.reason is not None:
-                raise KeyboardInterrupt(f"{what} {signals.reason}; the cell was stopped")
-            if call.error is not None:
+                    raise Aborted(f"{what} {signals.reason}")
+
+            call = Call(what, lambda: made.append(work(check)))
+            while not call.done.wait(0.05) and signals.reason is None:
+                pass
+            if signals.reason is not None or call.error is not None:
                 self.devices.stop()
-                raise call.error
+                call.done.wait(5.0)
+                problems = self.devices.stop()  # once more: the work may have begun something before it saw the end
+                unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
+                if signals.reason is not None:
+                    raise KeyboardInterrupt(f"{what} {signals.reason}; the cell was stopped{unconfirmed}")
+                if call.error is not None:
+                    call.error.add_note(unconfirmed)
+                    raise call.error
         return made[0]
 
 

@@ -18,8 +18,8 @@ def main() -> None:
 
     try:
         app(standalone_mode=True)
-    except KeyboardInterrupt:
-        _complain("interrupted")
+    except KeyboardInterrupt as interrupt:
+        _complain(str(interrupt) or "interrupted")
         sys.exit(EXIT_INTERRUPTED)
     except ConfigError as error:
         _complain(str(error))

@@ -102,6 +102,6 @@ def _plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, 
     for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
         board = parse_board(plate.board)
         width, height = np.ptp(board.points()[:, :2], axis=0) + 2 * board.pitch
-        below = from_parts(centre_of(board) + (0.0, 0.0, PLATE_THICKNESS / 2))
+        below = from_parts(centre_of(board) + np.array([0.0, 0.0, PLATE_THICKNESS / 2]))
         plates.append((name, plate.base_from_board.se3() * below, (width, height, PLATE_THICKNESS)))
     return plates

@@ -1,0 +1,94 @@
+"""Collecting what a calibration is solved from: the cell moves through its own poses over the boards on its deck."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from cell.assembly import Devices
+from cell.calibration import ScanObservation, TargetObservation
+from cell.config import CellConfig
+from cell.geometry.poses import from_ur
+from cell.planning import View, scan_calibration_views, target_calibration_views
+from cell.steps.moves import Mover
+from cell.vision import BoardView, extract, find_board, parse_board
+from drivers.errors import RefusedError
+from drivers.interfaces import Camera
+
+PHOTO_RATE = 10.0
+LEAST_SHARE = 0.75
+"""Share of the planned views that have to show the board."""
+
+Progress = Callable[[float, str], None]
+Check = Callable[[], None]
+Made = TypeVar("Made")
+
+
+def collect_scan(
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+) -> list[ScanObservation]:
+    """Dots and stripe on the fine board, at several depths, tilts and rail positions.
+
+    At each view the laser is off for the photograph and on for the stripe. Raises `RefusedError` when too few
+    views show the board; a view that does not is left out.
+    """
+    board = parse_board(config.calibration.fine.board)
+    views = scan_calibration_views(config, board)
+    camera, rail = devices.scan_camera, devices.rail
+    if not rail.state().homed:
+        progress(0.0, "homing the rail")
+        rail.home().wait(60.0)
+    made: list[ScanObservation] = []
+    refusals: list[str] = []
+    for k, view in enumerate(views):
+        check()
+        progress(k / len(views), f"fine board, view {k + 1} of {len(views)}")
+        travel = rail.move_to(view.rail_position)
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+        travel.wait(30.0)
+        camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
+        seen = _look(camera, lambda image: find_board(image, board), refusals, k)
+        if seen is None:
+            continue
+        camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
+        with devices.laser.lit():
+            stripe = extract(camera.grab().image)
+        base_from_flange = from_ur(devices.arm.state().flange)
+        made.append(ScanObservation(seen, stripe, base_from_flange, rail.state().position, f"fine {k + 1}"))
+    return _enough(made, views, refusals)
+
+
+def collect_target(
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+) -> list[TargetObservation]:
+    """Dots of the large board, at several distances and tilts. Raises `RefusedError` when too few views show it."""
+    board = parse_board(config.calibration.large.board)
+    views = target_calibration_views(config, board)
+    devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
+    made: list[TargetObservation] = []
+    refusals: list[str] = []
+    for k, view in enumerate(views):
+        check()
+        progress(k / len(views), f"large board, view {k + 1} of {len(views)}")
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+        seen = _look(devices.target_camera, lambda image: find_board(image, board), refusals, k)
+        if seen is not None:
+            made.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
+    return _enough(made, views, refusals)
+
+
+def _look(camera: Camera, find: Callable[..., BoardView], refusals: list[str], k: int) -> BoardView | None:
+    try:
+        return find(camera.grab().image)
+    except RefusedError as error:
+        refusals.append(f"view {k + 1}: {error}")
+        return None
+
+
+def _enough(made: list[Made], views: list[View], refusals: list[str]) -> list[Made]:
+    if len(made) < LEAST_SHARE * len(views):
+        raise RefusedError(
+            f"only {len(made)} of {len(views)} calibration views show the board; check its place, the light and the "
+            "lens: " + "; ".join(refusals)
+        )
+    return made
