@@ -22,7 +22,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True)
-class Ending:
+class Failure:
     """Why a step did not succeed: the outcome it leads to unless it is repeated, and the reason in words.
 
     `code` is short and stable, for scripts. `recoverable` says that a recovery can clear it.

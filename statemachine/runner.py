@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Ending, OnFailure, Outcome, Policy, Step
+from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.sequence import STEPS, Sequence, SequenceError, State, Trigger
 from statemachine.step import Event, Observer, RunResult, StepCall, StepContext, StepOverrun, StepRecord, Summarised
 from statemachine.watch import Call, Clock, SignalWatch
+
+__all__ = ["Event", "RunResult", "Runner", "StepContext", "StepRecord"]
 
 POLL_S = 0.02
 """How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
@@ -45,7 +47,7 @@ class Runner:
     policy: Policy
     journal: Journal
     clock: Clock
-    classify: Callable[[BaseException], Ending]
+    classify: Callable[[BaseException], Failure]
     safe_stop: Callable[[str], None]
     observer: Observer | None = None
     recover: Callable[[BaseException], None] | None = None
@@ -93,12 +95,13 @@ class Runner:
                 end = self._drive()
             except Exception as error:
                 self._error = error
-                end = Ending(Outcome.FAULTED, f"the run could not go on: {error}", "run.internal")
+                end = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.internal")
             return self._finish(end)
 
     # --- the walk through the sequence ---
 
-    def _drive(self) -> Ending:
+    def _drive(self) -> Failure | None:
+        """Walk through the steps; None when all are done, else why not."""
         if (end := self._ask()) is not None:
             return end
         self.sequence.fire(Trigger.START)
@@ -108,9 +111,9 @@ class Runner:
                 return end
             self.sequence.facts.done.add(state)
             self.sequence.fire(Trigger.NEXT)
-        return Ending(Outcome.PLACED, "all steps done")
+        return None
 
-    def _perform(self, step: Step) -> Ending | None:
+    def _perform(self, step: Step) -> Failure | None:
         """Do one step, with its repetitions; None when it has succeeded."""
         attempt = 1
         while (end := self._attempt(step, attempt)) is not None:
@@ -133,7 +136,7 @@ class Runner:
             attempt += 1
         return None
 
-    def _recover(self, step: Step, error: BaseException, recover: Callable[[BaseException], None]) -> Ending | None:
+    def _recover(self, step: Step, error: BaseException, recover: Callable[[BaseException], None]) -> Failure | None:
         self.sequence.fire(Trigger.FAULT)
         self._stop(f"fault in {step.name}")
         self.sequence.fire(Trigger.RECOVER)
@@ -147,7 +150,7 @@ class Runner:
             self.sequence.fire(Trigger.RECOVERED)
         return end
 
-    def _attempt(self, step: Step, attempt: int) -> Ending | None:
+    def _attempt(self, step: Step, attempt: int) -> Failure | None:
         """One try: None, or the end that it leads to unless it is repeated."""
         started = self.clock.now()
         deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
@@ -178,9 +181,9 @@ class Runner:
 
     def _watch(
         self, call: Call, deadline: float, what: str, cancel: Callable[[str], None] | None = None
-    ) -> Ending | None:
+    ) -> Failure | None:
         """Wait for the end of `call`; on a request, a signal or the deadline stop the cell and say why."""
-        cause: Ending | None = None
+        cause: Failure | None = None
         while cause is None:
             if self.clock.wait(call.done, POLL_S * self.clock.rate):
                 return None
@@ -188,10 +191,10 @@ class Runner:
                 cause = self._ask()
             except JournalError as error:
                 self._error = error
-                cause = Ending(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
+                cause = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
             if cause is None and self.clock.now() > deadline:
                 self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
-                cause = Ending(Outcome.FAULTED, str(self._error), "step.deadline")
+                cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
         if cancel is not None:
             cancel(cause.reason)
         trouble = self._halt(cause.reason)
@@ -202,7 +205,7 @@ class Runner:
         self._tell(Event("safe_stop", None, {"reason": cause.reason, "trouble": trouble}))
         return cause
 
-    def _ask(self) -> Ending | None:
+    def _ask(self) -> Failure | None:
         """The end that somebody asked for, if any."""
         self._polls += 1
         if self._polls % REQUEST_POLLS == 1:
@@ -215,12 +218,12 @@ class Runner:
                     case "resume":
                         self.resume()
         if self._signals.reason is not None:
-            return Ending(Outcome.ABORTED, self._signals.reason, "signal")
+            return Failure(Outcome.ABORTED, self._signals.reason, "signal")
         if self._asked is not None:
-            return Ending(Outcome.ABORTED, self._asked, "request")
+            return Failure(Outcome.ABORTED, self._asked, "request")
         return None
 
-    def _hold(self) -> Ending | None:
+    def _hold(self) -> Failure | None:
         """Stay paused for as long as it is asked for."""
         end = self._ask()
         if end is None and self._paused.is_set():
@@ -233,16 +236,16 @@ class Runner:
                 self.sequence.fire(Trigger.RESUME)
         return end
 
-    def _judge(self, error: BaseException) -> Ending:
+    def _judge(self, error: BaseException) -> Failure:
         if isinstance(error, KeyboardInterrupt | SystemExit):
-            return Ending(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
+            return Failure(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
         text = "".join(traceback.format_exception(error))
         self.journal.event("traceback", self.sequence.state.value, {"text": text})
         try:
             return self.classify(error)
         except Exception as second:
             text = f"{type(error).__name__}: {error} (it could not be classified: {second})"
-            return Ending(Outcome.FAULTED, text, "run.internal")
+            return Failure(Outcome.FAULTED, text, "run.internal")
 
     # --- the end ---
 
@@ -257,21 +260,26 @@ class Runner:
         trouble = self._halt(reason)
         self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
 
-    def _finish(self, end: Ending) -> RunResult:
-        reason = f"end of the run ({end.outcome.value})"
+    def _finish(self, end: Failure | None) -> RunResult:
+        outcome = Outcome.PLACED if end is None else end.outcome
+        reason = f"end of the run ({outcome.value})"
         trouble = self._halt(reason)
+        said = "all steps done" if end is None else end.reason
         if trouble is not None:
-            end = Ending(Outcome.FAULTED, f"{end.reason}; the safe stop failed: {trouble}", "safe_stop")
+            end = Failure(Outcome.FAULTED, f"{said}; the safe stop failed: {trouble}", "safe_stop")
         try:
             self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
-            if end.outcome is not Outcome.PLACED:
+            if end is not None:
                 self.sequence.fire(_END_TRIGGERS[end.outcome])
-            self.journal.run_ended(end.outcome.value, end.reason)
+                outcome, said = end.outcome, end.reason
+            self.journal.run_ended(outcome.value, said)
         except (JournalError, SequenceError) as error:
-            end = Ending(Outcome.FAULTED, f"{end.reason}; the end could not be recorded: {error}", "run.internal")
+            outcome = Outcome.FAULTED
+            end = Failure(outcome, f"{said}; the end could not be recorded: {error}", "run.internal")
+            said = end.reason
         records = tuple(self._records[step.value] for step in STEPS)
-        results = dict(self._results)
-        return RunResult(end.outcome, end.reason, end.code, records, results, self._error, self._signals.number)
+        code = "" if end is None else end.code
+        return RunResult(outcome, said, code, records, dict(self._results), self._error, self._signals.number)
 
     # --- telling ---
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.clock import Clock
 from statemachine.journal import Journal, read, request
-from statemachine.policy import Ending, OnFailure, Outcome, Policy, Step
+from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.runner import Runner
 from statemachine.sequence import STEPS, Sequence, State
 
@@ -46,8 +46,8 @@ class Bench:
 
     def classify(self, error):
         if isinstance(error, ValueError):
-            return Ending(Outcome.REFUSED, str(error), "refused")
-        return Ending(Outcome.FAULTED, str(error), "fault", recoverable=isinstance(error, ConnectionError))
+            return Failure(Outcome.REFUSED, str(error), "refused")
+        return Failure(Outcome.FAULTED, str(error), "fault", recoverable=isinstance(error, ConnectionError))
 
     def safe_stop(self, reason):
         self.log.append(f"stop: {reason}")
