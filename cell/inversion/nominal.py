@@ -76,19 +76,19 @@ class NominalSurface:
 
         try:
             mesh = trimesh.load_mesh(path, process=True)
-            vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+            vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
         except Exception as error:  # every reader of trimesh raises its own
             raise ConfigError(
                 f"nominal surface {path} cannot be read as a mesh ({error}); give an STL or PLY"
             ) from error
-        surface = cls(vertices * (1.0 if unit == "m" else 1e-3), faces, rim)
-        extent = np.ptp(surface.vertices, axis=0)
-        if not 0.001 < extent.max() < 5.0:
+        vertices *= 1.0 if unit == "m" else 1e-3
+        extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
+        if not 0.001 < extent < 5.0:
             raise ConfigError(
-                f"nominal surface {path} measures {1e3 * extent.max():.3g} mm with mesh_unit = {unit!r}, allowed is "
+                f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r}, allowed is "
                 "1 to 5000 mm; check surface.mesh_unit in the job"
             )
-        return surface
+        return cls(vertices, faces, rim)
 
     def feet(self, points: ArrayLike, within: float = np.inf) -> tuple[Indices, Feet]:
         """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""

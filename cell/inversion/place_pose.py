@@ -162,8 +162,8 @@ def _demand(found: Registration, coverage: float, demands: Demands) -> None:
     """Refuse a scan that is not like the surface."""
     if coverage < demands.coverage:
         raise RefusedError(
-            f"the scan covers {100 * coverage:.0f} % of the nominal surface, at least {100 * demands.coverage:.0f} % is "
-            "needed. Lengthen the sweep or check where the surface lies"
+            f"the scan covers {100 * coverage:.0f} % of the nominal surface, at least "
+            f"{100 * demands.coverage:.0f} % is needed. Lengthen the sweep or check where the surface lies"
         )
     if found.share < demands.share:
         raise RefusedError(

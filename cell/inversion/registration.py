@@ -22,6 +22,8 @@ from drivers.errors import RefusedError
 SIGMA_FLOOR = 3e-6
 """Smallest standard deviation of a point along a normal, m: what a tessellation leaves."""
 COARSE_POINTS = 1200
+"""Points of the search from the start, and of the searches from other starts."""
+OTHER_POINTS = 400
 FINE_GATE = 0.0005
 """Correspondences farther than this are not used once the pose is nearly found, m."""
 CHI_GATE = 3.5
@@ -123,8 +125,9 @@ def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 |
     begin = prior.base_from_surface if start is None else start
     first = _first_gate(nominal, prior, begin)
     best, best_score = begin, -1.0
-    for attempt in _starts(begin, nominal, first):
-        pose = _coarse(attempt, thin, nominal, prior, first)
+    sparse = scan.thinned(OTHER_POINTS)
+    for count, attempt in enumerate(_starts(begin, nominal, first)):
+        pose = _coarse(attempt, sparse if count else thin, nominal, prior, first)
         score, share = _fit(pose, thin, nominal)
         if score > best_score:
             best, best_score = pose, score

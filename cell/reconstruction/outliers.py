@@ -17,12 +17,16 @@ THRESHOLD = 6.5
 
 The deviation is the lesser of two, so its median is less than a normal variable's and the sheet's 5 becomes 6.5.
 """
+LEAST_LEVEL = 0.25
+"""Smallest median absolute deviation that is taken for the noise, in units of the noise stated."""
 LEAST_NEIGHBOURS = 6
 """A point with fewer neighbours in its window is rejected: nothing supports it."""
-SCALE_OF_QUARTILE = 2.0
-"""Median over lower quartile of the absolute values of a normal variable; streaks on both sides spoil the median."""
-LEAST_PAIRS = 5
-"""With fewer pairs of opposite neighbours only the median of all neighbours is used."""
+SCALE_OF_QUARTILE = 1.5
+"""The local scale is so many lower quartiles of the deviations around: streaks on both sides spoil their median."""
+FEW_PAIRS = 5
+"""With fewer pairs of opposite neighbours the slope is also continued from one side."""
+LEAST_PAIRS = 3
+"""With fewer values for the slope only the median of all neighbours is used."""
 
 
 def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -44,10 +48,13 @@ def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> N
 
 
 def _level(values: Array, noise: Array) -> float:
-    """Median absolute deviation over the whole cloud, in units of the noise, from every seventh line and row."""
+    """Median absolute deviation over the whole cloud, in units of the noise, from every few lines and rows.
+
+    At least `LEAST_LEVEL`: nothing is an outlier that lies within the noise that was stated for it.
+    """
     deviations = _sampled(values, noise, 3 if values.size < 20_000 else 7)
     found = deviations[np.isfinite(deviations)]
-    return float(np.median(np.abs(found))) if len(found) else 1.0
+    return max(LEAST_LEVEL, float(np.median(np.abs(found)))) if len(found) else 1.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -83,20 +90,40 @@ def _gather(values: Array, line: int, row: int, buffer: Array) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _gather_pairs(values: Array, line: int, row: int, buffer: Array) -> int:
-    """Means of the values opposite each other about (line, row), into `buffer`; their number."""
+    """What a slope through the neighbours says of (line, row), into `buffer`; the number of such values.
+
+    The means of neighbours opposite each other; where these are few, at a border or beside a hole, also the lines
+    through two neighbours that lie behind each other.
+    """
     count = 0
+    inside = 2 <= line < values.shape[0] - 2 and 2 <= row < values.shape[1] - 2
     for i in range(-2, 1):
         for j in range(-2, 3):
             if i == 0 and j >= 0:
                 break
-            a, b, c, d = line + i, row + j, line - i, row - j
-            if a < 0 or c >= values.shape[0] or min(b, d) < 0 or max(b, d) >= values.shape[1]:
-                continue
-            mean = 0.5 * (values[a, b] + values[c, d])
+            if inside:
+                mean = 0.5 * (values[line + i, row + j] + values[line - i, row - j])
+            else:
+                mean = 0.5 * (_at(values, line + i, row + j) + _at(values, line - i, row - j))
             if not np.isnan(mean):
                 buffer[count] = mean
                 count += 1
+    if count < FEW_PAIRS:
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                beyond = 2.0 * _at(values, line + i, row + j) - _at(values, line + 2 * i, row + 2 * j)
+                if (i != 0 or j != 0) and not np.isnan(beyond):
+                    buffer[count] = beyond
+                    count += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _at(values: Array, line: int, row: int) -> float:
+    """The value there, NaN beyond the border."""
+    if 0 <= line < values.shape[0] and 0 <= row < values.shape[1]:
+        return float(values[line, row])
+    return np.nan
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,331 @@
+"""The pose found is the true one, its stated uncertainty is true, and what cannot be known is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from cell.geometry.poses import difference, perturbed
+from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.inversion.registration import Scan, register
+from cell.reconstruction import Cloud
+from drivers.errors import ConfigError, NotObservable, RefusedError
+
+Array = NDArray[np.float64]
+Height = Callable[[Array, Array], Array]
+
+SIGMA = 40e-6
+RAIL_SIGMA = 8e-6
+TRUE = pin.SE3(pin.exp3(np.array([0.01, -0.02, 0.03])), np.array([0.75, 0.01, 0.05]))
+JOB = Tolerance(translation=0.0006, rotation=0.006)
+LOOSE = np.diag([0.008**2] * 3 + [np.radians(20) ** 2] * 3)
+BOARD = np.diag([0.002**2] * 3 + [np.radians(0.6) ** 2] * 3)
+
+
+def freeform(x: Array, y: Array) -> Array:
+    """A pot-like relief without any symmetry, closed form, m."""
+    return 0.006 + 0.0015 * np.sin(150 * x + 70 * y + 0.4) + 0.0011 * np.sin(230 * y - 90 * x + 1.3) + 4 * x * y
+
+
+def seat(x: Array, y: Array) -> Array:
+    """A curved seat with two oblique steps, closed form, m."""
+    steps = 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008) - 0.001 * np.tanh((y - 0.15 * x - 0.006) / 0.0008)
+    return 0.005 + 3 * x**2 + 6 * y**2 + 0.05 * x + steps
+
+
+def bowl(x: Array, y: Array) -> Array:
+    """A surface of revolution about z, m."""
+    r2 = x**2 + y**2
+    return 0.003 + 6 * r2 + 0.001 * np.cos(np.sqrt(r2) * 300)
+
+
+def flat(x: Array, y: Array) -> Array:
+    """A plane, m."""
+    return 0.004 + 0.0 * x * y
+
+
+def cap(x: Array, y: Array) -> Array:
+    """A cap of a sphere of radius 40 mm about (0, 0, −32) mm, m."""
+    return -0.032 + np.sqrt(np.maximum(0.040**2 - x**2 - y**2, 0.0))
+
+
+@cache
+def nominal(height: Height, half_x: float = 0.035, half_y: float = 0.018, step: float = 0.0005) -> NominalSurface:
+    nx, ny = int(2 * half_x / step) + 1, int(2 * half_y / step) + 1
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, nx), np.linspace(-half_y, half_y, ny), indexing="ij")
+    index = np.arange(nx * ny).reshape(nx, ny)
+    a, b, c, d = (index[s, t].ravel() for s, t in _QUAD)
+    return NominalSurface(
+        np.stack([x.ravel(), y.ravel(), height(x.ravel(), y.ravel())], -1),
+        np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]),
+    )
+
+
+_QUAD = (
+    (slice(-1), slice(-1)),
+    (slice(1, None), slice(-1)),
+    (slice(1, None), slice(1, None)),
+    (slice(-1), slice(1, None)),
+)
+
+
+def scanned(
+    height: Height,
+    seed: int,
+    *,
+    true: pin.SE3 = TRUE,
+    missing: float = 0.0,
+    outliers: float = 0.01,
+    sigma: float = SIGMA,
+    shift: tuple[float, float] = (0.0015, -0.001),
+) -> Cloud:
+    """A cloud as a sweep gives it: the surface, the flat table around it, stripe and rail noise, outliers, gaps."""
+    rng = np.random.default_rng(seed)
+    lines, rows = 160, 240
+    x, y = np.meshgrid(
+        np.linspace(-0.036, 0.036, lines) + shift[0], np.linspace(-0.02, 0.02, rows) + shift[1], indexing="ij"
+    )
+    inside = (np.abs(x) < 0.035) & (np.abs(y) < 0.018)
+    points = np.stack([x, y, np.where(inside, height(x, y), 0.0)], -1)
+    across = np.array([0.06, 0.0, 1.0]) * sigma
+    points += across * rng.standard_normal((lines, rows, 1))
+    points[:, :, 0] += RAIL_SIGMA * rng.standard_normal((lines, 1))
+    wild = rng.random((lines, rows)) < outliers
+    points[wild, 2] += rng.uniform(-0.004, 0.004, int(wild.sum()))
+    if missing:
+        slant = x + 1.5 * y
+        points[slant > np.quantile(slant, 1 - missing)] = np.nan
+    spread = np.broadcast_to(across @ true.rotation.T, points.shape).astype(np.float32)
+    return Cloud(
+        points=points @ true.rotation.T + true.translation,
+        stripe_spread=spread,
+        rail_spread=np.tile(true.rotation[:, 0] * RAIL_SIGMA, (lines, 1)),
+        centres=np.zeros((lines, rows)),
+        rail=np.linspace(0, 0.07, lines),
+        rejected=np.zeros((lines, rows), dtype=bool),
+    )
+
+
+def start_away(rng: np.random.Generator, metres: float, degrees: float) -> pin.SE3:
+    way, axis = rng.normal(size=3), rng.normal(size=3)
+    turn = np.radians(degrees) * axis / np.linalg.norm(axis)
+    return perturbed(TRUE, np.concatenate([metres * way / np.linalg.norm(way), turn]))
+
+
+def inverted(height: Height, cloud: Cloud, prior: Prior, **options: object) -> PlacePose:
+    return invert_pose(cloud, nominal(height), prior, JOB, **options)  # type: ignore[arg-type]
+
+
+# --- the closest point ---
+
+
+def test_distances_to_the_mesh_are_those_to_the_closed_form_surface() -> None:
+    surface = nominal(freeform, step=0.00025)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.033, 0.033, 3000), rng.uniform(-0.016, 0.016, 3000)
+    gx, gy = (freeform(x + dx, y + dy) - freeform(x - dx, y - dy) for dx, dy in ((1e-6, 0), (0, 1e-6)))
+    normal = np.stack([-gx / 2e-6, -gy / 2e-6, np.ones_like(x)], -1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = rng.uniform(-0.0004, 0.0004, 3000)
+    found = surface.deviations(np.stack([x, y, freeform(x, y)], -1) + height[:, None] * normal)
+    assert np.abs(found - height).max() < 2e-6
+
+
+def test_closest_points_of_large_triangles_agree_with_a_brute_force_search() -> None:
+    vertices = np.array([[0, 0, 0], [0.03, 0, 0], [0.03, 0.02, 0.004], [0, 0.02, 0.001]], dtype=float)
+    surface = NominalSurface(vertices, [[0, 1, 2], [0, 2, 3]], rim=0.0)
+    s, t = np.meshgrid(np.linspace(0, 1, 400), np.linspace(0, 1, 400))
+    keep = s + t <= 1
+    bary = np.stack([1 - s[keep] - t[keep], s[keep], t[keep]], -1)
+    dense = np.concatenate([bary @ vertices[[0, 1, 2]], bary @ vertices[[0, 2, 3]]])
+    points = np.random.default_rng(1).uniform([-0.01, -0.01, -0.01], [0.04, 0.03, 0.01], (200, 3))
+    _, feet = surface.feet(points)
+    exact = np.linalg.norm(points - feet.points, axis=1)
+    brute = np.array([np.linalg.norm(dense - p, axis=1).min() for p in points])
+    assert np.all(exact <= brute + 1e-12)
+    assert np.all(brute - exact < 5e-5)
+
+
+def test_points_beside_the_surface_have_no_deviation() -> None:
+    beside = np.array([[0.0352, 0.0, 0.0], [0.0, 0.0185, 0.005], [0.06, 0.0, 0.0], [np.nan] * 3])
+    assert np.all(np.isnan(nominal(freeform).deviations(beside)))
+
+
+def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path) -> None:
+    import trimesh
+
+    surface = nominal(seat)
+    path = tmp_path / "seat.stl"
+    trimesh.Trimesh(surface.vertices * 1e3, surface.triangles).export(path)
+    loaded = NominalSurface.load(path, unit="mm")
+    assert loaded.radius == pytest.approx(surface.radius, rel=1e-6)
+    with pytest.raises(ConfigError, match="mesh_unit = 'm'"):
+        NominalSurface.load(path, unit="m")
+    (tmp_path / "broken.stl").write_bytes(b"solid nonsense")
+    with pytest.raises(ConfigError, match=r"broken\.stl"):
+        NominalSurface.load(tmp_path / "broken.stl")
+
+
+# --- the pose ---
+
+
+@pytest.mark.parametrize("height", [freeform, seat])
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(height: Height, missing: float) -> None:
+    rng = np.random.default_rng(5)
+    scores = []
+    for seed in range(6):
+        prior = Prior(perturbed(TRUE, rng.normal(size=6) * np.sqrt(np.diag(BOARD))), BOARD)
+        found = register(Scan.of(scanned(height, seed, missing=missing), 4000), nominal(height), prior)
+        error = difference(found.base_from_surface, TRUE)
+        assert np.linalg.norm(error[:3]) < 30e-6
+        assert np.linalg.norm(error[3:]) < 1e-3
+        scores.append(error @ np.linalg.solve(found.covariance, error))
+    # The mean of six χ² variables of six degrees of freedom, within four of its standard deviations.
+    assert 6 - 4 * np.sqrt(12 / 6) < np.mean(scores) < 6 + 4 * np.sqrt(12 / 6)
+
+
+@pytest.mark.parametrize("height", [freeform, seat])
+def test_the_pose_is_found_from_twenty_degrees_and_eight_millimetres_away(height: Height) -> None:
+    rng = np.random.default_rng(7)
+    scan = Scan.of(scanned(height, 3), 3000)
+    for _ in range(6):
+        start = start_away(rng, 0.008, 20.0)
+        found = register(scan, nominal(height), Prior(start, LOOSE))
+        error = difference(found.base_from_surface, TRUE)
+        assert np.linalg.norm(error[:3]) < 50e-6
+        assert np.linalg.norm(error[3:]) < 1.5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [freeform, seat])
+def test_at_least_99_of_100_starts_lead_to_the_true_pose(height: Height) -> None:
+    rng = np.random.default_rng(11)
+    lost = 0
+    for k in range(200):
+        scan = Scan.of(scanned(height, k, missing=0.4 * (k % 2)), 3000)
+        found = register(scan, nominal(height), Prior(start_away(rng, 0.008, 20.0), LOOSE))
+        lost += bool(np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) > 1e-4)
+    assert lost <= 2
+
+
+def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
+    sharp = np.diag([1e-7**2] * 3 + [1e-6**2] * 3)
+    board = perturbed(TRUE, [2e-5, -1e-5, 0, 0, 0, 1e-4])
+    found = register(Scan.of(scanned(freeform, 1), 3000), nominal(freeform), Prior(board, sharp))
+    assert np.abs(difference(found.base_from_surface, board)).max() < 1e-6
+
+
+def test_an_uncertainty_that_all_points_share_is_added() -> None:
+    arm = np.diag([1e-4**2] * 3 + [2e-4**2] * 3)
+    prior = Prior(TRUE, BOARD)
+    pose = inverted(freeform, scanned(freeform, 2), prior, systematic=arm)
+    assert np.allclose(pose.systematic, arm, rtol=0.02)
+    assert np.allclose(pose.covariance, pose.random + pose.systematic)
+
+
+def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
+    """A scale error of the sweep and a shift of the whole cloud, as a calibration would leave them."""
+    cloud, prior = scanned(freeform, 2), Prior(TRUE, BOARD)
+    moved = np.stack(
+        [np.array([1.0, 0.0, 0.0]) * 1e-3 * (cloud.points[:, :, :1] - 0.75), np.full_like(cloud.points, 5e-5)], -1
+    )
+    plain = inverted(freeform, cloud, prior)
+    stated = inverted(freeform, cloud, prior, calibration=lambda lines, rows: moved[lines, rows])
+    seen = np.zeros((6, 6))
+    for k in range(2):
+        other = Cloud(
+            cloud.points + moved[:, :, :, k],
+            cloud.stripe_spread,
+            cloud.rail_spread,
+            cloud.centres,
+            cloud.rail,
+            cloud.rejected,
+        )
+        step = difference(inverted(freeform, other, prior).base_from_surface, plain.base_from_surface)
+        seen += np.outer(step, step)
+    unit = np.sqrt(np.maximum(np.diag(seen), 1e-14))
+    assert np.abs((stated.systematic - seen) / np.outer(unit, unit))[:3, :3].max() < 0.1
+
+
+# --- what cannot be known ---
+
+
+def test_the_spin_of_a_bowl_is_not_determined_and_named() -> None:
+    cloud = scanned(bowl, 1)
+    with pytest.raises(NotObservable, match=r"rotation about the z axis .*is not determined: 3σ .* mrad > 6 mrad"):
+        inverted(bowl, cloud, Prior(TRUE, BOARD))
+
+
+def test_the_spin_stays_where_a_sharp_board_put_it() -> None:
+    sharp = np.diag([0.002**2] * 3 + [0.001**2] * 3)
+    board = perturbed(TRUE, [0.0005, -0.0005, 0.001, 0.0, 0.0, 0.0008])
+    pose = inverted(bowl, scanned(bowl, 1), Prior(board, sharp))
+    assert any("rotation about the z axis" in words for words in pose.verdict.unseen)
+    assert difference(pose.base_from_surface, board)[5] == pytest.approx(0.0, abs=2e-4)
+    assert np.linalg.norm((pose.base_from_surface.translation - TRUE.translation)[:2]) < 3e-5
+
+
+def test_a_plane_leaves_three_motions_open() -> None:
+    with pytest.raises(NotObservable) as caught:
+        inverted(flat, scanned(flat, 1, outliers=0.0), Prior(TRUE, BOARD))
+    assert str(caught.value).count("is not determined") == 3
+    assert "rotation about the z axis" in str(caught.value)
+    assert "translation along" in str(caught.value)
+
+
+def test_a_sphere_turns_freely_about_its_centre() -> None:
+    sharp = np.diag([0.002**2] * 3 + [0.0005**2] * 3)
+    board = perturbed(TRUE, [0.0003, 0.0002, -0.0004, 0, 0, 0])
+    surface = nominal(cap)
+    pose = invert_pose(scanned(cap, 1), surface, Prior(board, sharp), Tolerance(0.0006, 0.006))
+    assert len(pose.verdict.unseen) == 3
+    assert any("through (" in words and "-3" in words for words in pose.verdict.unseen)
+
+
+def test_a_freeform_surface_leaves_nothing_to_the_board() -> None:
+    pose = inverted(freeform, scanned(freeform, 4), Prior(TRUE, BOARD))
+    assert pose.verdict.unseen == ()
+    assert pose.verdict.observable
+    assert pose.verdict.spectrum[0] > 1e-3
+
+
+# --- refusals ---
+
+
+def test_another_surface_is_refused() -> None:
+    with pytest.raises(RefusedError, match="nominal surface"):
+        inverted(freeform, scanned(seat, 1), Prior(TRUE, BOARD))
+
+
+def test_a_scan_of_too_little_of_the_surface_is_refused() -> None:
+    with pytest.raises(RefusedError, match="covers"):
+        inverted(freeform, scanned(freeform, 1, missing=0.8), Prior(TRUE, BOARD))
+
+
+def test_a_scan_beside_the_surface_is_refused() -> None:
+    away = Prior(perturbed(TRUE, [0.2, 0, 0, 0, 0, 0]), BOARD)
+    with pytest.raises(RefusedError, match="is the scan over it"):
+        inverted(freeform, scanned(freeform, 1), away)
+
+
+def test_noise_beyond_the_demands_is_refused() -> None:
+    with pytest.raises(RefusedError, match=r"off the nominal surface, at most 0\.020 mm"):
+        inverted(freeform, scanned(freeform, 1), Prior(TRUE, BOARD), demands=Demands(rms=2e-5))
+
+
+def test_a_scan_that_contradicts_the_board_is_refused() -> None:
+    sharp = np.diag([0.0002**2] * 3 + [0.001**2] * 3)
+    with pytest.raises(RefusedError, match=r"scan and board disagree: the surface lies 3\.0\d mm"):
+        inverted(freeform, scanned(freeform, 1), Prior(perturbed(TRUE, [0.003, 0, 0, 0, 0, 0]), sharp))
+
+
+def test_tolerances_must_be_sensible() -> None:
+    with pytest.raises(ValueError, match="tolerances"):
+        Tolerance(0.0, 0.006)

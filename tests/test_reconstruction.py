@@ -1,0 +1,256 @@
+"""The cloud lies where an independent ray trace puts the surface, its noise is what it says, outliers are out."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from cell.geometry.camera import CameraModel
+from cell.geometry.light_plane import LightPlane
+from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry, calibration_motions, deviation_colours, write_ply
+from cell.reconstruction.outliers import find_outliers
+from cell.vision.stripe import StripeProfile
+from drivers.errors import RefusedError
+
+Array = NDArray[np.float64]
+
+DIST = (-0.08, 0.05, 4e-4, -3e-4, 0.0)
+MATRIX = np.array([[1668.0, 0.0, 322.0], [0.0, 1664.0, 237.0], [0.0, 0.0, 1.0]])
+CAMERA = CameraModel(640, 480, 1668.0, 1664.0, 322.0, 237.0, DIST)
+PLANE = LightPlane.of((1.0, 0.01, -1 / 3.5), -0.0351)
+RAIL = np.array([1.0008, 0.004, -0.003])
+MOUNT = pin.SE3(pin.utils.rotate("z", 1.57) @ pin.utils.rotate("x", 0.01), np.array([0.09, -0.05, 0.08]))
+GEOMETRY = ScanGeometry(CAMERA, PLANE, RAIL, MOUNT)
+DOWN = np.column_stack([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+BASE_FROM_FLANGE = pin.SE3(DOWN @ pin.utils.rotate("x", 0.02), np.array([0.70, -0.09, 0.26]))
+TABLE = 0.05
+"""Height of the scanned plane in the base, m."""
+
+
+def profile(centres: Array, sigma: float | Array = 0.07) -> StripeProfile:
+    n = len(centres)
+    none = np.zeros(n, dtype=bool)
+    filled = np.broadcast_to(np.asarray(sigma, dtype=float), (n,)).copy()
+    return StripeProfile("rows", centres, filled, np.full(n, 150.0), np.full(n, 2.0), none, none)
+
+
+def table_stripe(rail: float) -> Array:
+    """Columns (480,) at which OpenCV's projection sees the laser line on the table, from the base, point by point."""
+    base_from_camera = BASE_FROM_FLANGE * MOUNT
+    normal, offset = PLANE.n, PLANE.distance
+    origin = base_from_camera.translation + base_from_camera.rotation @ (rail * RAIL)
+    n = base_from_camera.rotation @ normal
+    # Table z = TABLE and light plane n·(p − origin) = offset meet in a line; sample it finely.
+    way = np.cross(n, [0.0, 0.0, 1.0])
+    a = np.array([n, [0, 0, 1], way])
+    foot = np.linalg.solve(a, [offset + n @ origin, TABLE, way @ origin])
+    line = foot + np.linspace(-0.03, 0.03, 4001)[:, None] * way / np.linalg.norm(way)
+    seen = (line - origin) @ base_from_camera.rotation
+    pixels = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), MATRIX, np.array(DIST))[0].reshape(-1, 2)
+    order = np.argsort(pixels[:, 1])
+    return np.interp(np.arange(480), pixels[order, 1], pixels[order, 0])
+
+
+def built(noise: float = 0.0, lines: int = 60) -> Cloud:
+    rng = np.random.default_rng(0)
+    builder = ProfileBuilder(GEOMETRY, expected_lines=16)
+    for rail in np.linspace(0.02, 0.08, lines):
+        centres = table_stripe(rail) + noise * rng.standard_normal(480)
+        assert builder.add(profile(centres, max(noise, 0.01)), rail, 1e-6) == 480
+    return builder.finish(BASE_FROM_FLANGE)
+
+
+# --- triangulation and frames ---
+
+
+def test_the_table_is_where_an_independent_projection_puts_it() -> None:
+    cloud = built()
+    assert cloud.shape == (60, 480)
+    assert np.abs(cloud.points[:, :, 2] - TABLE).max() < 1e-7
+    assert not cloud.rejected.any()
+
+
+def test_lines_are_spaced_as_the_carriage_moved() -> None:
+    cloud = built()
+    sweep = BASE_FROM_FLANGE.rotation @ MOUNT.rotation @ RAIL
+    step = np.diff(cloud.points.mean(axis=1), axis=0).mean(axis=0)
+    assert step[:2] == pytest.approx(sweep[:2] * 0.06 / 59, abs=3e-5)
+
+
+def test_the_noise_of_the_points_is_what_the_cloud_says() -> None:
+    cloud = built(noise=0.08)
+    lines, rows = np.nonzero(cloud.valid)
+    up = np.tile([0.0, 0.0, 1.0], (len(lines), 1))
+    sigma = cloud.sigma_along(lines, rows, up)
+    ratio = (cloud.points[lines, rows, 2] - TABLE) / sigma
+    assert np.std(ratio) == pytest.approx(1.0, abs=0.02)
+    assert np.abs(np.mean(ratio)) < 0.03
+    assert 1e-5 < np.median(sigma) < 5e-5
+    full = np.sqrt(cloud.covariances(lines, rows)[:, 2, 2])
+    assert np.allclose(full, sigma)
+
+
+def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says() -> None:
+    clouds = []
+    for error in (0.0, 2e-5):
+        builder = ProfileBuilder(GEOMETRY)
+        for rail in np.linspace(0.04, 0.05, 10):
+            builder.add(profile(table_stripe(rail)), rail + error, 2e-5)
+        clouds.append(builder.finish(BASE_FROM_FLANGE))
+    moved = clouds[1].points - clouds[0].points
+    assert np.abs(moved - clouds[0].rail_spread[:, None]).max() < 1e-12
+    assert np.linalg.norm(clouds[0].rail_spread, axis=1) == pytest.approx(2e-5 * np.linalg.norm(RAIL))
+
+
+def test_another_calibration_moves_the_points_as_foretold() -> None:
+    cloud = built()
+    other = ScanGeometry(CAMERA, LightPlane.of((1.0, 0.01, -1 / 3.501), -0.03512), RAIL * 1.0002, MOUNT)
+    lines, rows = cloud.subsample(500)
+    foretold = calibration_motions(cloud, lines, rows, BASE_FROM_FLANGE, GEOMETRY, [other])[:, :, 0]
+    builder = ProfileBuilder(other)
+    for rail in cloud.rail:
+        builder.add(profile(table_stripe(rail)), rail, 1e-6)
+    seen = builder.finish(BASE_FROM_FLANGE).points[lines, rows] - cloud.points[lines, rows]
+    assert np.abs(foretold - seen).max() < 1e-9
+    assert np.abs(foretold).max() > 1e-5
+
+
+def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
+    builder = ProfileBuilder(GEOMETRY)
+    for rail in (0.042, 0.040, 0.044, 0.041, 0.043):
+        centres = table_stripe(rail)
+        centres[100:200] = np.nan
+        builder.add(profile(centres), rail, 1e-5)
+    cloud = builder.finish(BASE_FROM_FLANGE)
+    assert np.all(np.diff(cloud.rail) > 0)
+    assert np.all(np.isnan(cloud.points[:, 100:200]))
+    assert cloud.size == 5 * 380
+
+
+def test_a_profile_of_another_camera_is_refused() -> None:
+    with pytest.raises(ValueError, match="camera of 480 rows"):
+        ProfileBuilder(GEOMETRY).add(profile(np.full(1024, 300.0)), 0.0, 1e-5)
+
+
+def test_a_sweep_without_points_is_refused() -> None:
+    builder = ProfileBuilder(GEOMETRY)
+    builder.add(profile(np.full(480, np.nan)), 0.0, 1e-5)
+    with pytest.raises(RefusedError, match="gave 0 points in 1 profiles"):
+        builder.finish(BASE_FROM_FLANGE)
+
+
+def test_the_cloud_is_ready_within_100_ms_of_the_last_frame() -> None:
+    rng = np.random.default_rng(0)
+    builder = ProfileBuilder(GEOMETRY, 256)
+    for rail in np.linspace(0.02, 0.08, 256):
+        builder.add(profile(table_stripe(rail) + 0.07 * rng.standard_normal(480)), rail, 1e-5)
+    builder.finish(BASE_FROM_FLANGE)
+    spent = []
+    for _ in range(3):
+        start = time.thread_time()
+        cloud = builder.finish(BASE_FROM_FLANGE)
+        spent.append(time.thread_time() - start)
+    assert cloud.size > 120_000
+    assert min(spent) < 0.1
+
+
+def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
+    cloud = built()
+    lines, rows = cloud.subsample(2000)
+    assert len(lines) <= 2000
+    assert np.bincount(lines, minlength=60).min() > 20
+    assert np.histogram(rows, bins=10, range=(0, 480))[0].min() > 150
+
+
+# --- outliers ---
+
+
+def relief(name: str, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Depth (256, 480) of a curved surface with noise, m, as a sweep samples it, and the noise's σ."""
+    x, y = np.meshgrid((np.arange(256) - 128) * 0.25e-3, (np.arange(480) - 240) * 0.078e-3, indexing="ij")
+    depth = 0.0015 * np.sin(150 * x + 70 * y) + 0.0011 * np.sin(230 * y - 90 * x)
+    if name == "steps":
+        depth = 3 * x**2 + 6 * y**2 + 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008)
+    sigma = 25e-6 * rng.uniform(0.7, 1.5, x.shape)
+    return depth + sigma * rng.standard_normal(x.shape), sigma
+
+
+def spoil(depth: Array, kind: str, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    bad = np.zeros(depth.shape, dtype=bool)
+    if kind == "streak":
+        # Streaks along a line, some lines apart so that each stands alone.
+        for line in rng.permutation(np.arange(3, 253, 7)):
+            if bad.mean() >= share:
+                break
+            first = rng.integers(5, 400)
+            bad[line, first : first + rng.integers(20, 70)] = True
+    else:
+        bad = rng.random(depth.shape) < share
+    low, high = (0.002, 0.008) if kind == "far" else (0.00028, 0.0008)
+    offset = rng.uniform(low, high, depth.shape) * np.where(kind == "streak", 1, rng.choice([-1, 1], depth.shape))
+    depth[bad] += offset[bad]
+    return bad
+
+
+@pytest.mark.parametrize("name", ["free-form", "steps"])
+@pytest.mark.parametrize("kind", ["far", "near", "streak"])
+@pytest.mark.parametrize("share", [0.01, 0.05])
+def test_outliers_are_found_and_little_else(name: str, kind: str, share: float) -> None:
+    rng = np.random.default_rng(4)
+    depth, sigma = relief(name, rng)
+    bad = spoil(depth, kind, share, rng)
+    depth[rng.random(depth.shape) < 0.02] = np.nan
+    bad &= np.isfinite(depth)
+    found = find_outliers(depth, sigma)
+    assert np.count_nonzero(found & bad) / np.count_nonzero(bad) >= 0.99
+    assert np.count_nonzero(found & bad) / np.count_nonzero(found) >= 0.90
+
+
+def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none() -> None:
+    depth = np.full((20, 20), np.nan)
+    assert not find_outliers(depth, np.ones_like(depth)).any()
+    depth[10, 10] = 0.1
+    assert find_outliers(depth, np.full_like(depth, 1e-5))[10, 10]
+
+
+# --- PLY ---
+
+
+def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
+    import trimesh
+
+    cloud = built(lines=12)
+    points = cloud.points.copy()
+    points[3, 100:120] = np.nan
+    quality = points[:, :, 2] - TABLE
+    colours = deviation_colours(quality, 1e-4)
+    path = tmp_path / "cloud.ply"
+    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    count = write_ply(path, points, normals=normals, quality=quality, colours=colours, comment="frame: arm base")
+    kept = np.isfinite(points[:, :, 0])
+    assert count == kept.sum()
+    loaded = trimesh.load(path)
+    assert np.allclose(loaded.vertices, points[kept], atol=1e-6)
+    assert np.array_equal(loaded.colors[:, :3], colours[kept])
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
+        assert line in header.splitlines()
+    assert path.stat().st_size == len(header) + len("end_header\n") + count * (7 * 4 + 3)
+
+
+def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="quality has 3 values for 2 points"):
+        write_ply(tmp_path / "x.ply", np.zeros((2, 3)), quality=np.zeros(3))
+
+
+def test_deviation_colours_run_from_blue_over_green_to_red() -> None:
+    colours = deviation_colours([-1.0, -0.001, 0.0, 0.001, np.nan], 0.001)
+    assert colours.tolist() == [[0, 0, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [128, 128, 128]]
+    with pytest.raises(ValueError, match="greater than 0"):
+        deviation_colours([0.0], 0.0)
