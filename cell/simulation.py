@@ -11,10 +11,11 @@ import os
 import select
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import CellConfig, default_toml
 from drivers.errors import ConfigError, DeviceFault
 
 START_TIMEOUT_S = 60.0
@@ -26,11 +27,13 @@ class SimulatedCell:
     def __init__(self, *, seed: int, level: str, speed: float, surface: str) -> None:
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
         command += ["--seed", str(seed), "--level", level, "--speed", repr(speed), "--surface", surface]
+        # A file, because a pipe that nobody reads would block the writer; closed with the process.
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._messages,
             start_new_session=True,  # Ctrl-C goes to the supervisor, which stops the devices before their world ends
         )
         try:
@@ -45,7 +48,7 @@ class SimulatedCell:
         return self._process.pid
 
     def _read_endpoints(self) -> dict[str, Any]:
-        assert self._process.stdout is not None and self._process.stderr is not None
+        assert self._process.stdout is not None
         deadline = time.monotonic() + START_TIMEOUT_S
         line = b""
         descriptor = self._process.stdout.fileno()
@@ -71,8 +74,8 @@ class SimulatedCell:
         if timed_out:
             return f"it did not start within {START_TIMEOUT_S:.0f} s"
         self._process.wait(5)
-        assert self._process.stderr is not None
-        text = self._process.stderr.read().decode(errors="replace").strip()
+        self._messages.seek(0)
+        text = self._messages.read().decode(errors="replace").strip()
         return text.splitlines()[-1] if text else f"it ended with exit code {self._process.returncode}"
 
     def close(self) -> None:
@@ -84,9 +87,9 @@ class SimulatedCell:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait(5)
-        for pipe in (self._process.stdout, self._process.stderr):
-            if pipe is not None and not pipe.closed:
-                pipe.close()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._messages.close()
 
 
 def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
@@ -105,3 +108,24 @@ def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
             "target_camera": config.target_camera.model_copy(update={"address": endpoints["target_camera"]["address"]}),
         }
     )
+
+
+def endpoint_toml(endpoints: dict[str, Any]) -> str:
+    """The shipped configuration's text with the addresses of a served simulated cell in it."""
+    values = {
+        ("cell", "time_scale"): str(float(endpoints["speed"])),
+        ("cell", "truth"): json.dumps(endpoints["truth"]["address"]),
+        ("rail", "url"): json.dumps(endpoints["rail"]["url"]),
+        ("arm", "address"): json.dumps(endpoints["arm"]["address"]),
+        ("vehicle", "interface"): json.dumps(endpoints["vehicle"]["interface"]),
+        ("vehicle", "channel"): json.dumps(endpoints["vehicle"]["channel"]),
+        ("scan_camera", "address"): json.dumps(endpoints["scan_camera"]["address"]),
+        ("target_camera", "address"): json.dumps(endpoints["target_camera"]["address"]),
+    }
+    table, lines = "", []
+    for line in default_toml().splitlines():
+        if line.startswith("["):
+            table = line[1 : line.index("]")]
+        value = values.get((table, line.split(" = ")[0]))
+        lines.append(line if value is None else f"{line.split(' = ')[0]} = {value}")
+    return "\n".join(lines) + "\n"

@@ -145,9 +145,11 @@ def _spec(world: World, camera: str) -> CameraSpec:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Serve until told to end. Exit code 0, or 2 for a wrong option."""
+def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], None] | None = None) -> int:
+    """Serve until told to end; `ready` is told the endpoints first. Exit code 0, or 2 for a wrong option."""
     options = _options(argv)
+    # Pictures are computed beside threads that answer devices' requests within milliseconds.
+    sys.setswitchinterval(0.0005)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -160,6 +162,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     with cell:
         endpoints = cell.endpoints()
+        if ready is not None:
+            ready(endpoints)
         print(json.dumps(endpoints) if options.json else _table(endpoints), flush=True)
         ended.wait()
     return 0

@@ -88,17 +88,18 @@ def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title="devices")
-    for name in ("device", "", "model", "serial", "firmware", "address"):
-        table.add_column(name, overflow="fold")
-    table.add_column("p50 ms", justify="right")
-    table.add_column("p99 ms", justify="right")
-    table.add_column("errors")
-    table.add_column("state", overflow="fold")
+    table = Table(title="devices", show_lines=True)
+    for name in ("device", "identity", "address", "ms p50\np99", "errors", "state"):
+        table.add_column(name, overflow="fold", justify="right" if name.startswith("ms") else "left")
     for row in rows:
         mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
+        identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
         table.add_row(
-            row.device, mark, row.model, row.serial, row.firmware, row.address, row.p50_text, row.p99_text,
-            row.errors_text, row.state,
-        )  # fmt: skip
+            f"{row.device}\n{mark}",
+            identity,
+            row.address,
+            f"{row.p50_text}\n{row.p99_text}",
+            row.errors_text,
+            row.state,
+        )
     Console().print(table)

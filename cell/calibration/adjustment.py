@@ -1,0 +1,257 @@
+"""The joint adjustment: camera, light plane, rail, hand-eye and board in one robust least-squares problem.
+
+The arm's poses and the rail's readings are unknowns too, held by their repeatability; groups of measurements whose
+noise is not known get it from their own residuals (variance components). Theory sheet, part 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.blocks import (
+    CAMERA,
+    COLUMNS,
+    HAND,
+    OWN,
+    PLANE,
+    RAIL,
+    SHARED,
+    State,
+    ViewData,
+    dots_block,
+    stripe_block,
+)
+from cell.geometry.camera import Array
+from cell.geometry.poses import difference
+
+DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01)
+HUBER = 2.5
+STEPS = 25
+VARIANCE_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known beforehand: one standard deviation each.
+
+    `arm_translation` (m) and `arm_rotation` (rad) per axis of a reported flange pose, `rail` (m) of a rail reading.
+    With `estimate_arm` the first two are starting values only and the residuals decide. `dots_scale` multiplies the
+    σ of the dots, `stripe_scale` that of the stripe; the residuals always decide on these.
+    """
+
+    arm_translation: float = 1e-4
+    arm_rotation: float = 2e-4
+    rail: float = 2e-5
+    estimate_arm: bool = False
+    dots_scale: float = 2.0
+    stripe_scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Result: the state, the covariance (27, 27) of the shared parameters, χ² per degree of freedom, found noise."""
+
+    state: State
+    covariance: Array
+    chi2_per_dof: float
+    dots_rms_px: float
+    stripe_rms_m: float
+    priors: Priors
+    iterations: int
+
+
+@dataclass(eq=False)
+class _Normal:
+    """Normal equations, kept apart by group so that the groups' redundancies can be told."""
+
+    groups: dict[str, Array]
+    right: Array
+    squares: dict[str, float]
+    counts: dict[str, int]
+
+    @property
+    def matrix(self) -> Array:
+        return np.asarray(sum(self.groups.values()), dtype=np.float64)
+
+    @property
+    def total(self) -> float:
+        return float(sum(self.squares.values()))
+
+
+class Adjustment:
+    """One problem: views, what is free, and the priors. `solve` iterates from a start."""
+
+    def __init__(self, views: Sequence[ViewData], free: NDArray[np.bool_], priors: Priors) -> None:
+        """`free` (27,) says which shared parameters move, in the order of `blocks`."""
+        self.views = list(views)
+        own_free = np.ones(OWN, dtype=np.bool_)
+        own_free[6] = bool(free[RAIL].any())
+        self.free = np.concatenate([free, np.tile(own_free, len(self.views))])
+        self.priors = priors
+
+    def solve(self, start: State, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
+        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals."""
+        state = replace(
+            start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
+        )
+        self._first_camera = start.camera.parameters
+        iterations = 0
+        normal = self._normal(state)
+        for turn in range(variance_rounds + 1):
+            state, normal, used = self._minimise(state, normal)
+            iterations += used
+            if turn < variance_rounds:
+                if not self._update_noise(normal):
+                    break
+                normal = self._normal(state)
+        index = np.flatnonzero(self.free)
+        inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
+        covariance = np.zeros((SHARED, SHARED))
+        shared = index[index < SHARED]
+        covariance[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
+        measured = sum(normal.counts.values())
+        dof = max(1, measured - len(index))
+        return Adjusted(
+            state,
+            covariance,
+            normal.total / dof,
+            *self.residual_rms(state),
+            self.priors,
+            iterations,
+        )
+
+    def residual_rms(self, state: State) -> tuple[float, float]:
+        """RMS of the dots in px (per component) and of the stripe's distances from the board in m; NaN when unseen."""
+        dots, stripe = [np.zeros(0)], [np.zeros(0)]
+        for view, flange, rail in zip(self.views, state.flanges, state.rails, strict=True):
+            if len(view.points):
+                dots.append(dots_block(state, view, flange, float(rail))[0].ravel())
+            if len(view.stripe) and state.plane is not None:
+                stripe.append(stripe_block(state, view, flange, float(rail))[0])
+        return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
+
+    def _minimise(self, state: State, normal: _Normal) -> tuple[State, _Normal, int]:
+        damping = 1e-6
+        index = np.flatnonzero(self.free)
+        used = 0
+        for _ in range(STEPS):
+            used += 1
+            matrix = normal.matrix[np.ix_(index, index)]
+            scale = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+            scaled = matrix / np.outer(scale, scale) + damping * np.eye(len(index))
+            step = np.zeros(len(self.free))
+            step[index] = np.linalg.solve(scaled, normal.right[index] / scale) / scale
+            candidate = state.moved(step)
+            new = self._normal(candidate)
+            if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
+                gain = normal.total - new.total
+                state, normal = candidate, new
+                damping = max(1e-9, 0.1 * damping)
+                if gain < 1e-7 * normal.total + 1e-9:
+                    break
+            else:
+                damping *= 20
+                if damping > 1e4:
+                    break
+        return state, normal, used
+
+    def _normal(self, state: State) -> _Normal:
+        size = len(self.free)
+        groups = {name: np.zeros((size, size)) for name in ("dots", "stripe", "shift", "turn", "rail", "lens")}
+        squares = dict.fromkeys(groups, 0.0)
+        counts = dict.fromkeys(groups, 0)
+        right = np.zeros(size)
+
+        def add(name: str, columns: NDArray[np.intp], jacobian: Array, residual: Array, cost: float) -> None:
+            groups[name][np.ix_(columns, columns)] += jacobian.T @ jacobian
+            right[columns] += jacobian.T @ residual
+            squares[name] += cost
+            counts[name] += len(residual)
+
+        for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
+            own = SHARED + OWN * k + np.arange(OWN)
+            columns = np.concatenate([np.arange(SHARED), own])
+            if len(view.points):
+                residual, jacobian = dots_block(state, view, flange, float(rail))
+                sigma = self.priors.dots_scale * view.sigma
+                white = residual / sigma[:, None]
+                weight, cost = _huber(np.linalg.norm(white, axis=1))
+                root = (np.sqrt(weight) / sigma)[:, None]
+                add(
+                    "dots",
+                    columns,
+                    (jacobian * root[:, :, None]).reshape(-1, COLUMNS),
+                    (residual * root).ravel(),
+                    cost,
+                )
+            if len(view.stripe) and state.plane is not None:
+                residual, jacobian, sigma = stripe_block(state, view, flange, float(rail))
+                sigma = self.priors.stripe_scale * sigma
+                weight, cost = _huber(np.abs(residual / sigma))
+                root = np.sqrt(weight) / sigma
+                add("stripe", columns, jacobian * root[:, None], residual * root, cost)
+            apart = -difference(flange, view.base_from_flange)
+            for name, part, deviation in (
+                ("shift", slice(0, 3), self.priors.arm_translation),
+                ("turn", slice(3, 6), self.priors.arm_rotation),
+            ):
+                white = apart[part] / deviation
+                add(name, own[part], np.eye(3) / deviation, white, float(white @ white))
+            if self.free[own[6]]:
+                white = np.array([(view.rail - rail) / self.priors.rail])
+                add("rail", own[6:], np.eye(1) / self.priors.rail, white, float(white @ white))
+        lens = np.arange(4, 8)[self.free[4:8]]
+        deviation = np.array(DISTORTION_PRIOR)[lens - 4]
+        if len(lens):
+            white = -state.camera.parameters[lens] / deviation
+            add("lens", lens, np.diag(1 / deviation), white, float(white @ white))
+        return _Normal(groups, right, squares, counts)
+
+    def _update_noise(self, normal: _Normal) -> bool:
+        """Scale each group's σ so that its χ² meets its redundancy; False when nothing changes much."""
+        index = np.flatnonzero(self.free)
+        inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
+        factors = {}
+        groups = ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else [])
+        for name in groups:
+            if normal.counts[name] == 0:
+                continue
+            taken = float(np.sum(inverse * normal.groups[name][np.ix_(index, index)]))
+            redundancy = max(normal.counts[name] - taken, 0.02 * normal.counts[name])
+            factors[name] = float(np.clip(np.sqrt(normal.squares[name] / redundancy), 0.1, 10.0))
+        p = self.priors
+        self.priors = replace(
+            p,
+            dots_scale=p.dots_scale * factors.get("dots", 1.0),
+            stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), 0.1),
+            arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
+            arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
+        )
+        return any(abs(np.log(f)) > 0.02 for f in factors.values())
+
+
+def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:
+    """Which of the 27 shared parameters move: always fx … k1, hand-eye and board; k3 never (it is not observable)."""
+    free = np.ones(SHARED, dtype=np.bool_)
+    free[CAMERA.start + 8] = False
+    free[5] = k2
+    free[6:8] = tangential
+    free[PLANE] = plane
+    free[RAIL] = rail
+    free[HAND] = True
+    return free
+
+
+def _huber(size: Array) -> tuple[Array, float]:
+    """Weights (n,) and cost of whitened residual lengths (n,)."""
+    weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
+    cost = np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2)
+    return weight, float(cost.sum())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

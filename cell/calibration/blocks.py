@@ -1,0 +1,155 @@
+"""Residuals of one view of a calibration, with their analytic derivatives: the dots in px, the stripe in m.
+
+Columns of every Jacobian: camera (9), light plane (3: two turns of the normal, distance), rail (3), hand-eye (6),
+board (6), then the view's own flange pose (6) and rail position (1). Poses move as in `cell.geometry.poses`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.circles import seen_centres
+from cell.geometry.light_plane import LightPlane
+from cell.geometry.poses import from_parts, perturbed
+
+CAMERA, PLANE, RAIL = slice(0, 9), slice(9, 12), slice(12, 15)
+HAND, BOARD = slice(15, 21), slice(21, 27)
+SHARED = 27
+FLANGE, POSITION = slice(27, 33), slice(33, 34)
+OWN = 7
+COLUMNS = SHARED + OWN
+
+
+@dataclass(frozen=True, eq=False)
+class ViewData:
+    """Measurements of one view: board points (n, 3) in m, their pixels (n, 2) and σ (n,), stripe pixels on the board.
+
+    `base_from_flange` and `rail` are as reported; `dot_radius` in m, 0 for corners. Empty arrays where nothing is seen.
+    """
+
+    points: Array
+    pixels: Array
+    sigma: Array
+    dot_radius: float
+    stripe: Array
+    stripe_sigma: Array
+    base_from_flange: pin.SE3
+    rail: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Everything that the adjustment estimates. `rail_direction` (3,): camera travel per metre of rail reading."""
+
+    camera: CameraModel
+    plane: LightPlane | None
+    rail_direction: Array
+    flange_from_camera: pin.SE3
+    base_from_board: pin.SE3
+    flanges: list[pin.SE3] = field(default_factory=list)
+    rails: Array = field(default_factory=lambda: np.zeros(0))
+
+    def moved(self, step: Array) -> State:
+        """The state after a step (27 + 7 per view,)."""
+        plane = self.plane
+        if plane is not None:
+            a, b = tangents(plane.n)
+            plane = LightPlane.of(plane.n + step[9] * a + step[10] * b, 1.0)
+            plane = replace(plane, distance=(self.plane.distance if self.plane else 0.0) + float(step[11]))
+        own = step[SHARED:].reshape(-1, OWN)
+        return State(
+            self.camera.with_parameters(self.camera.parameters + step[CAMERA]),
+            plane,
+            self.rail_direction + step[RAIL],
+            perturbed(self.flange_from_camera, step[HAND]),
+            perturbed(self.base_from_board, step[BOARD]),
+            [perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
+            self.rails + own[:, 6],
+        )
+
+    def camera_from_board(self, flange: pin.SE3, rail: float) -> pin.SE3:
+        """Pose of the board in the camera at a flange pose and a rail position."""
+        base_from_camera = flange * self.flange_from_camera * from_parts(rail * self.rail_direction)
+        return base_from_camera.inverse() * self.base_from_board
+
+
+def tangents(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors perpendicular to a unit normal and to each other."""
+    other = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    first = np.cross(normal, other)
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array]:
+    """Measured minus predicted pixels (n, 2), and the derivative of the prediction (n, 2, COLUMNS)."""
+    hand, board = state.flange_from_camera, state.base_from_board
+    turned = view.points @ board.rotation.T
+    in_base = turned + board.translation
+    from_flange = in_base - flange.translation
+    in_flange = from_flange @ flange.rotation
+    from_camera = in_flange - hand.translation
+    seen = from_camera @ hand.rotation - rail * state.rail_direction
+    to_camera = (flange.rotation @ hand.rotation).T
+    if view.dot_radius > 0:
+        # The centre of the ellipse moves with the circle; the little that it moves besides has no weight here.
+        seen = seen_centres(seen, to_camera @ board.rotation[:, 2], view.dot_radius)
+    pixels, by_point, by_camera = state.camera.project_with_jacobians(seen)
+    jacobian = np.zeros((len(seen), 2, COLUMNS))
+    jacobian[:, :, CAMERA] = by_camera
+    by_base = by_point @ to_camera
+    jacobian[:, :, RAIL] = -rail * by_point
+    by_flange_axes = by_point @ hand.rotation.T
+    jacobian[:, :, 15:18] = -by_flange_axes
+    jacobian[:, :, 18:21] = np.cross(by_flange_axes, from_camera[:, None, :])
+    jacobian[:, :, 21:24] = by_base
+    jacobian[:, :, 24:27] = np.cross(turned[:, None, :], by_base)
+    jacobian[:, :, 27:30] = -by_base
+    jacobian[:, :, 30:33] = np.cross(by_base, from_flange[:, None, :])
+    jacobian[:, :, 33] = -by_point @ state.rail_direction
+    return view.pixels - pixels, jacobian
+
+
+def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:
+    """Negative distance (m,) of the stripe points from the board's plane, derivative of the distance, σ (m,).
+
+    All in m. The sign makes the block like that of the dots, where the residual is measured minus predicted.
+    """
+    assert state.plane is not None
+    camera, plane, hand, board = state.camera, state.plane, state.flange_from_camera, state.base_from_board
+    rays, ray_by_pixel = camera.rays_with_jacobian(view.stripe)
+    points, by_ray, by_normal, by_distance = plane.intersect_with_jacobians(rays)
+    # A change of the camera's parameters moves a fixed pixel's ray as the opposite move of the pixel would.
+    _, _, by_camera = camera.project_with_jacobians(rays)
+    point_by_pixel = by_ray @ ray_by_pixel
+    moved = points + rail * state.rail_direction
+    turned = moved @ hand.rotation.T
+    in_flange = turned + hand.translation
+    swung = in_flange @ flange.rotation.T
+    in_base = swung + flange.translation
+    normal = board.rotation[:, 2]
+    normal_flange = flange.rotation.T @ normal
+    normal_camera = hand.rotation.T @ normal_flange
+    away = in_base - board.translation
+    distance = away @ normal
+    a, b = tangents(plane.n)
+    jacobian = np.zeros((len(points), COLUMNS))
+    by_pixel = normal_camera @ point_by_pixel
+    jacobian[:, CAMERA] = -np.einsum("ni,nij->nj", by_pixel, by_camera)
+    by_n = normal_camera @ by_normal
+    jacobian[:, 9], jacobian[:, 10] = by_n @ a, by_n @ b
+    jacobian[:, 11] = by_distance @ normal_camera
+    jacobian[:, RAIL] = rail * normal_camera
+    jacobian[:, 15:18] = normal_flange
+    jacobian[:, 18:21] = np.cross(turned, normal_flange)
+    jacobian[:, 21:24] = -normal
+    jacobian[:, 24:27] = np.cross(normal, away)
+    jacobian[:, 27:30] = normal
+    jacobian[:, 30:33] = np.cross(swung, normal)
+    jacobian[:, 33] = normal_camera @ state.rail_direction
+    sigma = np.linalg.norm(by_pixel, axis=1) * view.stripe_sigma
+    return -distance, jacobian, np.maximum(sigma, 1e-7)

@@ -1,0 +1,169 @@
+"""Closed-form starts of the joint adjustment: Zhang's camera and the paper's light plane, with its cross-ratio check.
+
+The paper's six steps (section 4.1) give the light plane by themselves; the joint adjustment starts from them and keeps
+them as a cross-check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.calibration.stripe_on_board import on_plane, points_on_board
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.light_plane import LightPlane
+from cell.vision.board_view import BoardView
+from cell.vision.stripe import StripeProfile
+from drivers.errors import RefusedError
+
+LEAST_VIEWS = 3
+
+
+def zhang(
+    views: Sequence[BoardView], nominal: CameraModel | None = None, lens: bool = True
+) -> tuple[CameraModel, Array]:
+    """Camera of several views of a board, and the RMS in px of each view (n,).
+
+    `nominal` is a start where it is known. Without `lens` no distortion is estimated. Raises RefusedError for fewer
+    than three views, or none that tell the focal length.
+    """
+    if len(views) < LEAST_VIEWS:
+        raise RefusedError(
+            f"{len(views)} views of the board; a camera's calibration needs {LEAST_VIEWS} or more from different sides"
+        )
+    size = views[0].size
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if not lens:
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    matrix, dist = np.eye(3), np.zeros(5)
+    if nominal is not None:
+        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+        matrix, dist = nominal.matrix, np.array(nominal.dist)
+    objects = [v.object_points.astype(np.float32) for v in views]
+    pixels = [v.pixels.astype(np.float32).reshape(-1, 1, 2) for v in views]
+    try:
+        result = cv2.calibrateCameraExtended(objects, pixels, size, matrix, dist, flags=flags)
+    except cv2.error as error:
+        raise RefusedError(
+            f"the {len(views)} views do not determine a camera: {error.err}; tilt the board more"
+        ) from error
+    matrix, dist, per_view = np.asarray(result[1]), np.asarray(result[2]).ravel()[:5], np.asarray(result[7]).ravel()
+    camera = CameraModel(size[0], size[1], 1.0, 1.0, 0.0, 0.0).with_parameters(
+        [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *dist]
+    )
+    if not 0.1 * max(size) < camera.fx < 100 * max(size):
+        raise RefusedError(
+            f"the {len(views)} views do not determine a camera (focal length {camera.fx:.0f} px); tilt the board more"
+        )
+    # OpenCV's figure is per point; ours everywhere is per component.
+    return camera, np.asarray(per_view / np.sqrt(2), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneStart:
+    """The light plane of the paper's steps, the RMS distance in m of its points, and the rows used per view."""
+
+    plane: LightPlane
+    rms: float
+    rows: list[NDArray[np.intp]]
+
+
+def plane_from_board(
+    camera: CameraModel,
+    camera_from_board: Sequence[pin.SE3],
+    views: Sequence[BoardView],
+    profiles: Sequence[StripeProfile | None],
+) -> PlaneStart:
+    """Steps 1 and 4 to 6 of the paper: stripe points on the board's plane in the camera frame, and their plane.
+
+    Frames whose stripe misses the board give no rows. Raises RefusedError when all points lie on one line.
+    """
+    rows, points = [], []
+    for pose, view, profile in zip(camera_from_board, views, profiles, strict=True):
+        chosen = (
+            np.empty(0, dtype=np.intp)
+            if profile is None
+            else points_on_board(camera, pose, view.spec, profile, view.dot_radius)
+        )
+        rows.append(chosen)
+        if profile is not None and len(chosen):
+            points.append(on_plane(camera, pose, stripe_pixels(profile, chosen)))
+    if not points:
+        raise RefusedError(
+            "no frame shows the laser stripe on the board; is the laser on, and does it cross the board?"
+        )
+    cloud = np.concatenate(points)
+    spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
+    if len(points) < 2 or spread[1] < 0.02 * spread[0]:
+        raise RefusedError(
+            f"the stripe was seen on the board in {len(points)} frames, all along one line; a light plane needs the "
+            "board at different distances or tilts"
+        )
+    keep = np.ones(len(cloud), dtype=np.bool_)
+    plane = LightPlane.fit(cloud)
+    for _ in range(5):
+        away = np.abs(plane.distances(cloud))
+        keep = away < 4 * 1.4826 * max(float(np.median(away)), 1e-9)
+        plane = LightPlane.fit(cloud[keep])
+    return PlaneStart(plane, float(np.sqrt(np.mean(plane.distances(cloud[keep]) ** 2))), rows)
+
+
+def stripe_pixels(profile: StripeProfile, rows: NDArray[np.intp]) -> Array:
+    """Pixels (n, 2) of some rows of a profile."""
+    pair = (profile.centres[rows], rows.astype(np.float64))
+    return np.column_stack(pair if profile.axis == "rows" else pair[::-1])
+
+
+def cross_ratio_check(
+    camera: CameraModel, camera_from_board: pin.SE3, view: BoardView, profile: StripeProfile, rows: NDArray[np.intp]
+) -> float:
+    """Step 3 of the paper as a check: RMS in m between two ways to say where the stripe meets each row of the board.
+
+    The cross ratio of three points of a board row and the stripe's crossing is the same in the picture (lens distortion
+    removed) as on the board; that place is compared with the one on the board's plane. NaN when no row is crossed.
+    """
+    stripe = camera.normalised(stripe_pixels(profile, rows))
+    if len(stripe) < 2:
+        return float("nan")
+    line = _line(stripe)
+    ideal = camera.normalised(view.pixels)
+    local = view.object_points
+    apart = []
+    for y in np.unique(local[:, 1]):
+        row = np.flatnonzero(local[:, 1] == y)
+        if len(row) < 3:
+            continue
+        chosen = row[np.argsort(local[row, 0])][[0, len(row) // 2, -1]]
+        crossing = np.cross(_line(ideal[row]), line)
+        if abs(crossing[2]) < 1e-12:
+            continue
+        place = crossing[:2] / crossing[2]
+        along = ideal[chosen[2]] - ideal[chosen[0]]
+        t = [float((p - ideal[chosen[0]]) @ along / (along @ along)) for p in (*ideal[chosen], place)]
+        x = _fourth(local[chosen, 0], t)
+        pixel = camera.project([[*place, 1.0]])
+        seen = (
+            on_plane(camera, camera_from_board, pixel)[0] - camera_from_board.translation
+        ) @ camera_from_board.rotation
+        apart.append(seen[0] - x)
+    return float(np.sqrt(np.mean(np.square(apart)))) if apart else float("nan")
+
+
+def _line(points: Array) -> Array:
+    """Homogeneous line (3,) that fits points (n, 2) best."""
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][1]
+    return np.array([normal[0], normal[1], -float(normal @ centre)])
+
+
+def _fourth(x: Array, t: Sequence[float]) -> float:
+    """The x whose cross ratio with three places x equals that of the parameters t (four, the last belongs to it)."""
+    ratio = ((t[2] - t[0]) * (t[3] - t[1])) / ((t[2] - t[1]) * (t[3] - t[0]))
+    a, b, c = (float(v) for v in x)
+    # (c − a)(d − b) = ratio (c − b)(d − a), solved for d.
+    return ((c - a) * b - ratio * (c - b) * a) / ((c - a) - ratio * (c - b))
