@@ -31,9 +31,8 @@ def separable_blur(image: Image, kernel: Image) -> None:
     across = np.empty((rows, cols), dtype=np.float32)
     line = np.empty(cols + 2 * radius, dtype=np.float32)
     for v in range(rows):
-        line[:radius] = image[v, 0]
-        line[radius : radius + cols] = image[v]
-        line[radius + cols :] = image[v, cols - 1]
+        for u in range(line.shape[0]):
+            line[u] = image[v, min(max(u - radius, 0), cols - 1)]
         out = across[v]
         scale(out, line[radius : radius + cols], kernel[radius])
         for k in range(0, radius, 3):

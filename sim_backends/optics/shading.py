@@ -25,7 +25,7 @@ def render_mesh(image: Image, optics: CameraOptics, instance: MeshInstance, ligh
     distance = float(pose[2, :3] @ mesh.middle + pose[2, 3])
     if distance < 1e-3:
         return
-    cell = int(np.clip(round(0.5 * mesh.leaf_size * optics.fx / distance), 1, 8))
+    cell = int(np.clip(round(0.9 * mesh.leaf_size * optics.fx / distance), 1, 12))
     lamp = pose[:3, :3].T @ np.array((0.0, 0.0, -1.0) if light.direction is None else light.direction)
     eye = -pose[:3, :3].T @ pose[:3, 3]
     shape = (optics.height // cell + 2, optics.width // cell + 2)
