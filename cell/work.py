@@ -124,7 +124,16 @@ class JobWork:
         """See `cell.steps.invert_pose`."""
         fix = cast(BoardFix, context.results["board_photo"])
         cloud = cast(Cloud, context.results["reconstruct"])
-        return invert_pose(cloud, fix, self._job, self._nominal, self._calibration.scan, self.repeatability)
+        sweep = cast(SweepRecord, context.results["laser_sweep"])
+        return invert_pose(
+            cloud,
+            sweep.base_from_flange,
+            fix,
+            self._job,
+            self._nominal,
+            self._calibration.scan,
+            self.repeatability,
+        )
 
     def place(self, context: StepContext) -> PlaceResult:
         """See `cell.steps.place`."""

@@ -14,9 +14,13 @@ from cell.geometry.camera import Array, CameraModel
 from cell.vision.board_spec import DOTS, BoardSpec
 from cell.vision.stripe import StripeProfile
 
-# How far beyond the outermost points the board is trusted to be flat: in pitches, and as a share of its diagonal.
+# How far beyond the outermost points there is board for certain, in pitches.
 MARGIN_PITCHES = {"marked_dots": 0.8, "asymmetric_dots": 0.8, "dots": 0.8, "chessboard": 2.0, "charuco": 1.5}
+# Further out, the stripe is followed as long as it stays straight within this share of the board's diagonal, no further
+# than the diagonal itself.
+FLATNESS = 0.003
 STRAIGHTNESS = 4.0
+LONGEST_GAP = 8
 LEAST_POINTS = 20
 
 
@@ -47,18 +51,48 @@ def points_on_board(
     points = spec.points()[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
     margin = MARGIN_PITCHES[spec.kind] * spec.pitch
-    with np.errstate(invalid="ignore"):
-        near = (local[:, :2] > low - margin) & (local[:, :2] < high + margin)
-    keep = np.asarray(near.all(axis=1), dtype=np.bool_)
-    keep &= ~profile.double[rows]
+    diagonal = float(np.linalg.norm(high - low + 2 * spec.pitch))
     # The stripe's half width on the board: σ in px times metres per pixel.
     half = 2.5 * profile.width[rows] * np.abs(seen[:, 2]) / camera.fx
-    keep &= _clear_of_print(local[:, :2], half, spec, dot_radius)
-    index = np.flatnonzero(keep)
+    usable = ~profile.double[rows] & _clear_of_print(local[:, :2], half, spec, dot_radius)
+    index = np.flatnonzero(usable & _within(local, low - margin, high + margin))
     if len(index) < LEAST_POINTS:
         return np.empty(0, dtype=np.intp)
     index = index[_straight(local[index, :2])]
-    return rows[index] if len(index) >= LEAST_POINTS else np.empty(0, dtype=np.intp)
+    if len(index) < LEAST_POINTS:
+        return np.empty(0, dtype=np.intp)
+    beyond = np.flatnonzero(usable & _within(local, low - diagonal, high + diagonal))
+    index = _followed(local[:, :2], index, beyond, FLATNESS * diagonal)
+    return np.asarray(rows[index], dtype=np.intp)
+
+
+def _within(local: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        inside = (local[:, :2] > low) & (local[:, :2] < high)
+    return np.asarray(inside.all(axis=1), dtype=np.bool_)
+
+
+def _followed(
+    local: Array, trusted: NDArray[np.intp], candidates: NDArray[np.intp], tolerance: float
+) -> NDArray[np.intp]:
+    """The trusted points and those beyond them, up to where the stripe leaves their line or breaks."""
+    centre = local[trusted].mean(axis=0)
+    direction, across = np.linalg.svd(local[trusted] - centre, full_matrices=False)[2]
+    away = np.abs((local - centre) @ across)
+    length = (local[trusted] - centre) @ direction
+    # A short stretch says little about the direction further out.
+    allowed = tolerance * np.clip(np.abs((local - centre) @ direction) / max(float(np.ptp(length)), 1e-9), 1.0, 3.0)
+    good = set(candidates[away[candidates] < allowed[candidates]].tolist())
+    kept = set(trusted.tolist())
+    for start, stop, step in ((int(trusted.max()), len(local), 1), (int(trusted.min()), -1, -1)):
+        gap = 0
+        for i in range(start, stop, step):
+            if i in good:
+                kept.add(i)
+                gap = 0
+            elif (gap := gap + 1) > LONGEST_GAP:
+                break
+    return np.array(sorted(kept), dtype=np.intp)
 
 
 def _clear_of_print(local: Array, half: Array, spec: BoardSpec, dot_radius: float) -> NDArray[np.bool_]:

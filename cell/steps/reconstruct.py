@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cell.calibration import ScanCalibration
-from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry, write_ply
+from cell.reconstruction import Cloud, ProfileBuilder, write_ply
 from cell.steps.laser_sweep import SweepRecord
 
 
@@ -15,10 +15,7 @@ def reconstruct(sweep: SweepRecord, calibration: ScanCalibration, rail_sigma: fl
     `rail_sigma` is the standard deviation in m of one profile's rail position. Raises `RefusedError` when too few
     points are left.
     """
-    geometry = ScanGeometry(
-        calibration.camera, calibration.light_plane, calibration.rail_direction, calibration.flange_from_camera
-    )
-    builder = ProfileBuilder(geometry, len(sweep.profiles))
+    builder = ProfileBuilder(calibration.geometry(), len(sweep.profiles))
     for profile, position in zip(sweep.profiles, sweep.positions, strict=True):
         builder.add(profile, float(position), rail_sigma)
     cloud = builder.finish(sweep.base_from_flange)

@@ -1,11 +1,29 @@
-"""How the kernels of the optics are compiled: once, kept on disk, and without holding the interpreter's lock."""
+"""How the kernels of the optics are compiled: once, kept on disk, and without holding the interpreter's lock.
 
+Numba keeps compiled kernels by the file that they stand in and does not see when a kernel that they call has changed in
+another file. They are therefore kept in a folder named after the text of all of them.
+"""
+
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def _cache_folder() -> str:
+    here = Path(__file__).parent
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))).hexdigest()[:16]
+    root = here / "__pycache__" if os.access(here, os.W_OK) else Path.home() / ".cache" / "assembly-cell"
+    return str(root / f"kernels-{digest}")
+
+
+if not numba.config.CACHE_DIR:
+    numba.config.CACHE_DIR = _cache_folder()
 
 
 def compiled(function: Function) -> Function:

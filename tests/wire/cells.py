@@ -1,0 +1,95 @@
+"""Simulated cells and the command line for tests that use the whole as an engineer would."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from drivers.clock import Clock
+from statemachine.journal import JournalError, read
+
+SPEED = "3"
+
+
+def command(*arguments: str) -> list[str]:
+    """A `cell` command line that runs this checkout."""
+    return [sys.executable, "-c", "from cell.cli import main; main()", *arguments]
+
+
+def cell(*arguments: str, folder: Path, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:
+    """Run a `cell` command to its end in `folder`."""
+    return subprocess.run(command(*arguments), cwd=folder, capture_output=True, text=True, timeout=timeout)
+
+
+@contextmanager
+def started(*arguments: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A `cell` command that is going on; killed at the end if it still is."""
+    process = subprocess.Popen(
+        command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@contextmanager
+def served(folder: Path, *arguments: str) -> Iterator[dict[str, Any]]:
+    """A simulated cell and `sim.toml` in `folder` that names it; yields its endpoints."""
+    toml = folder / "sim.toml"
+    toml.unlink(missing_ok=True)
+    with started(
+        "sim", "serve", "--json", "--speed", SPEED, "--config-out", str(toml), *arguments, folder=folder
+    ) as sim:
+        assert sim.stdout is not None
+        yield json.loads(sim.stdout.readline())
+        if sim.poll() is None:
+            sim.send_signal(signal.SIGINT)
+            assert sim.wait(10) == 0
+
+
+def ask(endpoints: dict[str, Any], **request: str) -> dict[str, Any]:
+    """A request to the truth endpoint."""
+    host, port = endpoints["truth"]["address"].rsplit(":", 1)
+    with socket.create_connection((host, int(port)), timeout=10) as link, link.makefile("rwb") as file:
+        file.write(json.dumps(request).encode() + b"\n")
+        file.flush()
+        answer: dict[str, Any] = json.loads(file.readline())
+    assert answer["ok"], answer
+    return answer
+
+
+def assert_safe(endpoints: dict[str, Any]) -> None:
+    """Laser off, vehicle stopped and braked, rail and arm at rest, by the world's truth."""
+    truth = ask(endpoints, op="truth")["truth"]
+    assert not truth["laser_on"]
+    assert truth["vehicle"]["stopped"]
+    assert truth["vehicle"]["braked"]
+    assert not truth["rail_moving"]
+    assert not truth["arm"]["moving"]
+
+
+def wait_for_step(folder: Path, step: str, timeout: float = 120.0) -> Path:
+    """Wait until the newest run in `folder` is in `step`; gives the run's folder."""
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        for run in sorted((folder / "runs").glob("*")):
+            try:
+                record = read(run)
+            except JournalError:
+                continue
+            if not record.finished and any(row.name == step and row.state == "running" for row in record.steps):
+                return run
+        Clock().sleep(0.05)
+    raise AssertionError(f"no run came to {step} within {timeout} s")

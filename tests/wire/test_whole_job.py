@@ -1,0 +1,213 @@
+"""The whole job on the simulated cell, as an engineer runs it: placed, aborted, killed, faulted, refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cell.runs import list_runs
+from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
+
+pytestmark = pytest.mark.wire
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the calibration of the simulated cell of seed 3 in it."""
+    folder = tmp_path_factory.mktemp("cell")
+    done = cell("calibrate", "--sim", "all", "--seed", "3", "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def placed(place: Path) -> dict[str, Any]:
+    """The report of a dry run that ended placed."""
+    done = cell("dry-run", "--seed", "3", "--json", folder=place)
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+def test_a_dry_run_places_the_part_within_the_nominal_bound(placed: dict[str, Any]) -> None:
+    assert placed["outcome"] == "placed"
+    assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
+    assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
+
+
+def test_the_report_keeps_its_contract(placed: dict[str, Any]) -> None:
+    assert {"outcome", "seed", "level", "steps", "place_pose", "place_sigma", "assumed_noise", "truth"} <= set(placed)
+    assert placed["seed"] == 3
+    assert placed["level"] == "nominal"
+    for step in placed["steps"]:
+        assert {"name", "state", "duration_s", "retries"} <= set(step)
+    truth = placed["truth"]
+    assert truth["points"] == 45
+    assert {"x", "y", "z", "d"} == set(truth["error_mm"])
+    assert {"mean", "p85"} <= set(truth["sensor_mm"])
+    assert 0 < truth["bound_mm"] < 0.5
+    assert truth["d_p95"] <= truth["error_mm"]["d"]["max"] + 1e-9
+
+
+def test_the_placed_part_ends_a_safe_cell(placed: dict[str, Any]) -> None:
+    end = placed["end_state"]
+    assert not end["laser_on"]
+    assert end["vehicle"]["braked"]
+    assert not end["arm"]["moving"]
+    assert not end["part"]["held"]
+
+
+def test_the_run_folder_holds_everything(place: Path, placed: dict[str, Any]) -> None:
+    folder = place / "runs" / placed["run"]
+    names = {path.name for path in folder.iterdir()}
+    assert {"report.json", "picture.png", "cloud.ply", "journal.sqlite", "frames", "configuration.json", "job.json",
+            "calibration.json"} <= names  # fmt: skip
+    assert len(list((folder / "frames").glob("stripe-*.png"))) > 50
+    base = sqlite3.connect(folder / "journal.sqlite")
+    done = [name for (name,) in base.execute("SELECT name FROM steps WHERE state = 'done' ORDER BY id")]
+    assert done == [step["name"] for step in placed["steps"]]
+
+
+def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
+    with served(place, "--seed", "3") as endpoints:
+        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+            wait_for_step(place, "laser_sweep")
+            os.kill(run.pid, signal.SIGINT)
+            out, err = run.communicate(timeout=30)
+        assert run.returncode == 130, err
+        report = json.loads(out)
+        assert report["outcome"] == "aborted"
+        assert "keyboard" in report["reason"]
+        assert "Traceback" not in err
+        assert_safe(endpoints)
+
+
+def test_cell_abort_ends_a_run_from_another_shell(place: Path) -> None:
+    with served(place, "--seed", "3") as endpoints:
+        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+            wait_for_step(place, "drive_to_target")
+            held = cell("jog", "rail", "+1mm", "-c", "sim.toml", folder=place)
+            asked = cell("abort", "-c", "sim.toml", folder=place)
+            out, err = run.communicate(timeout=30)
+        assert held.returncode == 1
+        assert "held by process" in held.stderr
+        assert asked.returncode == 0, asked.stderr
+        assert run.returncode == 1, err
+        assert json.loads(out)["outcome"] == "aborted"
+        assert_safe(endpoints)
+
+
+def test_an_emergency_stop_faults_the_run_and_names_the_arm(place: Path) -> None:
+    with served(place, "--seed", "3") as endpoints:
+        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+            wait_for_step(place, "laser_sweep")
+            ask(endpoints, op="fault", name="arm.emergency_stop")
+            out, err = run.communicate(timeout=60)
+        assert run.returncode == 1, err
+        report = json.loads(out)
+        assert report["outcome"] == "faulted"
+        assert "emergency" in report["reason"]
+        truth = ask(endpoints, op="truth")["truth"]
+        assert not truth["laser_on"]
+        assert truth["vehicle"]["braked"]
+
+
+def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path) -> None:
+    with started("dry-run", "--seed", "3", "--json", folder=place) as run:
+        wait_for_step(place, "laser_sweep")
+        children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+        world = next(pid for pid in children if b"sim_backends" in Path(f"/proc/{pid}/cmdline").read_bytes())
+        os.kill(int(world), signal.SIGKILL)
+        killed = time.monotonic()
+        out, err = run.communicate(timeout=30)
+        took = time.monotonic() - killed
+    assert run.returncode == 1
+    assert took < 10
+    assert "Traceback" not in err
+    report = json.loads(out)
+    assert report["outcome"] == "faulted"
+    assert any(name in report["reason"] for name in ("arm", "camera", "rail", "vehicle"))
+    for pid in children:
+        assert not Path(f"/proc/{pid}").exists()
+
+
+def test_two_dry_runs_at_once_do_not_disturb_each_other(place: Path) -> None:
+    again = ("dry-run", "--seed", "3", "--json")
+    with started(*again, folder=place) as first, started(*again, folder=place) as second:
+        texts = [run.communicate(timeout=240) for run in (first, second)]
+    for (out, err), run in zip(texts, (first, second), strict=True):
+        assert run.returncode == 0, err
+        assert json.loads(out)["outcome"] == "placed"
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (('lead = "2 mm"', "lead = 2"), "rail.lead"),
+        (("microsteps", "mikrosteps"), "rail.mikrosteps"),
+        (('max_joint_speed = "60 deg/s"', 'max_joint_speed = "9000 deg/s"'), "1 to 120 deg/s"),
+    ],
+)
+def test_a_wrong_configuration_is_one_clear_message_and_2(tmp_path: Path, edit: tuple[str, str], words: str) -> None:
+    assert cell("init", ".", folder=tmp_path).returncode == 0
+    toml = tmp_path / "cell.toml"
+    toml.write_text(toml.read_text().replace(*edit))
+    done = cell("dry-run", "-c", "cell.toml", folder=tmp_path)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list_runs(tmp_path / "runs") == []
+
+
+def test_a_job_with_a_missing_mesh_is_refused_with_2(tmp_path: Path) -> None:
+    assert cell("init", ".", folder=tmp_path).returncode == 0
+    (tmp_path / "pot.stl").unlink()
+    done = cell("dry-run", "-j", "pot.toml", folder=tmp_path)
+    assert done.returncode == 2
+    assert "pot.stl" in done.stderr
+
+
+def test_a_run_without_a_calibration_of_this_cell_is_refused(tmp_path: Path) -> None:
+    with served(tmp_path, "--seed", "4"):
+        done = cell("run", "-c", "sim.toml", folder=tmp_path)
+    assert done.returncode == 1
+    assert "calibrat" in done.stderr
+
+
+def test_diag_shows_every_device_and_fails_when_one_does(tmp_path: Path) -> None:
+    with served(tmp_path, "--seed", "3"):
+        good = cell("diag", "-c", "sim.toml", "--json", folder=tmp_path)
+        toml = tmp_path / "sim.toml"
+        toml.write_text(toml.read_text().replace('url = "socket://127.0.0.1:', 'url = "socket://127.0.0.1:1'))
+        bad = cell("diag", "-c", "sim.toml", "--json", folder=tmp_path)
+    rows = json.loads(good.stdout)
+    assert good.returncode == 0
+    assert set(rows) == {"arm", "rail", "vehicle", "scan_camera", "target_camera", "laser", "claw"}
+    assert all(row["ok"] and np.isfinite(row["p99_ms"]) for row in rows.values())
+    assert bad.returncode == 1
+    assert not json.loads(bad.stdout)["rail"]["ok"]
+
+
+def test_jogs_move_and_are_refused_outside_the_limits(tmp_path: Path) -> None:
+    with served(tmp_path, "--seed", "3") as endpoints:
+        before = np.array(ask(endpoints, op="truth")["truth"]["poses"]["base_from_flange"])
+        assert cell("jog", "arm", "z", "-10mm", "-c", "sim.toml", folder=tmp_path).returncode == 0
+        after = np.array(ask(endpoints, op="truth")["truth"]["poses"]["base_from_flange"])
+        assert after[2, 3] - before[2, 3] == pytest.approx(-0.010, abs=0.0005)
+        assert cell("jog", "rail", "+5mm", "-c", "sim.toml", folder=tmp_path).returncode == 0
+        assert ask(endpoints, op="truth")["truth"]["rail"]["carriage"] == pytest.approx(0.005, abs=0.0002)
+        start = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
+        assert cell("jog", "vehicle", "+0.1m", "-c", "sim.toml", folder=tmp_path).returncode == 0
+        end = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
+        assert np.linalg.norm(end[:2, 3] - start[:2, 3]) == pytest.approx(0.1, abs=0.01)
+        refused = cell("jog", "rail", "-20mm", "-c", "sim.toml", folder=tmp_path)
+        assert refused.returncode == 1
+        assert "0 mm" in refused.stderr or "0 to 100" in refused.stderr
