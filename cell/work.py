@@ -23,7 +23,7 @@ from cell.steps.board_photo import board_photo
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.invert_pose import invert_pose
 from cell.steps.laser_sweep import SweepRecord, laser_sweep
-from cell.steps.moves import Mover
+from cell.steps.moves import HOME, Mover
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.place import PlaceResult, place
 from cell.steps.reconstruct import reconstruct
@@ -70,6 +70,7 @@ class JobWork:
         """See `cell.steps.drive_to_target`."""
         context.progress(0.0, "arm to the looking pose")
         self._devices.vehicle.brake()
+        self._mover.to_joints(HOME)
         camera = self._calibration.target.flange_from_camera
         self._mover.to(look_pose(self._config, self._job, self._board, camera), "the looking pose")
         self._devices.target_camera.configure(self._config.target_camera.photo_exposure, 10.0)

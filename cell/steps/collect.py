@@ -10,7 +10,7 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.config import CellConfig
 from cell.geometry.poses import from_ur
 from cell.planning import View, scan_calibration_views, target_calibration_views
-from cell.steps.moves import Mover
+from cell.steps.moves import HOME, Mover
 from cell.vision import BoardView, extract, find_board, parse_board
 from drivers.errors import RefusedError
 from drivers.interfaces import Camera
@@ -38,6 +38,7 @@ def collect_scan(
     if not rail.state().homed:
         progress(0.0, "homing the rail")
         rail.home().wait(60.0)
+    mover.to_joints(HOME)
     made: list[ScanObservation] = []
     refusals: list[str] = []
     for k, view in enumerate(views):

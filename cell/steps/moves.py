@@ -22,7 +22,10 @@ from drivers.interfaces import Arm
 
 PLATE_THICKNESS = 0.01
 HOME = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
-"""Where `cell home` brings the arm: folded above the deck, tool down."""
+"""Where `cell home` brings the arm, and where jobs and calibrations begin: folded above the deck, tool down.
+
+Postures are chosen nearest to the present one, so a fixed beginning keeps the arm in one of its configurations.
+"""
 
 
 class Mover:
