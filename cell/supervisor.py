@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from cell.assembly import Devices, connect
-from cell.calibration import CellCalibration, load_calibration, save_calibration
 from cell.config import CellConfig, load_config
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface
@@ -25,6 +24,7 @@ from cell.runs import REPORT, CellLock, new_run, write_json
 from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
+from cell.stored_calibration import CellCalibration, find_calibration, save_calibration
 from cell.work import JobWork
 from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError, DeviceError, DeviceFault, RefusedError
 from statemachine.journal import Journal
@@ -221,11 +221,11 @@ class Cell:
 
     def calibration(self) -> CellCalibration:
         """The stored calibration of this very cell as configured; raises `CalibrationStale` that says what differs."""
-        return load_calibration(
+        return find_calibration(
             self.calibrations_folder,
-            identities=self._identities(),
-            configuration=self.config.calibration_hash(),
-            max_age_s=self.config.calibration.max_age,
+            self._identities(),
+            self.config.calibration_hash(),
+            self.config.calibration.max_age,
         )
 
     def _identities(self) -> dict[str, str]:

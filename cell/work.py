@@ -12,7 +12,6 @@ from typing import cast
 import numpy as np
 
 from cell.assembly import Devices
-from cell.calibration import CellCalibration
 from cell.config import CellConfig
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface, PlacePose
@@ -27,6 +26,7 @@ from cell.steps.moves import HOME, Mover
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.place import PlaceResult, place
 from cell.steps.reconstruct import reconstruct
+from cell.stored_calibration import CellCalibration
 from cell.vision import parse_board
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext

@@ -43,8 +43,8 @@ class Priors:
     σ of the dots, `stripe_scale` that of the stripe; the residuals always decide on these.
     """
 
-    arm_translation: float = 1e-4
-    arm_rotation: float = 2e-4
+    arm_translation: float = 3e-5
+    arm_rotation: float = 6e-5
     rail: float = 2e-5
     estimate_arm: bool = False
     dots_scale: float = 2.0
@@ -98,15 +98,15 @@ class Adjustment:
         state = replace(
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
         )
-        self._first_camera = start.camera.parameters
         iterations = 0
         normal = self._normal(state)
         for turn in range(variance_rounds + 1):
-            state, normal, used = self._minimise(state, normal)
+            # Until the noise is settled there is no point in the last digits.
+            settled = 1e-3 if turn < variance_rounds else 1e-7
+            state, normal, used = self._minimise(state, normal, settled)
             iterations += used
             if turn < variance_rounds:
-                if not self._update_noise(normal):
-                    break
+                self._update_noise(normal)
                 normal = self._normal(state)
         index = np.flatnonzero(self.free)
         inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
@@ -134,7 +134,7 @@ class Adjustment:
                 stripe.append(stripe_block(state, view, flange, float(rail))[0])
         return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
 
-    def _minimise(self, state: State, normal: _Normal) -> tuple[State, _Normal, int]:
+    def _minimise(self, state: State, normal: _Normal, settled: float) -> tuple[State, _Normal, int]:
         damping = 1e-6
         index = np.flatnonzero(self.free)
         used = 0
@@ -151,7 +151,7 @@ class Adjustment:
                 gain = normal.total - new.total
                 state, normal = candidate, new
                 damping = max(1e-9, 0.1 * damping)
-                if gain < 1e-7 * normal.total + 1e-9:
+                if gain < settled * normal.total + 1e-9:
                     break
             else:
                 damping *= 20
@@ -211,8 +211,8 @@ class Adjustment:
             add("lens", lens, np.diag(1 / deviation), white, float(white @ white))
         return _Normal(groups, right, squares, counts)
 
-    def _update_noise(self, normal: _Normal) -> bool:
-        """Scale each group's σ so that its χ² meets its redundancy; False when nothing changes much."""
+    def _update_noise(self, normal: _Normal) -> None:
+        """Scale each group's σ so that its χ² meets its redundancy."""
         index = np.flatnonzero(self.free)
         inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
         factors = {}
@@ -231,7 +231,6 @@ class Adjustment:
             arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
             arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
         )
-        return any(abs(np.log(f)) > 0.02 for f in factors.values())
 
 
 def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:

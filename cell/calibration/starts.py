@@ -40,7 +40,8 @@ def zhang(
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if not lens:
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    matrix, dist = np.eye(3), np.zeros(5)
+    matrix: Array = np.eye(3)
+    dist: Array = np.zeros(5)
     if nominal is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, dist = nominal.matrix, np.array(nominal.dist)
@@ -52,7 +53,9 @@ def zhang(
         raise RefusedError(
             f"the {len(views)} views do not determine a camera: {error.err}; tilt the board more"
         ) from error
-    matrix, dist, per_view = np.asarray(result[1]), np.asarray(result[2]).ravel()[:5], np.asarray(result[7]).ravel()
+    matrix = np.asarray(result[1], dtype=np.float64)
+    dist = np.asarray(result[2], dtype=np.float64).ravel()[:5]
+    per_view = np.asarray(result[7], dtype=np.float64).ravel()
     camera = CameraModel(size[0], size[1], 1.0, 1.0, 0.0, 0.0).with_parameters(
         [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *dist]
     )

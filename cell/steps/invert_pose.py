@@ -27,8 +27,8 @@ def invert_pose(
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
     `base_from_flange` is where the flange stood during the sweep, `repeatability` its (6, 6) covariance. The prior is
-    the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board do not fit together and
-    `NotObservable` when a direction is not known to the job's tolerance.
+    the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board do not fit together
+    and `NotObservable` when a direction is not known to the job's tolerance.
     """
     board_from_surface = job.place_from_board.inverse() * job.surface.place_from_surface.se3()
     expected = fix.base_from_board * board_from_surface

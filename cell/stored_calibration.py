@@ -1,0 +1,203 @@
+"""The cell's calibration as a whole: solved, tied to its devices and configuration, stored and found again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.calibration import (
+    Priors,
+    ScanCalibration,
+    ScanObservation,
+    TargetCalibration,
+    TargetObservation,
+    calibrate_scan,
+    calibrate_target,
+)
+from cell.calibration.results import Quality, sigmas
+from cell.config import CameraConfig, CellConfig
+from cell.geometry.camera import CameraModel
+from cell.runs import write_json
+from drivers.errors import CalibrationStale
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class CellCalibration:
+    """Scan head and target camera, with the serial numbers and the configuration that they belong to.
+
+    `made` is in seconds since the epoch; `identities` are serial numbers by device name.
+    """
+
+    scan: ScanCalibration
+    target: TargetCalibration
+    identities: dict[str, str]
+    configuration: str
+    made: float
+
+    @classmethod
+    def solve(
+        cls,
+        scan: list[ScanObservation],
+        target: list[TargetObservation],
+        identities: dict[str, str],
+        config: CellConfig,
+    ) -> CellCalibration:
+        """From the observations; raises `RefusedError` when they do not determine it."""
+        priors = Priors(
+            arm_translation=config.arm.repeatability,
+            arm_rotation=config.arm.repeatability_angle,
+            rail=config.calibration.rail_sigma,
+        )
+        along = np.array([1.0, 0.0, 0.0])
+        return cls(
+            calibrate_scan(scan, nominal_camera(config.scan_camera), along, priors),
+            calibrate_target(target, nominal_camera(config.target_camera), priors),
+            identities,
+            config.calibration_hash(),
+            time.time(),
+        )
+
+    @property
+    def date(self) -> str:
+        """When it was made, for people."""
+        return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made))
+
+    @property
+    def name(self) -> str:
+        """What its file is called: the serial numbers that it belongs to."""
+        return "-".join(self.identities[device] for device in sorted(self.identities))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return {
+            "format": FORMAT,
+            "made": self.made,
+            "date": self.date,
+            "identities": self.identities,
+            "configuration": self.configuration,
+            "scan": self.scan.as_dict(),
+            "target": self.target.as_dict(),
+        }
+
+    def hash(self) -> str:
+        """Hash of its content, for reports."""
+        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
+
+    def summary(self) -> dict[str, Any]:
+        """Values, standard deviations and residuals by name, units in the names."""
+        scan, target = self.scan, self.target
+        sigma = sigmas(scan.covariance)
+        return {
+            "date": self.date,
+            "identities": self.identities,
+            "scan_camera": {
+                **_lens(scan.camera),
+                **{f"sigma_{name}": round(sigma[name], 5) for name in ("fx", "fy", "cx", "cy", "k1")},
+            },
+            "light_plane": {
+                "normal": [round(v, 7) for v in scan.light_plane.normal],
+                "distance_mm": round(1e3 * scan.light_plane.distance, 4),
+                "sigma_distance_mm": round(1e3 * sigma["plane distance"], 5),
+            },
+            "rail": {
+                "direction": [round(float(v), 6) for v in scan.rail_direction / np.linalg.norm(scan.rail_direction)],
+                "scale": round(float(np.linalg.norm(scan.rail_direction)), 6),
+                "sigma_scale": round(sigma["rail x"], 6),
+            },
+            "hand_eye": {
+                "translation_mm": [round(1e3 * float(v), 4) for v in scan.flange_from_camera.translation],
+                "sigma_mm": [round(1e3 * sigma[f"hand-eye {axis}"], 4) for axis in "xyz"],
+                "sigma_mrad": [round(1e3 * sigma[f"hand-eye r{axis}"], 4) for axis in "xyz"],
+            },
+            "scan_quality": _quality(scan.quality),
+            "target_camera": _lens(target.camera),
+            "target_hand_eye": {
+                "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation],
+            },
+            "target_quality": _quality(target.quality),
+        }
+
+
+def nominal_camera(config: CameraConfig) -> CameraModel:
+    """The camera as the configuration draws it: no distortion, principal point in the middle."""
+    focal = config.focal_length / config.pixel
+    return CameraModel(
+        config.width, config.height, focal, focal, (config.width - 1) / 2, (config.height - 1) / 2, (0.0,) * 5
+    )
+
+
+def save_calibration(calibration: CellCalibration, path: Path) -> None:
+    """Write it; a reader finds the old file or the new one, never half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, calibration.as_dict())
+
+
+def read_calibration(path: Path) -> CellCalibration:
+    """Read a stored calibration; raises `CalibrationStale` when the file is none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
+        return CellCalibration(
+            ScanCalibration.from_dict(data["scan"]),
+            TargetCalibration.from_dict(data["target"]),
+            {str(name): str(serial) for name, serial in data["identities"].items()},
+            str(data["configuration"]),
+            float(data["made"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
+
+
+def find_calibration(folder: Path, identities: dict[str, str], configuration: str, max_age: float) -> CellCalibration:
+    """The stored calibration of these devices under this configuration, not older than `max_age` s.
+
+    Raises `CalibrationStale` that says what is missing or what differs.
+    """
+    found = [read_calibration(path) for path in sorted(folder.glob("*.json"))] if folder.is_dir() else []
+    own = [entry for entry in found if entry.identities == identities]
+    if not own:
+        devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
+        raise CalibrationStale(
+            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored; run `cell calibrate`"
+        )
+    current = [entry for entry in own if entry.configuration == configuration]
+    if not current:
+        raise CalibrationStale(
+            f"the calibration of {own[-1].date} was made under another configuration ({own[-1].configuration}, now "
+            f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
+        )
+    newest = max(current, key=lambda entry: entry.made)
+    age = time.time() - newest.made
+    if age > max_age:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} is {age / 86400:.1f} days old, allowed are {max_age / 86400:.1f}; run "
+            "`cell calibrate`"
+        )
+    return newest
+
+
+def _lens(camera: CameraModel) -> dict[str, float]:
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    return {name: round(float(value), 6) for name, value in zip(names, camera.parameters[:8], strict=True)}
+
+
+def _quality(quality: Quality) -> dict[str, float]:
+    figures = {
+        "views": quality.views,
+        "chi2_per_dof": round(quality.chi2_per_dof, 3),
+        "dots_rms_px": round(quality.dots_rms_px, 5),
+        "held_out_dots_rms_px": round(quality.held_out_px, 4),
+    }
+    if quality.stripe_rms is not None and quality.held_out_stripe is not None:
+        figures["stripe_rms_mm"] = round(1e3 * quality.stripe_rms, 5)
+        figures["held_out_stripe_rms_mm"] = round(1e3 * quality.held_out_stripe, 5)
+    return figures
