@@ -45,7 +45,7 @@ def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
 def centre_of(board: BoardSpec) -> Vector:
     """The middle (3,) of the board's points in its own frame, m."""
     points = board.points()
-    return 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return np.asarray(0.5 * (points.min(axis=0) + points.max(axis=0)), dtype=np.float64)
 
 
 def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:

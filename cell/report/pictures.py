@@ -94,7 +94,8 @@ def _bars(axes: Axes, truth: dict[str, Any] | None) -> None:
     axes.set_yscale("log")
     axes.set_xticks(places, ["x", "y", "z", "D"])
     axes.set_ylabel("mean, whisker to max, in mm (log)")
-    axes.legend(fontsize=7, loc="lower left")
+    axes.set_ylim(bottom=0.004)
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2)
 
 
 def _empty(axes: Axes, text: str) -> None:

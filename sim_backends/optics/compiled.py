@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
+from numba.core import config
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -22,8 +23,8 @@ def _cache_folder() -> str:
     return str(root / f"kernels-{digest}")
 
 
-if not numba.config.CACHE_DIR:
-    numba.config.CACHE_DIR = _cache_folder()
+if not getattr(config, "CACHE_DIR", ""):
+    vars(config)["CACHE_DIR"] = _cache_folder()
 
 
 def compiled(function: Function) -> Function:
