@@ -49,7 +49,7 @@ def calibrate(
     if source is not None:
         _from_folder(source, board, json)
         return
-    from cell.cli.display import ProgressDisplay
+    from cell.cli.display import ProgressDisplay, print_calibration
     from cell.supervisor import Cell
 
     if config is None and sim is None:
@@ -62,8 +62,7 @@ def calibrate(
     if json:
         print_json(calibration.summary())
     else:
-        _print_summary(calibration.summary())
-        typer.echo(f"stored in {where}")
+        print_calibration(calibration.summary(), str(where))
 
 
 def _from_folder(folder: Path, board: str | None, json: bool) -> None:

@@ -116,3 +116,33 @@ def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
     for entry in noise.get("sigmas", {}).values():
         table.add_row(str(entry["of"]), f"{entry['sigma']:.4g}", str(entry["unit"]))
     console.print(table)
+
+
+def print_calibration(summary: Mapping[str, Any], where: str) -> None:
+    """A calibration for people: values with their standard deviations, then how well the observations fit."""
+    console = Console()
+    lens, plane, rail, hand = (summary[key] for key in ("scan_camera", "light_plane", "rail", "hand_eye"))
+    values = Table(title=f"calibration of {summary['date']}")
+    values.add_column("quantity")
+    values.add_column("value", justify="right")
+    values.add_column("sigma", justify="right")
+    values.add_column("unit")
+    for name, unit in (("fx", "px"), ("fy", "px"), ("cx", "px"), ("cy", "px"), ("k1", "")):
+        values.add_row(f"scan camera {name}", f"{lens[name]:.4f}", f"{lens[f'sigma_{name}']:.4f}", unit)
+    values.add_row("light plane distance", f"{plane['distance_mm']:.4f}", f"{plane['sigma_distance_mm']:.4f}", "mm")
+    values.add_row("rail scale", f"{rail['scale']:.6f}", f"{rail['sigma_scale']:.6f}", "")
+    for axis, value, sigma in zip("xyz", hand["translation_mm"], hand["sigma_mm"], strict=True):
+        values.add_row(f"flange to scan camera {axis}", f"{value:.4f}", f"{sigma:.4f}", "mm")
+    for axis, sigma in zip("xyz", hand["sigma_mrad"], strict=True):
+        values.add_row(f"turn about flange {axis}", "", f"{sigma:.4f}", "mrad")
+    console.print(values)
+    fit = Table(title="residuals; held-out views are predicted from the others")
+    for name in ("camera", "views", "chi²/dof", "dots px", "held-out px", "stripe mm", "held-out mm"):
+        fit.add_column(name, justify="left" if name == "camera" else "right")
+    for camera in ("scan", "target"):
+        q = summary[f"{camera}_quality"]
+        keys = ("dots_rms_px", "held_out_dots_rms_px", "stripe_rms_mm", "held_out_stripe_rms_mm")
+        shown = ["" if q.get(key) is None else f"{q[key]:.4f}" for key in keys]
+        fit.add_row(camera, str(q["views"]), f"{q['chi2_per_dof']:.3f}", *shown)
+    console.print(fit)
+    console.print(f"stored in {where}", markup=False, soft_wrap=True)
