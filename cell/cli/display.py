@@ -13,6 +13,9 @@ from rich.table import Table
 from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 from statemachine.runner import Event
 
+SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
+"""How a standard deviation in SI is shown to people, by its unit."""
+
 COLOURS = {"placed": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 
 
@@ -114,7 +117,8 @@ def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
     table.add_column("sigma", justify="right")
     table.add_column("unit")
     for entry in noise.get("sigmas", {}).values():
-        table.add_row(str(entry["of"]), f"{entry['sigma']:.4g}", str(entry["unit"]))
+        factor, unit = SHOWN_UNITS.get(entry["unit"], (1.0, entry["unit"]))
+        table.add_row(str(entry["of"]), f"{factor * entry['sigma']:.4g}", str(unit))
     console.print(table)
 
 

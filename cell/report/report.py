@@ -111,11 +111,12 @@ def _add_truth(
         return
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part")}
-    cloud, pose = result.results.get("reconstruct"), result.results.get("invert_pose")
+    sweep, cloud, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     if report["outcome"] != "placed" or not isinstance(pose, PlacePose):
         return
     report["truth"] = place_error(job, nominal, now)
-    report["truth"]["bound_mm"] = expected_error(job, nominal, pose, repeatability)
+    assert isinstance(sweep, SweepRecord)
+    report["truth"]["bound_mm"] = expected_error(job, nominal, pose, sweep.base_from_flange, repeatability, now)
     if isinstance(cloud, Cloud) and witness.at_sweep is not None:
         report["truth"]["sensor_mm"] = sensor_error(cloud, nominal, witness.at_sweep)
 

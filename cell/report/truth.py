@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import cKDTree
 
-from cell.geometry.poses import from_matrix, from_parts, transform
+from cell.geometry.poses import from_matrix, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
@@ -92,21 +92,41 @@ def place_error(job: Job, nominal: NominalSurface, truth: dict[str, Any]) -> dic
     }
 
 
-def expected_error(job: Job, nominal: NominalSurface, pose: PlacePose, repeatability: Vector) -> float:
-    """Mean D in mm over the 45 points to expect from the assumed noise: stated covariance and arm's repeatability.
+def expected_error(
+    job: Job,
+    nominal: NominalSurface,
+    pose: PlacePose,
+    base_from_sweep_flange: pin.SE3,
+    configured: Vector,
+    truth: dict[str, Any],
+) -> float:
+    """Mean D in mm over the 45 points to expect from the world's assumed noise.
 
-    `repeatability` (6, 6) counts once more for the placing pose; that of the sweep is in the pose's covariance.
+    Stripe, rail and calibration as the pose's covariance states them; the arm's repeatability, once for the sweep and
+    once for placing, as the world assumes it instead of the `configured` (6, 6) that the covariance was stated with.
+    The arm's kinematic error is not in it.
     """
+    sigma = {
+        name: truth["assumed_noise"][name]["sigma"] for name in ("arm_repeatability", "arm_repeatability_rotation")
+    }
+    radial, angle = sigma["arm_repeatability"], sigma["arm_repeatability_rotation"]
+    assumed = np.diag([radial**2 / 3] * 3 + [angle**2] * 3)
     base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
-    arms = transform(from_parts(np.zeros(3), base_from_part.rotation), part_points(nominal))
-    to_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
-    surface_part = _jacobians(arms)
-    flange_part = _jacobians(arms + base_from_part.translation - to_flange.translation)
-    covariance = surface_part @ pose.covariance @ surface_part.transpose(0, 2, 1)
-    covariance = covariance + flange_part @ repeatability @ flange_part.transpose(0, 2, 1)
+    points = transform(base_from_part, part_points(nominal))
+    place_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
+    by_pose = _jacobians(points - pose.base_from_surface.translation)
+    by_sweep = _jacobians(points - base_from_sweep_flange.translation)
+    by_placing = _jacobians(points - place_flange.translation)
+    covariance = _through(by_pose, pose.covariance) + _through(by_sweep, assumed - configured)
+    values, vectors = np.linalg.eigh(covariance + _through(by_placing, assumed))
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     draws = np.random.default_rng(0).standard_normal((2000, 1, 3, 1))
-    roots = np.linalg.cholesky(covariance + 1e-18 * np.eye(3))
     return float(1e3 * np.linalg.norm((roots @ draws)[..., 0], axis=-1).mean())
+
+
+def _through(jacobians: Vector, covariance: Vector) -> Vector:
+    """Covariances (n, 3, 3) of points whose Jacobians (n, 3, 6) by a pose of covariance (6, 6) are given."""
+    return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1), dtype=np.float64)
 
 
 def _jacobians(arms: Vector) -> Vector:
