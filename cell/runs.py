@@ -94,15 +94,19 @@ class CellLock:
         self._file = -1
 
     def __enter__(self) -> CellLock:
-        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(self._file, 64, 0).decode(errors="replace").strip() or "unknown"
-            os.close(self._file)
-            raise InterlockError(
-                self._name, f"the cell is held by process {holder}; wait for its end, or end it with `cell abort`"
-            ) from None
+        while True:
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = os.pread(self._file, 64, 0).decode(errors="replace").strip() or "unknown"
+                os.close(self._file)
+                raise InterlockError(
+                    self._name, f"the cell is held by process {holder}; wait for its end, or end it with `cell abort`"
+                ) from None
+            if self._is_current():
+                break
+            os.close(self._file)  # the holder before removed the file after it was opened here
         os.ftruncate(self._file, 0)
         os.pwrite(self._file, str(os.getpid()).encode(), 0)
         return self
@@ -110,4 +114,13 @@ class CellLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        os.close(self._file)
+        if self._file >= 0:
+            self.path.unlink(missing_ok=True)
+            os.close(self._file)
+            self._file = -1
+
+    def _is_current(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._file), self.path.stat())
+        except FileNotFoundError:
+            return False
