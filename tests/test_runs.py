@@ -22,9 +22,8 @@ def own_lock_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_cell_is_held_once_and_free_again_afterwards() -> None:
     lock = CellLock(load_config(None))
-    with lock:
-        with pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
-            CellLock(load_config(None)).__enter__()
+    with lock, pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
+        CellLock(load_config(None)).__enter__()
     assert not lock.path.exists()
     with CellLock(load_config(None)):
         pass

@@ -97,7 +97,7 @@ def _followed(
 
 def _clear_of_print(local: Array, half: Array, spec: BoardSpec, dot_radius: float) -> NDArray[np.bool_]:
     """True (n,) where a stripe of half width `half` (n,) in m touches no edge of a dot or square."""
-    known = np.isfinite(local).all(axis=1)
+    known = np.asarray(np.isfinite(local).all(axis=1), dtype=np.bool_)
     at = np.where(known[:, None], local, 0.0)
     if spec.kind in DOTS:
         offset = at[:, None, :] - spec.points()[None, :, :2]
