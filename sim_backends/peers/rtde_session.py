@@ -12,8 +12,10 @@ from sim_backends.peers.rtde_recipes import InputRecipe, OutputRecipe
 from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, View
 
 _HEADER = struct.Struct(">HB")
-_BACKLOG = 4096
-"""Bytes from which on data packets are no longer taken one a tick: a client that sends faster is not held up."""
+_CATCH_UP = 4
+"""Every so many calls a second data packet is taken from what has piled up: a quarter faster than it was sent."""
+_FLOOD = 65536
+"""Bytes from which on everything is taken at once: that is no stream at the controller's rate."""
 
 
 class Controller(Protocol):
@@ -37,6 +39,7 @@ class Session:
         self._controller = controller
         self._client = client
         self._buffer = b""
+        self._calls = 0
         self._inputs: dict[int, InputRecipe] = {}
         self._outputs: list[OutputRecipe] = []
         self.started = False
@@ -44,10 +47,13 @@ class Session:
     def feed(self, data: bytes) -> None:
         """Handle what arrived; a header that cannot be one ends the connection.
 
-        At most one data packet is taken each tick: a stream of targets that piled up while the machine was busy is
-        then followed as it was sent, not as one jump. Call with no data in ticks in which nothing arrived.
+        One data packet is taken each tick, now and then a second one: a stream of targets that piled up while the
+        machine was busy is then followed about as it was sent, not as one jump. Call with no data in ticks in which
+        nothing arrived.
         """
         self._buffer += data
+        self._calls += 1
+        left = 2 if self._calls % _CATCH_UP == 0 else 1
         while len(self._buffer) >= _HEADER.size:
             size, kind = _HEADER.unpack_from(self._buffer)
             if size < _HEADER.size:
@@ -59,7 +65,8 @@ class Session:
             handler = self._HANDLERS.get(chr(kind))
             if handler is not None:
                 handler(self, payload)
-            if chr(kind) == "U" and len(self._buffer) < _BACKLOG:
+            left -= chr(kind) == "U"
+            if left == 0 and len(self._buffer) < _FLOOD:
                 return
 
     def send_state(self, view: View, tick: int) -> None:
