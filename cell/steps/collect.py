@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -40,7 +41,7 @@ def collect_scan(
         rail.home().wait(60.0)
     mover.to_joints(HOME)
     made: list[ScanObservation] = []
-    refusals: list[str] = []
+    refusals = Counter[str]()
     for k, view in enumerate(views):
         check()
         progress(k / len(views), f"fine board, view {k + 1} of {len(views)}")
@@ -48,7 +49,7 @@ def collect_scan(
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
         travel.wait(30.0)
         camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
-        seen = _look(camera, lambda image: find_board(image, board), refusals, k)
+        seen = _look(camera, lambda image: find_board(image, board), refusals)
         if seen is None:
             continue
         camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
@@ -67,29 +68,29 @@ def collect_target(
     views = target_calibration_views(config, board)
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
     made: list[TargetObservation] = []
-    refusals: list[str] = []
+    refusals = Counter[str]()
     for k, view in enumerate(views):
         check()
         progress(k / len(views), f"large board, view {k + 1} of {len(views)}")
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
-        seen = _look(devices.target_camera, lambda image: find_board(image, board), refusals, k)
+        seen = _look(devices.target_camera, lambda image: find_board(image, board), refusals)
         if seen is not None:
             made.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
     return _enough(made, views, refusals)
 
 
-def _look(camera: Camera, find: Callable[..., BoardView], refusals: list[str], k: int) -> BoardView | None:
+def _look(camera: Camera, find: Callable[..., BoardView], refusals: Counter[str]) -> BoardView | None:
     try:
         return find(camera.grab().image)
     except RefusedError as error:
-        refusals.append(f"view {k + 1}: {error}")
+        refusals[str(error)] += 1
         return None
 
 
-def _enough(made: list[Made], views: list[View], refusals: list[str]) -> list[Made]:
+def _enough(made: list[Made], views: list[View], refusals: Counter[str]) -> list[Made]:
     if len(made) < LEAST_SHARE * len(views):
         raise RefusedError(
             f"only {len(made)} of {len(views)} calibration views show the board; check its place, the light and the "
-            "lens: " + "; ".join(refusals)
+            "lens: " + "; ".join(f"{count} times: {reason}" for reason, count in refusals.most_common())
         )
     return made

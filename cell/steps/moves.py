@@ -21,6 +21,8 @@ from drivers.clock import Clock
 from drivers.interfaces import Arm
 
 PLATE_THICKNESS = 0.01
+GRACE_WALL_S = 10.0
+"""How much longer than planned a motion may take before it is stopped, in seconds on the wall."""
 HOME = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
 """Where `cell home` brings the arm, and where jobs and calibrations begin: folded above the deck, tool down.
 
@@ -84,7 +86,7 @@ class Mover:
     def follow(self, trajectory: Trajectory, force_limit: float | None = None) -> bool:
         """Have the arm follow a trajectory to its end and settle; True when it ended early in contact."""
         motion = self._arm.follow(trajectory.times, trajectory.joints, force_limit)
-        motion.wait(2.0 * trajectory.duration + 5.0)
+        motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
         self._clock.sleep(self._settle_time)
         return motion.contact
 
