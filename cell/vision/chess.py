@@ -18,6 +18,8 @@ from cell.vision.pictures import Image, PictureRefused, Reason
 
 LEAST_CORNERS = 6
 SB_SIGMA_PX = 0.05
+# Corners of the plain search are refined in a picture with its noise blurred away.
+REFINE_BLUR_PX = 1.2
 # The search is done on at most this many px; corners are then refined in the picture itself.
 SEARCH_PX = 1600
 
@@ -25,18 +27,22 @@ SEARCH_PX = 1600
 def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
     """The inner corners of a chessboard in an 8-bit image (h, w). Raises PictureRefused."""
     lit = _laser(image)
-    for corners in _searches(image, lit, spec):
+    smooth = cv2.GaussianBlur(image, (0, 0), REFINE_BLUR_PX)
+    for corners, exact in _searches(image, lit, spec):
         half = _half_window(corners, spec)
-        refined = cv2.cornerSubPix(
-            image,
-            corners.astype(np.float32).reshape(-1, 1, 2),
-            (half, half),
-            (-1, -1),
-            (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4),
-        ).reshape(-1, 2)
-        if np.linalg.norm(refined - corners, axis=1).max() > half:
-            continue
-        ordered = _ordered(image, np.asarray(refined, dtype=np.float64), spec)
+        refined = corners
+        if not exact:
+            found = cv2.cornerSubPix(
+                smooth,
+                corners.astype(np.float32).reshape(-1, 1, 2),
+                (half, half),
+                (-1, -1),
+                (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4),
+            )
+            refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+            if np.linalg.norm(refined - corners, axis=1).max() > half:
+                continue
+        ordered = _ordered(image, refined, spec)
         ids = np.flatnonzero(~_near(lit, ordered, half))
         if len(ids) < LEAST_CORNERS:
             raise PictureRefused(Reason.NO_BOARD, "the laser line covers the chessboard's corners; turn the laser off")
@@ -111,8 +117,12 @@ def _variants(image: Image, lit: Image) -> list[Image]:
     return [stretched, clean, even, np.asarray(cv2.GaussianBlur(stretched, (0, 0), 1.5), dtype=np.uint8)]
 
 
-def _searches(image: Image, lit: Image, spec: BoardSpec) -> Iterator[Array]:
-    """Corners (n, 2) in some order of rows, as the searches find them, the quick and likely ones first."""
+def _searches(image: Image, lit: Image, spec: BoardSpec) -> Iterator[tuple[Array, bool]]:
+    """Corners (n, 2) in some order of rows and whether they are exact, the quick and likely searches first.
+
+    The sector-based search fits its corners over whole squares, better than a search around each corner does, unless
+    its picture was shrunk or evened out.
+    """
     stretched, clean, even, blurred = _variants(image, lit)
     size = (spec.cols, spec.rows)
     classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
@@ -134,7 +144,8 @@ def _searches(image: Image, lit: Image, spec: BoardSpec) -> Iterator[Array]:
         search = cv2.findChessboardCornersSB if sector_based else cv2.findChessboardCorners
         found, corners = search(small, size, flags=flags)
         if found and corners is not None and len(corners) == spec.cols * spec.rows:
-            yield (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+            exact = sector_based and scale == 1.0 and picture is not even
+            yield (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5, exact
 
 
 def _half_window(corners: Array, spec: BoardSpec) -> int:

@@ -1,0 +1,70 @@
+"""Which frames agree with each other: pictures turned or mirrored, or with the pose of another frame, stand out.
+
+The angle by which the flange turned between two frames is the angle by which the camera saw the board turn, whatever
+the hand-eye. It also settles the order of boards that look the same turned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.folder import RecordedFrame
+from cell.geometry.camera import Array, CameraModel
+from cell.vision.board import board_pose
+from cell.vision.pictures import Reason
+
+LARGEST_ANGLE = np.deg2rad(3.0)
+
+
+def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
+    """Give boards that look the same turned the order that agrees with the flange's turns, frame after frame."""
+    placed: list[tuple[pin.SE3, pin.SE3]] = []
+    for frame in frames:
+        assert frame.view is not None and frame.base_from_flange is not None
+        options = frame.view.turns()
+        poses = [board_pose(view, camera).camera_from_board for view in options]
+        if placed and len(options) > 1:
+            flange = frame.base_from_flange
+            misfit = [np.median([_apart(flange, pose, f, p) for f, p in placed]) for pose in poses]
+            best = int(np.argmin(misfit))
+        else:
+            best = 0
+        frame.view = options[best]
+        placed.append((frame.base_from_flange, poses[best]))
+
+
+def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
+    """Refuse frames whose turn disagrees with most others by more than 3°; the rest."""
+    kept = list(frames)
+    poses = {id(f): board_pose(f.view, camera).camera_from_board for f in kept if f.view is not None}
+    apart: Array = np.zeros((len(kept), len(kept)))
+    for (i, a), (j, b) in product(enumerate(kept), repeat=2):
+        if i != j:
+            apart[i, j] = _apart(a.base_from_flange, poses[id(a)], b.base_from_flange, poses[id(b)])
+    index = list(range(len(kept)))
+    while len(index) > 2:
+        inner = apart[np.ix_(index, index)] + np.diag(np.full(len(index), np.nan))
+        typical = np.nanmedian(inner, axis=1)
+        worst = int(np.argmax(typical))
+        if typical[worst] < LARGEST_ANGLE:
+            break
+        frame = kept[index[worst]]
+        frame.refuse(
+            Reason.TURNED,
+            f"the board is the wrong way round: it turned by {np.degrees(typical[worst]):.0f}° more or less than the "
+            "flange did between this frame and the others; is the picture turned or mirrored, or the pose of another "
+            "frame?",
+        )
+        del index[worst]
+    return [kept[i] for i in index]
+
+
+def _apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
+    """Difference in rad between the angles of the flange's and the board's turn."""
+    hand = float(np.linalg.norm(pin.log3(a_flange.rotation.T @ b_flange.rotation)))
+    eye = float(np.linalg.norm(pin.log3(a_board.rotation @ b_board.rotation.T)))
+    return abs(hand - eye)
