@@ -77,12 +77,19 @@ class State:
         return base_from_camera.inverse() * self.base_from_board
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products along the last axis of length 3, with broadcasting; several times quicker than NumPy's."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def tangents(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors perpendicular to a unit normal and to each other."""
     other = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(normal, other)
+    first = cross(normal, other)
     first /= np.linalg.norm(first)
-    return first, np.cross(normal, first)
+    return first, cross(normal, first)
 
 
 def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array]:
@@ -105,11 +112,11 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
     jacobian[:, :, RAIL] = -rail * by_point
     by_flange_axes = by_point @ hand.rotation.T
     jacobian[:, :, 15:18] = -by_flange_axes
-    jacobian[:, :, 18:21] = np.cross(by_flange_axes, from_camera[:, None, :])
+    jacobian[:, :, 18:21] = cross(by_flange_axes, from_camera[:, None, :])
     jacobian[:, :, 21:24] = by_base
-    jacobian[:, :, 24:27] = np.cross(turned[:, None, :], by_base)
+    jacobian[:, :, 24:27] = cross(turned[:, None, :], by_base)
     jacobian[:, :, 27:30] = -by_base
-    jacobian[:, :, 30:33] = np.cross(by_base, from_flange[:, None, :])
+    jacobian[:, :, 30:33] = cross(by_base, from_flange[:, None, :])
     jacobian[:, :, 33] = -by_point @ state.rail_direction
     return view.pixels - pixels, jacobian
 
@@ -145,11 +152,11 @@ def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> 
     jacobian[:, 11] = by_distance @ normal_camera
     jacobian[:, RAIL] = rail * normal_camera
     jacobian[:, 15:18] = normal_flange
-    jacobian[:, 18:21] = np.cross(turned, normal_flange)
+    jacobian[:, 18:21] = cross(turned, normal_flange)
     jacobian[:, 21:24] = -normal
-    jacobian[:, 24:27] = np.cross(normal, away)
+    jacobian[:, 24:27] = cross(normal, away)
     jacobian[:, 27:30] = normal
-    jacobian[:, 30:33] = np.cross(swung, normal)
+    jacobian[:, 30:33] = cross(swung, normal)
     jacobian[:, 33] = normal_camera @ state.rail_direction
     sigma = np.linalg.norm(by_pixel, axis=1) * view.stripe_sigma
     return -distance, jacobian, np.maximum(sigma, 1e-7)

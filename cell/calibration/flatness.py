@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.calibration.adjustment import Adjustment, Priors, shared_mask
+from cell.calibration.adjustment import Adjusted, Adjustment, Priors, shared_mask
 from cell.calibration.blocks import State
 from cell.calibration.joint import Staged, residuals_as_reported, start_state, view_data, without
 from cell.calibration.observations import ScanObservation
@@ -63,7 +63,7 @@ def leave_one_out(
             distances.append(np.zeros(0))
             continue
         others = [o for j, o in enumerate(observations) if j != k]
-        other = _solve(others, without(staged, k), state, priors, tangential)
+        other = _adjust(others, without(staged, k), state, priors, tangential, 1).state
         rest = [_in_base(other, o, staged, j) for j, o in enumerate(observations) if j != k]
         mine = _in_base(other, observations[k], staged, k)
         clouds.append(mine)
@@ -81,18 +81,15 @@ def choose_arm(
     figures: dict[str, float] = {}
     tried: list[tuple[float, Priors]] = []
     folds = min(FOLDS, len(observations))
-    start = start_state(staged)
+    whole = start_state(staged)
     for shift, turn in ARMS:
-        priors = Priors(arm_translation=shift, arm_rotation=turn)
+        adjusted = _adjust(observations, staged, whole, Priors(arm_translation=shift, arm_rotation=turn), tangential, 2)
+        whole, priors = adjusted.state, adjusted.priors
         dots, stripe = [], []
         for fold in range(folds):
             kept = [k for k in range(len(observations)) if k % folds != fold]
-            rows = None if staged.plane is None else [staged.plane.rows[k] for k in kept]
-            part = staged if rows is None or staged.plane is None else _with_rows(staged, rows)
-            try:
-                other = _solve([observations[k] for k in kept], part, start, priors, tangential, 2)
-            except np.linalg.LinAlgError:
-                continue
+            part = staged if staged.plane is None else _with_rows(staged, [staged.plane.rows[k] for k in kept])
+            other = _adjust([observations[k] for k in kept], part, whole, priors, tangential, 0).state
             for k in range(fold, len(observations), folds):
                 chosen = np.empty(0, dtype=np.intp) if staged.plane is None else staged.plane.rows[k]
                 off, away = residuals_as_reported(other, view_data(observations[k], chosen))
@@ -117,18 +114,18 @@ def _with_rows(staged: Staged, rows: list[np.ndarray]) -> Staged:
     return replace(staged, plane=replace(staged.plane, rows=rows))
 
 
-def _solve(
+def _adjust(
     observations: Sequence[ScanObservation],
     staged: Staged,
     start: State,
     priors: Priors,
     tangential: bool,
-    variance_rounds: int = 1,
-) -> State:
+    variance_rounds: int,
+) -> Adjusted:
     rows = [np.empty(0, dtype=np.intp)] * len(observations) if staged.plane is None else staged.plane.rows
     views = [view_data(o, r) for o, r in zip(observations, rows, strict=True)]
     free = shared_mask(plane=staged.plane is not None, rail=False, tangential=tangential)
-    return Adjustment(views, free, priors).solve(start, variance_rounds).state
+    return Adjustment(views, free, priors).solve(start, variance_rounds)
 
 
 def _in_base(state: State, observation: ScanObservation, staged: Staged, index: int) -> Array:
