@@ -44,7 +44,7 @@ def zhang(
     dist: Array = np.zeros(5)
     if nominal is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, dist = nominal.matrix, np.array(nominal.dist)
+        matrix, dist = nominal.matrix, np.array(nominal.dist, dtype=np.float64)
     objects = [v.object_points.astype(np.float32) for v in views]
     pixels = [v.pixels.astype(np.float32).reshape(-1, 1, 2) for v in views]
     try:

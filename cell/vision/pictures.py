@@ -85,9 +85,11 @@ def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:
 
 
 def _is_cut(data: bytes) -> bool:
-    """True for a PNG or JPEG whose end mark is missing."""
+    """True for a PNG or JPEG whose end mark is missing, and for a BMP shorter than it says."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-16:]
     if data.startswith(b"\xff\xd8"):
         return b"\xff\xd9" not in data[-4096:]
+    if data.startswith(b"BM") and len(data) > 6:
+        return int.from_bytes(data[2:6], "little") > len(data)
     return False
