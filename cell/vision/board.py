@@ -19,6 +19,7 @@ from cell.vision.board_spec import DOTS, BoardSpec
 from cell.vision.board_view import BoardView
 from cell.vision.chess import find_charuco, find_chessboard
 from cell.vision.dot_board import find_dots
+from cell.vision.outliers import without_outliers
 from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30
@@ -53,8 +54,9 @@ def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = Non
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image, size)
     if spec.kind in DOTS:
-        return find_dots(image, spec)
-    return find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
+        return without_outliers(find_dots(image, spec))
+    found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
+    return without_outliers(found)
 
 
 def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:

@@ -20,6 +20,9 @@ LEAST_CORNERS = 6
 SB_SIGMA_PX = 0.05
 # Corners of the plain search are refined in a picture with its noise blurred away.
 REFINE_BLUR_PX = 1.2
+# A laser line is thinner than this and longer than this share of the picture.
+STREAK_PX = 31
+STREAK_SHARE = 0.15
 # The search is done on at most this many px; corners are then refined in the picture itself.
 SEARCH_PX = 1600
 
@@ -96,13 +99,21 @@ def _charuco_corners(image: Image, spec: BoardSpec, legacy: bool) -> tuple[Array
 
 
 def _laser(image: Image) -> Image:
-    """Mask (h, w) of thin saturated streaks: a laser line, not the white of an over-exposed board."""
+    """Mask (h, w) of long thin saturated streaks: a laser line, not the white of an over-exposed board or marker."""
     white = (image >= 250).astype(np.uint8)
-    if not white.any():
-        return np.asarray(white, dtype=np.uint8)
-    wide = cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((31, 31), np.uint8))
-    thin = cv2.subtract(white, wide)
-    return np.asarray(cv2.dilate(thin, np.ones((9, 9), np.uint8)), dtype=np.uint8)
+    wide = cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((STREAK_PX, STREAK_PX), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.subtract(white, wide), connectivity=8)
+    mask = np.zeros_like(white)
+    for label in range(1, count):
+        x, y, w, h, area = stats[label]
+        if np.hypot(w, h) < STREAK_SHARE * max(image.shape) or area > STREAK_PX * np.hypot(w, h):
+            continue
+        inside = labels[y : y + h, x : x + w] == label
+        places = np.argwhere(inside).astype(np.float64)
+        across = np.linalg.eigvalsh(np.cov(places.T))[0]
+        if across < (STREAK_PX / 3) ** 2:
+            mask[y : y + h, x : x + w][inside] = 1
+    return np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), dtype=np.uint8)
 
 
 def _variants(image: Image, lit: Image) -> list[Image]:
