@@ -25,6 +25,7 @@ from cell.calibration.blocks import (
     dots_block,
     stripe_block,
 )
+from cell.calibration.normal import Normal
 from cell.geometry.camera import Array
 from cell.geometry.poses import difference
 
@@ -32,6 +33,8 @@ DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01)
 HUBER = 2.5
 STEPS = 25
 VARIANCE_ROUNDS = 4
+# Measurements without any noise would leave the priors no digits.
+LEAST_SCALE = 0.1
 
 
 @dataclass(frozen=True)
@@ -64,33 +67,15 @@ class Adjusted:
     iterations: int
 
 
-@dataclass(eq=False)
-class _Normal:
-    """Normal equations, kept apart by group so that the groups' redundancies can be told."""
-
-    groups: dict[str, Array]
-    right: Array
-    squares: dict[str, float]
-    counts: dict[str, int]
-
-    @property
-    def matrix(self) -> Array:
-        return np.asarray(sum(self.groups.values()), dtype=np.float64)
-
-    @property
-    def total(self) -> float:
-        return float(sum(self.squares.values()))
-
-
 class Adjustment:
     """One problem: views, what is free, and the priors. `solve` iterates from a start."""
 
     def __init__(self, views: Sequence[ViewData], free: NDArray[np.bool_], priors: Priors) -> None:
         """`free` (27,) says which shared parameters move, in the order of `blocks`."""
         self.views = list(views)
-        own_free = np.ones(OWN, dtype=np.bool_)
-        own_free[6] = bool(free[RAIL].any())
-        self.free = np.concatenate([free, np.tile(own_free, len(self.views))])
+        self.free = free
+        self.own_free = np.ones(OWN, dtype=np.bool_)
+        self.own_free[6] = bool(free[RAIL].any())
         self.priors = priors
 
     def solve(self, start: State, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
@@ -108,17 +93,10 @@ class Adjustment:
             if turn < variance_rounds:
                 self._update_noise(normal)
                 normal = self._normal(state)
-        index = np.flatnonzero(self.free)
-        inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
-        covariance = np.zeros((SHARED, SHARED))
-        shared = index[index < SHARED]
-        covariance[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
-        measured = sum(normal.counts.values())
-        dof = max(1, measured - len(index))
         return Adjusted(
             state,
-            covariance,
-            normal.total / dof,
+            normal.inverse().shared,
+            normal.total / max(1, normal.measured - normal.parameters),
             *self.residual_rms(state),
             self.priors,
             iterations,
@@ -134,18 +112,12 @@ class Adjustment:
                 stripe.append(stripe_block(state, view, flange, float(rail))[0])
         return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
 
-    def _minimise(self, state: State, normal: _Normal, settled: float) -> tuple[State, _Normal, int]:
+    def _minimise(self, state: State, normal: Normal, settled: float) -> tuple[State, Normal, int]:
         damping = 1e-6
-        index = np.flatnonzero(self.free)
         used = 0
         for _ in range(STEPS):
             used += 1
-            matrix = normal.matrix[np.ix_(index, index)]
-            scale = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-            scaled = matrix / np.outer(scale, scale) + damping * np.eye(len(index))
-            step = np.zeros(len(self.free))
-            step[index] = np.linalg.solve(scaled, normal.right[index] / scale) / scale
-            candidate = state.moved(step)
+            candidate = state.moved(normal.step(damping))
             new = self._normal(candidate)
             if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
                 gain = normal.total - new.total
@@ -159,75 +131,50 @@ class Adjustment:
                     break
         return state, normal, used
 
-    def _normal(self, state: State) -> _Normal:
-        size = len(self.free)
-        groups = {name: np.zeros((size, size)) for name in ("dots", "stripe", "shift", "turn", "rail", "lens")}
-        squares = dict.fromkeys(groups, 0.0)
-        counts = dict.fromkeys(groups, 0)
-        right = np.zeros(size)
-
-        def add(name: str, columns: NDArray[np.intp], jacobian: Array, residual: Array, cost: float) -> None:
-            groups[name][np.ix_(columns, columns)] += jacobian.T @ jacobian
-            right[columns] += jacobian.T @ residual
-            squares[name] += cost
-            counts[name] += len(residual)
-
+    def _normal(self, state: State) -> Normal:
+        normal = Normal(len(self.views), self.free, self.own_free)
         for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
-            own = SHARED + OWN * k + np.arange(OWN)
-            columns = np.concatenate([np.arange(SHARED), own])
             if len(view.points):
                 residual, jacobian = dots_block(state, view, flange, float(rail))
                 sigma = self.priors.dots_scale * view.sigma
                 white = residual / sigma[:, None]
                 weight, cost = _huber(np.linalg.norm(white, axis=1))
                 root = (np.sqrt(weight) / sigma)[:, None]
-                add(
-                    "dots",
-                    columns,
-                    (jacobian * root[:, :, None]).reshape(-1, COLUMNS),
-                    (residual * root).ravel(),
-                    cost,
-                )
+                rows = (jacobian * root[:, :, None]).reshape(-1, COLUMNS)
+                normal.add_view("dots", k, rows, (residual * root).ravel(), cost)
             if len(view.stripe) and state.plane is not None:
                 residual, jacobian, sigma = stripe_block(state, view, flange, float(rail))
                 sigma = self.priors.stripe_scale * sigma
                 weight, cost = _huber(np.abs(residual / sigma))
                 root = np.sqrt(weight) / sigma
-                add("stripe", columns, jacobian * root[:, None], residual * root, cost)
+                normal.add_view("stripe", k, jacobian * root[:, None], residual * root, cost)
             apart = -difference(flange, view.base_from_flange)
-            for name, part, deviation in (
-                ("shift", slice(0, 3), self.priors.arm_translation),
-                ("turn", slice(3, 6), self.priors.arm_rotation),
-            ):
-                white = apart[part] / deviation
-                add(name, own[part], np.eye(3) / deviation, white, float(white @ white))
-            if self.free[own[6]]:
-                white = np.array([(view.rail - rail) / self.priors.rail])
-                add("rail", own[6:], np.eye(1) / self.priors.rail, white, float(white @ white))
+            shift, turn = self.priors.arm_translation, self.priors.arm_rotation
+            normal.add_prior("shift", k, 0, apart[:3] / shift, shift)
+            normal.add_prior("turn", k, 3, apart[3:] / turn, turn)
+            if self.own_free[6]:
+                normal.add_prior("rail", k, 6, np.array([view.rail - rail]) / self.priors.rail, self.priors.rail)
         lens = np.arange(4, 8)[self.free[4:8]]
         deviation = np.array(DISTORTION_PRIOR)[lens - 4]
-        if len(lens):
-            white = -state.camera.parameters[lens] / deviation
-            add("lens", lens, np.diag(1 / deviation), white, float(white @ white))
-        return _Normal(groups, right, squares, counts)
+        normal.add_shared_prior("lens", lens, -state.camera.parameters[lens] / deviation, deviation)
+        return normal
 
-    def _update_noise(self, normal: _Normal) -> None:
+    def _update_noise(self, normal: Normal) -> None:
         """Scale each group's σ so that its χ² meets its redundancy."""
-        index = np.flatnonzero(self.free)
-        inverse = np.linalg.inv(normal.matrix[np.ix_(index, index)])
+        inverse = normal.inverse()
         factors = {}
         groups = ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else [])
         for name in groups:
-            if normal.counts[name] == 0:
+            block = normal.groups[name]
+            if block.count == 0:
                 continue
-            taken = float(np.sum(inverse * normal.groups[name][np.ix_(index, index)]))
-            redundancy = max(normal.counts[name] - taken, 0.02 * normal.counts[name])
-            factors[name] = float(np.clip(np.sqrt(normal.squares[name] / redundancy), 0.1, 10.0))
+            redundancy = max(block.count - inverse.taken(block), 0.02 * block.count)
+            factors[name] = float(np.clip(np.sqrt(block.squares / redundancy), 0.1, 10.0))
         p = self.priors
         self.priors = replace(
             p,
-            dots_scale=p.dots_scale * factors.get("dots", 1.0),
-            stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), 0.1),
+            dots_scale=max(p.dots_scale * factors.get("dots", 1.0), LEAST_SCALE),
+            stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), LEAST_SCALE),
             arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
             arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
         )

@@ -224,7 +224,7 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
     result["intrinsics"] = {
         **_camera_dict(state.camera),
         "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
-        "held_out_rms_px": math.sqrt(2) * chain.joint.held_out_px,
+        "held_out_at_reported_poses_rms_px": math.sqrt(2) * chain.joint.held_out_px,
         "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[:4].tolist(), strict=True)),
         "method": "joint adjustment",
     }
