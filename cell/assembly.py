@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 
 from cell.config import CameraConfig, CellConfig
+from cell.gate import Gate, GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
 from drivers.arm.limits import ArmLimits
-from drivers.arm.ur import UrArm
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
-from drivers.rail.tmcl import TmclRail
-from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
-from drivers.vehicle.agilex import AgilexVehicle
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
@@ -25,6 +23,7 @@ class Devices:
     """The connected devices of one cell and the clock that they share."""
 
     clock: Clock
+    gate: Gate
     arm: Arm
     rail: Rail
     vehicle: Vehicle
@@ -39,8 +38,10 @@ class Devices:
     def stop(self) -> list[str]:
         """Laser off, vehicle stopped and braked, rail and arm stopped; all at once, none waits for another.
 
-        Returns what could not be confirmed, a line each; an empty list means that everything answered.
+        Whoever works with the devices now cannot begin anything new with them. Returns what could not be confirmed, a
+        line each; an empty list means that everything answered.
         """
+        self.gate.shut()
         return _all_at_once(
             {
                 "laser off": self.laser.stop,
@@ -51,7 +52,6 @@ class Devices:
         )
 
     def _halt_vehicle(self) -> None:
-        self.vehicle.stop()
         self.vehicle.brake()
 
     def close(self) -> list[str]:
@@ -81,12 +81,15 @@ def connect(config: CellConfig) -> Devices:
         opened.callback(target_camera.close)
         laser, claw = connect_switches(config, arm, clock)
         opened.pop_all()
-    return Devices(clock, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
+    gate = Gate()
+    for device in (arm, rail, vehicle, laser, claw):
+        device.gate = gate
+    return Devices(clock, gate, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
 
 
-def connect_arm(config: CellConfig, clock: Clock) -> UrArm:
+def connect_arm(config: CellConfig, clock: Clock) -> GatedArm:
     """The arm; its own process switches the laser's output off when this one dies."""
-    return UrArm(
+    return GatedArm(
         "arm",
         config.arm.address,
         clock=clock,
@@ -100,9 +103,9 @@ def connect_arm(config: CellConfig, clock: Clock) -> UrArm:
     )
 
 
-def connect_rail(config: CellConfig, clock: Clock) -> TmclRail:
+def connect_rail(config: CellConfig, clock: Clock) -> GatedRail:
     """The rail."""
-    return TmclRail(
+    return GatedRail(
         "rail",
         config.rail.url,
         lead=config.rail.lead,
@@ -117,9 +120,9 @@ def connect_rail(config: CellConfig, clock: Clock) -> TmclRail:
     )
 
 
-def connect_vehicle(config: CellConfig, clock: Clock) -> AgilexVehicle:
+def connect_vehicle(config: CellConfig, clock: Clock) -> GatedVehicle:
     """The vehicle."""
-    return AgilexVehicle(
+    return GatedVehicle(
         "vehicle",
         config.vehicle.interface,
         config.vehicle.channel,
@@ -136,10 +139,10 @@ def connect_camera(name: str, config: CameraConfig, clock: Clock) -> StreamCamer
     return StreamCamera(name, config.address, shape=(config.height, config.width), clock=clock)
 
 
-def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[ArmSwitchedLaser, ArmSwitchedClaw]:
+def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[GatedLaser, GatedClaw]:
     """Laser and claw, on the arm's digital outputs."""
-    laser = ArmSwitchedLaser("laser", arm, config.laser.output)
-    return laser, ArmSwitchedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
+    laser = GatedLaser("laser", arm, config.laser.output)
+    return laser, GatedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
 
 
 def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
@@ -157,8 +160,9 @@ def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
     }
     for thread in threads.values():
         thread.start()
+    deadline = time.monotonic() + SAFE_STOP_TIMEOUT_S
     for what, thread in threads.items():
-        thread.join(SAFE_STOP_TIMEOUT_S)
+        thread.join(max(0.0, deadline - time.monotonic()))
         if thread.is_alive():
             problems.append(f"{what}: not confirmed within {SAFE_STOP_TIMEOUT_S:.0f} s")
     return problems

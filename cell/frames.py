@@ -16,6 +16,9 @@ CAPACITY = 64
 """Frames that may wait to be written; with more, the sweep is held up rather than a frame lost."""
 
 
+WRITE_TIMEOUT_S = 5.0
+
+
 class FrameStore:
     """Writes frames into `folder` as `<what>-<frame id>.png`, lossless."""
 
@@ -31,7 +34,16 @@ class FrameStore:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""
         if self._failure is not None:
             raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
-        self._waiting.put((what, frame))
+        try:
+            self._waiting.put((what, frame), timeout=WRITE_TIMEOUT_S)
+        except queue.Full:
+            self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
+            raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
+
+    @property
+    def failure(self) -> str | None:
+        """Why frames are missing, or None."""
+        return self._failure
 
     def _write(self) -> None:
         while (item := self._waiting.get()) is not None:
@@ -40,7 +52,7 @@ class FrameStore:
             try:
                 if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                     self._failure = f"{path} could not be written"
-            except cv2.error as error:
+            except Exception as error:  # the writer must go on emptying the queue
                 self._failure = f"{path}: {error}"
 
     def __enter__(self) -> FrameStore:
@@ -49,5 +61,8 @@ class FrameStore:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._waiting.put(None)
-        self._thread.join(60.0)
+        try:
+            self._waiting.put(None, timeout=WRITE_TIMEOUT_S)
+        except queue.Full:
+            return
+        self._thread.join(2 * WRITE_TIMEOUT_S)

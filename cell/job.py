@@ -12,9 +12,12 @@ from typing import Annotated, Literal
 import pinocchio as pin
 from pydantic import AfterValidator, Field
 
-from cell.config import Length, Pose, Table, checked_board, read_toml, validate
+from cell.config import CellConfig, Length, Pose, Table, checked_board, read_toml, validate
 from cell.units import quantity
 from drivers.errors import ConfigError
+
+RAMP_MARGIN = 0.0005
+"""What the rail's driver adds to each ramp of a sweep, m."""
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 
@@ -136,6 +139,28 @@ def load_job(name: str | Path) -> tuple[Job, Path]:
             f"{path}: surface.mesh {job.surface.mesh!r} is not a file (looked for {mesh}); name an STL or PLY"
         )
     return job, mesh
+
+
+def require_fit(job: Job, config: CellConfig) -> None:
+    """Raise `ConfigError` when the job asks for more than the cell's devices may do; nothing has moved yet."""
+    rail = config.rail
+    ramps = job.scan.speed**2 / rail.acceleration + 2 * RAMP_MARGIN
+    room = rail.travel[1] - rail.travel[0]
+    problems = []
+    if job.scan.length + ramps > room:
+        problems.append(
+            f"scan.length {1e3 * job.scan.length:g} mm and its ramps of {1e3 * ramps:.2f} mm exceed rail.travel, "
+            f"{1e3 * room:g} mm"
+        )
+    for name, asked, allowed, limit in (
+        ("scan.speed", job.scan.speed, rail.max_speed, "rail.max_speed"),
+        ("approach.speed", job.approach.speed, config.vehicle.max_speed, "vehicle.max_speed"),
+        ("place.speed", job.place.speed, config.arm.max_tool_speed, "arm.max_tool_speed"),
+    ):
+        if asked > allowed:
+            problems.append(f"{name} {1e3 * asked:g} mm/s exceeds {limit}, {1e3 * allowed:g} mm/s")
+    if problems:
+        raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 
 
 def _job_folder() -> Path:

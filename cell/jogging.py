@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -59,14 +60,18 @@ def _amount(text: str, unit: str) -> float:
 
 
 def jog(cell: Cell, wish: Jog) -> dict[str, str]:
-    """Perform it and give where the device is afterwards, in words with units."""
-    match wish.device:
-        case "rail":
-            return _jog_rail(cell, wish)
-        case "arm":
-            return _jog_arm(cell, wish)
-        case _:
-            return _jog_vehicle(cell, wish)
+    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell."""
+
+    def work(check: Callable[[], None]) -> dict[str, str]:
+        match wish.device:
+            case "rail":
+                return _jog_rail(cell, wish)
+            case "arm":
+                return _jog_arm(cell, wish)
+            case _:
+                return _jog_vehicle(cell, wish, check)
+
+    return cell.guarded(f"jog {wish.device}", work)
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
@@ -108,15 +113,15 @@ def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
     return {"flange": f"({shown}) mm in the base, moved {1e3 * way:.2f} mm"}
 
 
-def _jog_vehicle(cell: Cell, wish: Jog) -> dict[str, str]:
+def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, str]:
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
     vehicle.enable()
     odometry = Odometry(vehicle, Planar(0.0, 0.0, 0.0))
     try:
         if wish.axis == "yaw":
-            turn_to(vehicle, odometry, wish.amount, clock, lambda: None)
+            turn_to(vehicle, odometry, wish.amount, clock, check)
         else:
-            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, lambda: None)
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, check)
     finally:
         vehicle.brake()
     pose = odometry.pose()

@@ -162,12 +162,19 @@ def find_calibration(folder: Path, identities: dict[str, str], configuration: st
 
     Raises `CalibrationStale` that says what is missing or what differs.
     """
-    found = [read_calibration(path) for path in sorted(folder.glob("*.json"))] if folder.is_dir() else []
+    found, unreadable = [], []
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        try:
+            found.append(read_calibration(path))
+        except CalibrationStale:
+            unreadable.append(path.name)
     own = [entry for entry in found if entry.identities == identities]
     if not own:
         devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
         raise CalibrationStale(
-            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored; run `cell calibrate`"
+            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
+            + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + "; run `cell calibrate`"
         )
     current = [entry for entry in own if entry.configuration == configuration]
     if not current:

@@ -6,6 +6,7 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,17 +18,29 @@ from cell.assembly import Devices, connect
 from cell.config import CellConfig, load_config
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface
-from cell.job import Job, load_job
+from cell.job import Job, load_job, require_fit
 from cell.report.report import make_report
 from cell.report.truth import Witness
-from cell.runs import REPORT, CellLock, new_run, write_json
+from cell.runs import CellLock, new_run, write_json
 from cell.simulation import SimulatedCell, with_endpoints
+from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
 from cell.stored_calibration import CellCalibration, find_calibration, save_calibration
 from cell.work import JobWork
-from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError, DeviceError, DeviceFault, RefusedError
-from statemachine.journal import Journal
+from drivers.errors import (
+    Aborted,
+    CalibrationStale,
+    CellError,
+    ConfigError,
+    DeadlineError,
+    DeviceError,
+    DeviceFault,
+    Interrupted,
+    RefusedError,
+)
+from drivers.interfaces import ArmSafety
+from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy
 from statemachine.runner import Event, Runner
 from statemachine.sequence import Sequence
@@ -67,6 +80,8 @@ class Cell:
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
+        self._odometry: Odometry | None = None
+        self._closed = False
 
     @classmethod
     def open(
@@ -148,11 +163,18 @@ class Cell:
 
     def close(self) -> None:
         """Stop and disconnect everything and let go of the cell. Idempotent, and shielded from interrupts."""
+        if self._closed:
+            return
+        self._closed = True
         with SignalWatch():
-            self.devices.close()
-            self._lock.__exit__(None, None, None)
-            if self.simulated is not None:
-                self.simulated.close()
+            try:
+                problems = self.devices.stop() + self.devices.close()
+            finally:
+                self._lock.__exit__(None, None, None)
+                if self.simulated is not None:
+                    self.simulated.close()
+        for problem in problems:
+            print(f"closing the cell: {problem}", file=sys.stderr)
 
     # --- jobs ---
 
@@ -162,6 +184,7 @@ class Cell:
         A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`.
         """
         loaded, mesh = load_job(job)
+        require_fit(loaded, self.config)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
         try:
             calibration = self.calibration()
@@ -171,32 +194,81 @@ class Cell:
             if observer is not None:
                 observer(Event("note", None, {"text": "this simulated cell has no calibration yet: calibrating first"}))
             calibration = self.calibrate(observer, job)
-        folder = new_run(self.runs_folder)
-        self._keep_inputs(folder, Path(job), loaded, calibration)
-        journal = Journal(folder, folder.name, self._info(loaded, calibration))
+        with SignalWatch() as signals:
+            try:
+                folder = new_run(self.runs_folder)
+                self._keep_inputs(folder, loaded, calibration)
+                journal = Journal(folder, folder.name, self._info(loaded, calibration))
+            except (OSError, JournalError) as error:
+                raise CellError(f"no run can be recorded in {self.runs_folder}: {error}") from error
+            try:
+                return self._run_recorded(folder, journal, loaded, nominal, calibration, observer, signals)
+            finally:
+                journal.close()
+
+    def _run_recorded(
+        self,
+        folder: Path,
+        journal: Journal,
+        job: Job,
+        nominal: NominalSurface,
+        calibration: CellCalibration,
+        observer: Observer | None,
+        signals: SignalWatch,
+    ) -> RunOutcome:
         started = time.time()
+        info = self._info(job, calibration)
         witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
-        try:
-            with FrameStore(folder / "frames") as frames:
-                work = JobWork(self.config, loaded, nominal, calibration, self.devices, frames, folder)
-                runner = Runner(
-                    Sequence(), work.steps(), Policy(), journal, self.devices.clock, classify,
-                    lambda reason: self.stop(), _both(observer, witness), self._recover,
-                )  # fmt: skip
-                result = runner.run()
-        finally:
-            journal.close()
-        with SignalWatch():
-            report = make_report(
-                folder, self.config, loaded, nominal, work.repeatability, result, self._info(loaded, calibration),
-                started, witness,
+        with FrameStore(folder / "frames") as frames:
+            work = JobWork(self.config, job, nominal, calibration, self.devices, frames, folder, self._odometry)
+            runner = Runner(
+                Sequence(), work.steps(), Policy(), journal, self.devices.clock, classify,
+                lambda reason: self.stop(), _both(observer, witness), self._recover, self._health,
             )  # fmt: skip
-            write_json(folder / REPORT, report)
-        return RunOutcome(report["outcome"], report["reason"], folder, report, result.signal is not None)
+            if signals.reason is not None:
+                runner.abort(signals.reason)
+            result = runner.run()
+            self._odometry = work.odometry
+        report = make_report(
+            folder, self.config, job, nominal, work.repeatability, result, info, started, witness, frames.failure
+        )
+        interrupted = result.signal is not None or signals.reason is not None
+        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
+
+    def _health(self) -> None:
+        """Raise when a safety system has stopped the arm or the vehicle, whichever device is being waited for.
+
+        A reading that is too old says nothing here: the next command to that device finds a silent link.
+        """
+        try:
+            safety = self.devices.arm.state().safety
+            if safety is not ArmSafety.NORMAL:
+                raise DeviceFault(
+                    "arm",
+                    f"arm.{safety.name.lower()}",
+                    f"the arm is in {safety.value}",
+                    recoverable=safety is ArmSafety.PROTECTIVE_STOP,
+                    hint="Look for the reason and clear the way.",
+                )
+            if self.devices.vehicle.state().emergency_stop:
+                raise DeviceFault(
+                    "vehicle",
+                    "vehicle.emergency_stop",
+                    "the vehicle's emergency stop is pressed",
+                    recoverable=False,
+                    hint="Release it when it is safe, then run the job again.",
+                )
+        except DeadlineError:
+            return
 
     def _recover(self, error: BaseException) -> None:
+        """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
         if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
             self.devices.arm.recover()
+        elif isinstance(error, DeviceError) and error.device == "vehicle":
+            self.devices.gate.enter()
+            self.devices.vehicle.enable()
+            self.devices.vehicle.brake()
 
     def _info(self, job: Job, calibration: CellCalibration) -> dict[str, Any]:
         endpoints = {} if self.simulated is None else self.simulated.endpoints
@@ -212,7 +284,7 @@ class Cell:
             "calibration_date": calibration.date,
         }
 
-    def _keep_inputs(self, folder: Path, job: Path, loaded: Job, calibration: CellCalibration) -> None:
+    def _keep_inputs(self, folder: Path, loaded: Job, calibration: CellCalibration) -> None:
         write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
         write_json(folder / "job.json", loaded.model_dump(mode="json"))
         save_calibration(calibration, folder / "calibration.json")
@@ -284,19 +356,30 @@ class Cell:
                 if signals.reason is not None:
                     raise Aborted(f"{what} {signals.reason}")
 
-            call = Call(what, lambda: made.append(work(check)))
+            def begin() -> None:
+                self.devices.gate.enter()
+                check()
+                made.append(work(check))
+
+            call = Call(what, begin)
             while not call.done.wait(0.05) and signals.reason is None:
                 pass
             if signals.reason is not None or call.error is not None:
-                self.devices.stop()
+                problems = self.devices.stop()
                 call.done.wait(5.0)
-                problems = self.devices.stop()  # once more: the work may have begun something before it saw the end
                 unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
                 if signals.reason is not None:
-                    raise KeyboardInterrupt(f"{what} {signals.reason}; the cell was stopped{unconfirmed}")
-                if call.error is not None:
-                    call.error.add_note(unconfirmed)
-                    raise call.error
+                    raise Interrupted(f"{what} {signals.reason}; the cell was stopped{unconfirmed}")
+                if problems:
+                    raise DeviceFault(
+                        "cell",
+                        "safe_stop",
+                        f"{what}: {call.error}{unconfirmed}",
+                        recoverable=False,
+                        hint="Look at the cell before going near it.",
+                    ) from call.error
+                assert call.error is not None
+                raise call.error
         return made[0]
 
 
@@ -305,8 +388,12 @@ def _both(first: Observer | None, second: Observer | None) -> Observer:
     observers = [observer for observer in (first, second) if observer is not None]
 
     def tell(event: Event) -> None:
-        for observer in observers:
-            observer(event)
+        for observer in list(observers):
+            try:
+                observer(event)
+            except Exception as error:  # one who cannot listen any more must not keep the other from listening
+                observers.remove(observer)
+                print(f"an observer of the run failed and is told nothing more: {error}", file=sys.stderr)
 
     return tell
 

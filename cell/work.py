@@ -6,6 +6,7 @@ Here a step's context meets its function; what a step does is in `cell.steps`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +19,7 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.planning import look_pose, photo_pose, scan_plan
 from cell.reconstruction import Cloud
+from cell.steps.approach import Odometry, Planar
 from cell.steps.board_photo import board_photo
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.invert_pose import invert_pose
@@ -44,6 +46,7 @@ class JobWork:
         devices: Devices,
         frames: FrameStore,
         folder: Path,
+        odometry: Odometry | None = None,
     ) -> None:
         self._config = config
         self._job = job
@@ -54,30 +57,44 @@ class JobWork:
         self._folder = folder
         self._board = parse_board(job.board.spec)
         self._mover = Mover(devices.arm, devices.clock, config, job)
+        # Kept over retries and runs: the vehicle may stand anywhere when the step is done again.
+        self.odometry = odometry
 
     def steps(self) -> dict[str, Callable[[StepContext], object]]:
-        """The work by step name."""
-        return {
-            "drive_to_target": self.drive_to_target,
-            "board_photo": self.board_photo,
-            "laser_sweep": self.laser_sweep,
-            "reconstruct": self.reconstruct,
-            "invert_pose": self.invert_pose,
-            "place": self.place,
-        }
+        """The work by step name; each attempt enters the gate anew."""
+        steps = (
+            self.drive_to_target,
+            self.board_photo,
+            self.laser_sweep,
+            self.reconstruct,
+            self.invert_pose,
+            self.place,
+        )
+        return {step.__name__: partial(self._enter, step) for step in steps}
+
+    def _enter(self, step: Callable[[StepContext], object], context: StepContext) -> object:
+        self._devices.gate.enter()
+        context.check()
+        return step(context)
 
     def drive_to_target(self, context: StepContext) -> Arrival:
         """See `cell.steps.drive_to_target`."""
         context.progress(0.0, "arm to the looking pose")
-        self._devices.vehicle.brake()
-        self._mover.to_joints(HOME)
+        vehicle = self._devices.vehicle
+        vehicle.enable()
+        vehicle.brake()
+        if self.odometry is None:
+            self.odometry = Odometry(vehicle, Planar.of(self._job.approach.start.se3()))
+            self._mover.to_joints(HOME)
         camera = self._calibration.target.flange_from_camera
         self._mover.to(look_pose(self._config, self._job, self._board, camera), "the looking pose")
         self._devices.target_camera.configure(self._config.target_camera.photo_exposure, 10.0)
+        vehicle.enable()
         return drive_to_target(
             self._job,
             self._config.arm.vehicle_from_base.se3(),
-            self._devices.vehicle,
+            vehicle,
+            self.odometry,
             self._photograph,
             self._devices.clock,
             context.check,

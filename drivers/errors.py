@@ -11,6 +11,7 @@
     ├── RefusedError       a measurement is not good enough to go on
     │   └── NotObservable  a direction of the place pose is not known well enough
     └── Aborted            somebody asked for the end
+        └── Interrupted    with Ctrl-C or a signal, outside a run
 
 Every text says what happened, the value, the allowed range with units, and what to do next.
 """
@@ -90,3 +91,7 @@ class NotObservable(RefusedError):
 
 class Aborted(CellError):
     """The operator, a script or a signal asked for the end of the run; the text says who."""
+
+
+class Interrupted(Aborted):
+    """Ctrl-C or a signal ended work outside a run, and the cell was stopped; the text says what was not confirmed."""

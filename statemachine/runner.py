@@ -24,6 +24,8 @@ POLL_S = 0.02
 """How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
 REQUEST_POLLS = 10
 """The journal's requests are looked at every so many polls."""
+HEALTH_POLLS = 5
+"""The cell's health is looked at every so many polls."""
 
 
 _END_TRIGGERS = {
@@ -40,6 +42,7 @@ class Runner:
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
     stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
     a step is cut short, and exactly once more at the end of every run. `recover(error)` clears a recoverable fault.
+    `health()` is called about ten times a second while a step works, and raises what must end it whatever it does.
     """
 
     sequence: Sequence
@@ -51,6 +54,7 @@ class Runner:
     safe_stop: Callable[[str], None]
     observer: Observer | None = None
     recover: Callable[[BaseException], None] | None = None
+    health: Callable[[], None] | None = None
     _asked: str | None = field(default=None, init=False)
     _paused: threading.Event = field(default_factory=threading.Event, init=False)
     _polls: int = field(default=0, init=False)
@@ -192,6 +196,8 @@ class Runner:
             except JournalError as error:
                 self._error = error
                 cause = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
+            if cause is None and cancel is not None:
+                cause = self._ail()
             if cause is None and self.clock.now() > deadline:
                 self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
                 cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
@@ -221,6 +227,17 @@ class Runner:
             return Failure(Outcome.ABORTED, self._signals.reason, "signal")
         if self._asked is not None:
             return Failure(Outcome.ABORTED, self._asked, "request")
+        return None
+
+    def _ail(self) -> Failure | None:
+        """What `health` raises, if anything."""
+        if self.health is None or self._polls % HEALTH_POLLS:
+            return None
+        try:
+            self.health()
+        except Exception as error:
+            self._error = error
+            return self._judge(error)
         return None
 
     def _hold(self) -> Failure | None:

@@ -46,7 +46,7 @@ class Call:
 
 
 class SignalWatch:
-    """Inside this context SIGINT and SIGTERM are noted in `reason` and do not interrupt anything.
+    """Inside this context SIGINT, SIGTERM and SIGHUP are noted in `reason` and do not interrupt anything.
 
     So neither the first Ctrl-C nor a second one, however often it is pressed, can cut a safe stop short. Nested
     contexts see the signals of their own time. Does nothing outside the main thread, where Python allows no handlers.
@@ -61,11 +61,13 @@ class SignalWatch:
         """What to tell the operator, or None if no signal came."""
         if self.number is None:
             return None
-        return "interrupted from the keyboard" if self.number == signal.SIGINT else "asked to terminate (SIGTERM)"
+        if self.number == signal.SIGINT:
+            return "interrupted from the keyboard"
+        return f"asked to end ({signal.Signals(self.number).name})"
 
     def __enter__(self) -> SignalWatch:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 self._previous[number] = signal.signal(number, self._note)
         return self
 

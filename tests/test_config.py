@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from cell.config import CellConfig, default_toml, load_config, validate
-from cell.job import load_job, shipped_jobs
+from cell.job import job_path, load_job, require_fit, shipped_jobs
 from cell.units import parse_quantity
 from drivers.errors import ConfigError
 
@@ -114,9 +115,24 @@ def test_a_job_that_does_not_exist_lists_those_that_do() -> None:
         load_job("teapot")
 
 
-def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
-    from cell.job import job_path
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (('length = "64 mm"', 'length = "99.5 mm"'), "scan.length 99.5 mm"),
+        (('speed = "15 mm/s"', 'speed = "45 mm/s"'), "scan.speed 45 mm/s exceeds rail.max_speed, 40 mm/s"),
+        (('speed = "0.4 m/s"', 'speed = "0.9 m/s"'), "approach.speed 900 mm/s exceeds vehicle.max_speed, 500 mm/s"),
+    ],
+)
+def test_a_job_that_asks_too_much_of_the_cell_is_refused(tmp_path: Path, edit: tuple[str, str], words: str) -> None:
+    source = job_path("pot")
+    path = tmp_path / "mine.toml"
+    path.write_text(source.read_text().replace(*edit).replace("pot.stl", str(source.parent / "pot.stl")))
+    job, _ = load_job(path)
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        require_fit(job, load_config(None))
 
+
+def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(job_path("pot").read_text().replace("pot.stl", "gone.stl"))
     with pytest.raises(ConfigError, match=r"gone\.stl"):

@@ -14,17 +14,17 @@ EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 def main() -> None:
     """Entry point of the console script: runs a command and turns errors into a message and an exit code."""
     from cell.cli.app import app
-    from drivers.errors import CellError, ConfigError
+    from drivers.errors import CellError, ConfigError, Interrupted
 
     try:
         app(standalone_mode=True)
-    except KeyboardInterrupt as interrupt:
-        _complain(str(interrupt) or "interrupted")
+    except Interrupted as error:
+        _complain(str(error))
         sys.exit(EXIT_INTERRUPTED)
     except ConfigError as error:
         _complain(str(error))
         sys.exit(EXIT_USAGE)
-    except CellError as error:
+    except (CellError, OSError) as error:
         _complain(str(error))
         sys.exit(EXIT_FAILED)
 

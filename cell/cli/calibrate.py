@@ -67,6 +67,7 @@ def calibrate(
 
 def _from_folder(folder: Path, board: str | None, json: bool) -> None:
     from cell.calibration.recorded import calibrate_folder
+    from cell.cli.recorded_tables import print_recorded
     from cell.vision import parse_board
     from drivers.errors import ConfigError
 
@@ -74,12 +75,10 @@ def _from_folder(folder: Path, board: str | None, json: bool) -> None:
     if json:
         print_json(result)
     else:
-        _print_summary(result)
+        print_recorded(result)
     if not any(frame["used"] for frame in result["frames"]):
-        raise ConfigError(f"no picture in {folder} could be used; the reasons are listed above")
-
-
-def _print_summary(summary: object) -> None:
-    from rich.console import Console
-
-    Console().print(summary)
+        raise ConfigError(
+            f"no picture in {folder} could be used: is {board} the board in the pictures? The reasons are listed above"
+        )
+    if result["intrinsics"] is None and result["hand_eye"] is None:
+        raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result['notes'])}")

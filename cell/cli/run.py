@@ -57,10 +57,12 @@ def dry_run(
     json: JsonOption = False,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
-    from cell.job import load_job
+    from cell.config import load_config
+    from cell.job import load_job, require_fit
     from cell.supervisor import SIM_SPEED, Cell
 
     loaded, _ = load_job(job)
+    require_fit(loaded, load_config(config))
     with Cell.open(
         config,
         sim="all",

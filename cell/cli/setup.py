@@ -45,10 +45,11 @@ def init(
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
     from cell.config import load_config
-    from cell.job import load_job
+    from cell.job import load_job, require_fit
 
     loaded = load_config(config)
     checked, mesh = load_job(job)
+    require_fit(checked, loaded)
     if json:
         print_json({"cell": loaded.cell.name, "job": checked.job.name, "mesh": str(mesh), "ok": True})
     else:

@@ -15,8 +15,8 @@ from cell.job import Job
 from cell.reconstruction import Cloud
 from cell.report.pictures import run_picture
 from cell.report.truth import Witness, ask_truth, expected_error, place_error, sensor_error
+from cell.runs import REPORT, write_json
 from cell.steps.laser_sweep import SweepRecord
-from drivers.errors import CellError
 from drivers.interfaces import Image, Vector
 from statemachine.runner import RunResult
 
@@ -31,8 +31,12 @@ def make_report(
     info: dict[str, Any],
     started: float,
     witness: Witness | None,
+    frames_missing: str | None,
 ) -> dict[str, Any]:
-    """Everything about a run as JSON-ready data, and `picture.png` in its folder."""
+    """Everything about a run as JSON-ready data; also `report.json` and `picture.png` in its folder.
+
+    Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
+    """
     pose = result.results.get("invert_pose")
     report: dict[str, Any] = {
         "run": folder.name,
@@ -54,12 +58,19 @@ def make_report(
     if isinstance(pose, PlacePose):
         report["place_pose"] = _pose(pose, job)
         report["place_sigma"] = _sigma(pose)
+    if frames_missing is not None:
+        report["frames_missing"] = frames_missing
+    write_json(folder / REPORT, report)
     if witness is not None:
-        _add_truth(report, config, job, nominal, repeatability, result, witness)
+        try:
+            _add_truth(report, config, job, nominal, repeatability, result, witness)
+        except Exception as error:
+            report["truth_missing"] = f"{type(error).__name__}: {error}"
     try:
         _draw(folder, job, nominal, result, report)
-    except OSError as error:
-        report["picture"] = f"could not be written: {error}"
+    except Exception as error:
+        report["picture_missing"] = f"{type(error).__name__}: {error}"
+    write_json(folder / REPORT, report)
     return report
 
 
@@ -103,12 +114,8 @@ def _add_truth(
     result: RunResult,
     witness: Witness,
 ) -> None:
-    """The comparison with the simulated world; a world that does not answer any more leaves it out, and says so."""
-    try:
-        now = ask_truth(config.cell.truth)
-    except CellError as error:
-        report["truth_missing"] = str(error)
-        return
+    """The comparison with the simulated world; raises when that does not answer any more."""
+    now = ask_truth(config.cell.truth)
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part")}
     sweep, cloud, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))

@@ -13,7 +13,7 @@ from cell.geometry.poses import from_ur
 from cell.planning import View, scan_calibration_views, target_calibration_views
 from cell.steps.moves import HOME, Mover
 from cell.vision import BoardView, extract, find_board, parse_board
-from drivers.errors import RefusedError
+from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Camera
 
 PHOTO_RATE = 10.0
@@ -46,7 +46,7 @@ def collect_scan(
         check()
         progress(k / len(views), f"fine board, view {k + 1} of {len(views)}")
         travel = rail.move_to(view.rail_position)
-        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+        _move(devices, mover, view, k)
         travel.wait(30.0)
         camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
         seen = _look(camera, lambda image: find_board(image, board), refusals)
@@ -72,11 +72,22 @@ def collect_target(
     for k, view in enumerate(views):
         check()
         progress(k / len(views), f"large board, view {k + 1} of {len(views)}")
-        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+        _move(devices, mover, view, k)
         seen = _look(devices.target_camera, lambda image: find_board(image, board), refusals)
         if seen is not None:
             made.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
     return _enough(made, views, refusals)
+
+
+def _move(devices: Devices, mover: Mover, view: View, k: int) -> None:
+    """To a view; after a stop that a program may clear, once more."""
+    try:
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+    except DeviceFault as fault:
+        if fault.device != devices.arm.name or not fault.recoverable:
+            raise
+        devices.arm.recover()
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
 
 
 def _look(camera: Camera, find: Callable[..., BoardView], refusals: Counter[str]) -> BoardView | None:

@@ -44,6 +44,7 @@ def drive_to_target(
     job: Job,
     vehicle_from_base: pin.SE3,
     vehicle: Vehicle,
+    odometry: Odometry,
     photograph: Callable[[], BoardFix],
     clock: Clock,
     check: Callable[[], None],
@@ -51,21 +52,32 @@ def drive_to_target(
 ) -> Arrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
-    The arm stands in its looking pose already. `photograph` gives the board in the base; `check` raises when the run is
+    The arm stands in its looking pose already, the vehicle is enabled, and `odometry` knows its place roughly until the
+    board is seen. On odometry alone it goes no further than the staging pose.
+    `photograph` gives the board in the base; `check` raises when the run is
     to end. Raises `RefusedError` when the tolerance is not met after five tries.
     """
+
+    def place_from_vehicle(fix: BoardFix) -> Planar:
+        return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
+
     approach = job.approach
     staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
-    vehicle.enable()
-    odometry = Odometry(vehicle, Planar.of(approach.start.se3()))
-    progress(0.05, "driving on odometry")
-    drive_line(vehicle, odometry, staging, approach.speed, clock, check)
+    progress(0.05, "looking whether the board is in sight already")
+    try:
+        seen = place_from_vehicle(photograph())
+        odometry.anchor(seen)
+    except RefusedError:
+        seen = odometry.pose()
+    if (staging.inverse() * seen).x < 0:
+        progress(0.1, "driving on odometry")
+        drive_line(vehicle, odometry, staging, approach.speed, clock, check)
     for count in range(1, 2 * MAX_TRIES):
         progress(min(0.9, 0.3 + 0.15 * count), "looking at the board")
         clock.sleep(0.3)  # the suspension settles
         fix = photograph()
         base_from_place = fix.base_from_board * job.place_from_board.inverse()
-        seen = Planar.of((vehicle_from_base * base_from_place).inverse())
+        seen = place_from_vehicle(fix)
         odometry.anchor(seen)
         error = target.inverse() * seen
         near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance

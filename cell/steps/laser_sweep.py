@@ -21,6 +21,7 @@ from drivers.errors import DeviceFault
 from drivers.interfaces import Arm, Camera, Frame, Laser, Rail, Vector
 
 MAX_LOST_FRACTION = 0.05
+MAX_FLANGE_MOTION = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,19 @@ def laser_sweep(
             recoverable=True,
             hint="Lower scan.frame_rate or look at the camera's link.",
         )
+    moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
+    if moved > MAX_FLANGE_MOTION:
+        raise DeviceFault(
+            arm.name,
+            "arm.moved_in_sweep",
+            f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
+            recoverable=True,
+            hint="See what pushed the arm; the sweep is of no use.",
+        )
     samples = sweep.samples
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
-    residual = float(np.std([position - sweep.position_at(time) for time, position in moving])) if len(moving) else 0.0
+    residual = (
+        float(np.median([abs(position - sweep.position_at(time)) for time, position in moving])) if len(moving) else 0.0
+    )
     positions = np.array([sweep.position_at(time) for time, _ in inside])
     return SweepRecord(base_from_flange, [profile for _, profile in inside], positions, lost, residual, *middle)

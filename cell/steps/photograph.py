@@ -12,7 +12,6 @@ from cell.calibration import TargetCalibration
 from cell.geometry.poses import compose_covariance, from_ur, mean
 from cell.job import PhotoSection
 from cell.vision import BoardSpec, board_pose, find_board
-from drivers.clock import Clock
 from drivers.errors import RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
@@ -76,9 +75,3 @@ def photograph(
         base_from_camera, hand_eye, camera_from_board, np.mean([pose.covariance for pose in poses], axis=0) / count
     )
     return BoardFix(base_from_camera * camera_from_board, covariance, residual, obliquity, frames)
-
-
-def wait_still(arm: Arm, clock: Clock, settle_time: float) -> None:
-    """Wait until the arm has been at rest for the settling time."""
-    clock.sleep(settle_time)
-    arm.state()

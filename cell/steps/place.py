@@ -9,12 +9,16 @@ import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import Job
-from cell.steps.moves import Mover
+from cell.steps.moves import HOME, Mover
 from drivers.errors import RefusedError
 from drivers.interfaces import Arm, Claw
 
 TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
 """What may come closer than the collision margin on the way down and up."""
+
+
+FAST_FORCE = 3.0
+"""Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,8 @@ def place(
     """Put the part onto the surface whose pose was measured.
 
     Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
-    `contact_force`. Raises `RefusedError`, with the part still held and lifted, when contact comes too early, that is
+    `contact_force`; afterwards the arm folds.
+    Raises `RefusedError`, with the part still held and lifted, when contact comes too early, that is
     more than `contact_travel` from where it was expected, or does not come at all.
     """
     plan = job.place
@@ -63,7 +68,12 @@ def place(
     if not claw.holding:
         raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
     progress(0.4, "descending")
-    mover.line(flange_at(plan.contact_travel), plan.speed, TOUCHES)
+    if mover.line(flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
+        mover.line(above, plan.speed, TOUCHES)
+        raise RefusedError(
+            f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
+            "lifted again, still held. Look what lies on the place"
+        )
     arm.zero_force()
     progress(0.6, "feeling for contact")
     contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
@@ -81,4 +91,6 @@ def place(
     mover.leave_part()
     progress(0.9, "retreating")
     mover.line(above, plan.speed, TOUCHES)
+    progress(0.95, "folding the arm")
+    mover.to_joints(HOME)
     return PlaceResult(reached, contact, depth)

@@ -128,6 +128,7 @@ class ArmLink:
                 stdout=subprocess.DEVNULL,
                 stderr=self._errors,
                 env=environment,
+                start_new_session=True,  # a Ctrl-C is for the supervisor, which stops the arm through this process
             )
         return Connection(ours.detach()), process
 
@@ -218,7 +219,9 @@ def switch_off(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
     command = [sys.executable, "-m", "drivers.arm.ur_child", "--off", address, ",".join(map(str, outputs))]
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, timeout=deadline, check=False)
+        done = subprocess.run(
+            command, env=environment, capture_output=True, timeout=deadline, check=False, start_new_session=True
+        )
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0

@@ -21,7 +21,15 @@ from drivers.arm.link import ArmLink, switch_off
 from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion, fault
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceError, DeviceFault, InterlockError, LimitError, NotConnectedError
+from drivers.errors import (
+    Aborted,
+    DeadlineError,
+    DeviceError,
+    DeviceFault,
+    InterlockError,
+    LimitError,
+    NotConnectedError,
+)
 from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
 from drivers.quantities import check_positive, shown
 
@@ -29,6 +37,7 @@ _CALL_S = 5.0
 _OUTPUT_S = 1.0
 _CLOSE_S = 4.0
 _UNLOCK_S = 20.0
+_SWITCH_OFF_TRIES = 3
 _STATE_FLOOR_S, _STATE_FLOOR_FAST_S = 0.5, 3.0
 _FIRST_POINT = 0.02
 _WATCHDOG_S = 1.5
@@ -235,6 +244,8 @@ class UrArm:
         self._alive()
         problem = self._link.call(name, *arguments, deadline=deadline)
         if problem is not None:
+            if problem[0] == "arm.stopped":
+                raise Aborted(f"{self.name}: {name} was dropped because the arm was stopped")
             raise fault(self.name, *problem)
 
     def _start(self, what: str, name: str, *arguments: Any) -> UrMotion:
@@ -248,7 +259,7 @@ class UrArm:
             self._motion = motion
             try:
                 self._ask(name, motion.number, *arguments)
-            except DeviceError as error:
+            except (DeviceError, Aborted) as error:
                 motion.fail(error)
                 raise
             return motion
@@ -330,12 +341,14 @@ class UrArm:
             Dashboard(self.name, self._address).ask("stop")
         except DeviceError:
             self.statistics.count("emergency stop of the program failed")
-        if self._safe_off and not switch_off(self._address, self._safe_off, deadline=2.0):
+        for _ in range(_SWITCH_OFF_TRIES if self._safe_off else 0):
+            if switch_off(self._address, self._safe_off, deadline=2.0):
+                return
             self.statistics.count("emergency switching of outputs failed")
 
     def _join_safing(self) -> None:
         if self._safing is not None:
-            self._safing.join(4.0)
+            self._safing.join(_SWITCH_OFF_TRIES * 2.0 + 2.0)
 
     def _end_motion(self, error: Exception) -> None:
         if self._motion is not None:

@@ -59,10 +59,16 @@ class ControlThread:
         """Queue a request. A stop drops what waits and ends what runs."""
         if request.name in ("stop", "close"):
             self._stop.set()
+            stops: list[Request] = []
             with suppress(queue.Empty):
                 while True:
                     dropped = self._requests.get_nowait()
-                    self._send(Reply(dropped.number, ("arm.stopped", "")))
+                    if dropped.name == "stop":
+                        stops.append(dropped)
+                    else:
+                        self._send(Reply(dropped.number, ("arm.stopped", "")))
+            for stop in stops:
+                self._requests.put(stop)
         self._requests.put(request)
 
     def _run(self) -> None:

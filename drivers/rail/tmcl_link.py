@@ -58,7 +58,9 @@ class TmclLink:
         self._stops = 0
         self._closed = False
         try:
-            self._port = serial.serial_for_url(url, baudrate=baud, timeout=REPLY_TIMEOUT_S)
+            self._port = serial.serial_for_url(
+                url, baudrate=baud, timeout=REPLY_TIMEOUT_S, write_timeout=REPLY_TIMEOUT_S
+            )
         except (serial.SerialException, OSError, ValueError) as error:
             raise NotConnectedError(
                 name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"

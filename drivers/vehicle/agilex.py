@@ -177,10 +177,15 @@ class AgilexVehicle:
                 self._stopping -= 1
 
     def brake(self) -> None:
-        """Stop, wait for standstill and lock the brake; it stays locked until `enable()`."""
-        self.stop()
-        self._link.send("BrakeCommand", Locked=1)
-        self._braked = True
+        """Stop, wait for standstill and lock the brake; it stays locked until `enable()`.
+
+        The brake is locked also when standstill is not reported in time, which is raised afterwards.
+        """
+        try:
+            self.stop()
+        finally:
+            self._braked = True
+            self._link.send("BrakeCommand", Locked=1)
 
     def close(self) -> None:
         """Stop the vehicle, end the threads and shut the bus down."""

@@ -1,0 +1,76 @@
+"""Tables of a calibration from a folder of recorded frames, for people; scripts take the JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_recorded(result: Mapping[str, Any]) -> None:
+    """Frames with the reason of each refusal, then what was found, with units, then what could not be had."""
+    console = Console()
+    if result["board"] is not None:
+        console.print(_frames(result["frames"]))
+    values = _table("calibration", ("quantity", "value", "unit"), right=1)
+    camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
+    if camera is not None:
+        for name in ("fx", "fy", "cx", "cy"):
+            values.add_row(f"camera {name}", f"{camera[name]:.3f} ± {camera['sigma_px'][name]:.3f}", "px")
+        for name in ("k1", "k2", "p1", "p2"):
+            values.add_row(f"camera {name}", f"{camera[name]:.5f}", "")
+        values.add_row("RMS of the board's points", f"{camera['rms_px']:.4f}", "px")
+    if hand is not None:
+        setup = f"hand-eye ({hand['setup'].replace('_', ' ')})"
+        for axis, value in zip("xyz", hand["translation_mm"], strict=True):
+            values.add_row(f"{setup} {axis}", f"{value:.3f}", "mm")
+        for axis, value in zip("xyz", hand["rotation_vector_rad"], strict=True):
+            values.add_row(f"{setup} rotation {axis}", f"{value:.5f}", "rad")
+        values.add_row("scatter of the board", f"{hand['scatter_mm']:.3f}", "mm")
+        values.add_row("scatter of the board", f"{hand['scatter_deg']:.4f}", "deg")
+    if plane is not None:
+        values.add_row("light plane normal", ", ".join(f"{v:.5f}" for v in plane["normal"]), "")
+        values.add_row("light plane distance", f"{plane['distance_mm']:.3f}", "mm")
+        values.add_row("light plane RMS", f"{plane['rms_mm']:.4f}", "mm")
+    if values.row_count:
+        console.print(values)
+    if result["flatness"] is not None:
+        console.print(_flatness(result["flatness"]))
+    for note in result["notes"]:
+        console.print(note, markup=False, soft_wrap=True)
+
+
+def _frames(frames: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("frames", ("frame", "used", "RMS in px", "reason"), right=2)
+    for frame in frames:
+        rms = "" if frame["rms_px"] is None else f"{frame['rms_px']:.3f}"
+        table.add_row(frame["name"], "yes" if frame["used"] else "no", rms, frame["text"])
+    return table
+
+
+def _flatness(flat: Mapping[str, Any]) -> Table:
+    title = f"flatness of the board in the {flat['frame']}, end to end, mm"
+    table = _table(title, ("points of", "RMS", "left out", "staged"), right=1)
+    other = [flat["leave_one_out"], flat["staged"]]
+
+    def shown(part: Mapping[str, Any] | None, key: str) -> str:
+        return "" if part is None or part[key] is None else f"{part[key]:.3f}"
+
+    for k, frame in enumerate(flat["per_frame"]):
+        rest = [shown(None if part is None else part["per_frame"][k], "rms_mm") for part in other]
+        table.add_row(frame["name"], shown(frame, "rms_mm"), *rest)
+    table.add_section()
+    table.add_row("all frames", shown(flat, "rms_mm"), *(shown(part, "rms_mm") for part in other))
+    table.add_row("95 % within", shown(flat, "p95_mm"), *(shown(part, "p95_mm") for part in other))
+    table.add_row(f"{flat['points']} points", *(["×".join(f"{v:.0f}" for v in flat["extent_mm"])] + [""] * 2))
+    return table
+
+
+def _table(title: str, columns: Sequence[str], right: int) -> Table:
+    """A table whose columns from `right` on hold numbers, the last one but text where it is a unit or a reason."""
+    table = Table(title=title)
+    for k, name in enumerate(columns):
+        table.add_column(name, justify="right" if k >= right and name not in ("unit", "reason") else "left")
+    return table
