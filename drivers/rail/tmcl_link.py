@@ -31,6 +31,7 @@ from drivers.rail.tmcl_codec import (
 )
 
 REPLY_TIMEOUT_S = 0.5
+WRITE_TIMEOUT_S = 2.0
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
 _QUIET_S = 0.05
 _ATTEMPTS = 2
@@ -59,7 +60,7 @@ class TmclLink:
         self._closed = False
         try:
             self._port = serial.serial_for_url(
-                url, baudrate=baud, timeout=REPLY_TIMEOUT_S, write_timeout=REPLY_TIMEOUT_S
+                url, baudrate=baud, timeout=REPLY_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S
             )
         except (serial.SerialException, OSError, ValueError) as error:
             raise NotConnectedError(
