@@ -31,8 +31,9 @@ from drivers.rail.tmcl_codec import (
 )
 
 REPLY_TIMEOUT_S = 0.5
-WRITE_TIMEOUT_S = 2.0
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
+WRITE_TIMEOUT_S = 2.0
+"""Wall seconds after which a port that takes no bytes counts as stuck."""
 _QUIET_S = 0.05
 _ATTEMPTS = 2
 _USER_BANK = 2
