@@ -13,11 +13,16 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.folder import RecordedFrame
+from cell.calibration.hand_eye import HandEye, solve_hand_eye
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board import board_pose
 from cell.vision.pictures import Reason
+from drivers.errors import RefusedError
 
 LARGEST_ANGLE = np.deg2rad(3.0)
+# A board further from where the others see it than this share of its distance, and than this many times what is
+# usual in the folder, was not where the flange pose says.
+MISPLACED_SHARE, MISPLACED_RATIO = 0.02, 6.0
 
 
 def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
@@ -61,6 +66,54 @@ def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> lis
         )
         del index[worst]
     return [kept[i] for i in index]
+
+
+def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
+    """Refuse frames whose flange pose puts the board far from where the others see it; the rest.
+
+    The worst goes first. Nothing is refused where no hand-eye can be had.
+    """
+    kept = list(frames)
+    while len(kept) > 3:
+        try:
+            off, reach = _misplacements(kept, camera)
+        except RefusedError:
+            break
+        worst = int(np.argmax(off / reach))
+        others = float(np.median(np.delete(off, worst)))
+        if off[worst] < max(MISPLACED_SHARE * reach[worst], MISPLACED_RATIO * others):
+            break
+        kept[worst].refuse(
+            Reason.NO_POSE,
+            f"the flange pose puts the board {1e3 * off[worst]:.0f} mm from where the other frames see it, which agree "
+            f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
+        )
+        del kept[worst]
+    return kept
+
+
+def _misplacements(frames: Sequence[RecordedFrame], camera: CameraModel) -> tuple[Array, Array]:
+    """How far each frame's board (n,) lies from where the others put it, and from the camera (n,), both in m.
+
+    For the camera on the flange or standing before it, whichever fits better.
+    """
+    boards = [board_pose(f.view, camera).camera_from_board for f in frames if f.view is not None]
+    reported = [f.base_from_flange for f in frames if f.base_from_flange is not None]
+    reach = np.array([np.linalg.norm(b.translation) for b in boards])
+    tried = []
+    for flanges in (reported, [f.inverse() for f in reported]):
+        off = np.zeros(len(frames))
+        for k in range(len(frames)):
+            rest = [j for j in range(len(frames)) if j != k]
+            found = solve_hand_eye([flanges[j] for j in rest], [boards[j] for j in rest])
+            off[k] = _away(found, flanges[k], boards[k])
+        tried.append(off)
+    return min(tried, key=lambda off: float(np.median(off))), reach
+
+
+def _away(found: HandEye, flange: pin.SE3, board: pin.SE3) -> float:
+    seen = flange * found.flange_from_camera * board
+    return float(np.linalg.norm(seen.translation - found.base_from_board.translation))
 
 
 def _apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:

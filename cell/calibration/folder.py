@@ -147,6 +147,14 @@ def read_pose_pairs(folder: Path) -> list[tuple[pin.SE3, pin.SE3]]:
     return []
 
 
+def poses_without_frame(folder: Path, frames: Sequence[RecordedFrame]) -> list[str]:
+    """Names of the pose files that belong to no picture."""
+    stems = {name for frame in frames for name in _pose_names(frame.path.stem)}
+    return sorted(
+        p.name for p in folder.glob("pose*") if p.suffix.lower() == ".txt" and p.is_file() and p.stem not in stems
+    )
+
+
 def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
     """The frames that were not refused."""
     return [f for f in frames if f.reason is None and f.view is not None]
@@ -154,9 +162,7 @@ def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
 
 def _attach_pose(frame: RecordedFrame) -> None:
     """Give a frame the pose of its number; a broken pose file refuses the frame, a missing one does not."""
-    stem = frame.path.stem
-    names = [re.sub(r"^.*?(\d+)$", r"pose\1", stem), f"{stem}_pose", stem]
-    for name in names:
+    for name in _pose_names(frame.path.stem):
         for suffix in (".txt", ".json"):
             path = frame.path.with_name(name + suffix)
             if not path.exists():
@@ -167,6 +173,11 @@ def _attach_pose(frame: RecordedFrame) -> None:
                 if frame.reason is None:
                     frame.refuse(Reason.NO_POSE, str(error))
             return
+
+
+def _pose_names(stem: str) -> list[str]:
+    """What the pose file of a picture may be called, without its ending."""
+    return [re.sub(r"^.*?(\d+)$", r"pose\1", stem), f"{stem}_pose", stem]
 
 
 def _natural(path: Path) -> list[object]:

@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.blocks import PLANE
-from cell.calibration.consistency import refuse_odd_ones, settle_orders
+from cell.calibration.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.calibration.flatness import Flatness, choose_arm, flatness, leave_one_out
-from cell.calibration.folder import RecordedFrame, read_frames, read_pose_pairs, used
+from cell.calibration.folder import RecordedFrame, poses_without_frame, read_frames, read_pose_pairs, used
 from cell.calibration.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
 from cell.calibration.intrinsics import Intrinsics, choose_lens
 from cell.calibration.joint import Joint, Staged, solve_joint, solve_staged, start_state
@@ -60,7 +60,8 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
     - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
       it), `held_out_rms_px`, `sigma_px`; `intrinsics_without_distortion`, `intrinsics_from_pictures` likewise;
     - `hand_eye`: `method`, `setup` (eye_in_hand, eye_to_hand), `translation_mm`, `rotation` (3×3),
-      `rotation_vector_rad`, `euler_xyz_rad` (rotations about x, then the new y, then the new z), `scatter_mm`,
+      `rotation_vector_rad`, `euler_xyz_rad` (rotations about x, then the new y, then the new z;
+      the first in 0 … π), `scatter_mm`,
       `scatter_deg`, of the closed form under `closed_form`;
     - `light_plane`: `normal`, `distance_mm` (normal · point = distance in the camera frame), `rms_mm`;
     - `flatness`: `rms_mm`, `p95_mm`, `points`, `extent_mm`, `per_frame`, `leave_one_out`, `staged`;
@@ -80,6 +81,9 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
             return _from_pairs(pairs)
         raise
     result = _empty(spec)
+    result["notes"] += [
+        f"{name} is not used: no picture has its number" for name in poses_without_frame(folder, frames)
+    ]
     _from_frames(frames, result)
     result["frames"] = [_frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
@@ -116,7 +120,7 @@ def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
     if len(posed) >= LEAST_POSES:
         settle_orders(posed, chosen.camera)
         before = len(posed)
-        posed = refuse_odd_ones(posed, chosen.camera)
+        posed = refuse_misplaced(refuse_odd_ones(posed, chosen.camera), chosen.camera)
         if len(posed) < before:
             try:
                 chosen, plain = _camera(frames)
@@ -363,6 +367,10 @@ def _hand_eye_dict(setup: str, pose: pin.SE3) -> dict[str, Any]:
     r = pose.rotation
     middle = math.asin(max(-1.0, min(1.0, float(r[0, 2]))))
     first, last = math.atan2(-r[1, 2], r[2, 2]), math.atan2(-r[0, 1], r[0, 0])
+    if first < 0:
+        # Of the two triples for one rotation, that with the first angle in 0 … π.
+        first, middle, last = first + math.pi, math.pi - middle, last + math.pi
+        middle, last = (math.remainder(angle, 2 * math.pi) for angle in (middle, last))
     return {
         "setup": setup,
         "pose": "flange_from_camera" if setup == "eye_in_hand" else "base_from_camera",

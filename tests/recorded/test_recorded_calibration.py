@@ -1,0 +1,153 @@
+"""Promises on photographs and poses that others recorded on real hardware, whole and spoilt."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cell.calibration.recorded import calibrate_folder
+from cell.vision import parse_board
+from drivers.errors import ConfigError
+
+RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[3] / "shared" / "data"))
+CHESS = parse_board("chessboard:7x6:10mm")
+
+pytestmark = pytest.mark.recorded
+
+
+def recording(name: str) -> Path:
+    folder = RECORDED / name
+    if not folder.is_dir():
+        pytest.skip(f"recorded data are missing: {folder} (set CELL_RECORDED_DATA)")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def line_laser():
+    return calibrate_folder(recording("robot_line_laser"), CHESS)
+
+
+def test_the_whole_chain_is_flatter_than_the_staged_pipeline(line_laser):
+    flatness = line_laser["flatness"]
+    assert flatness["rms_mm"] < 0.448
+    assert flatness["p95_mm"] < 1.011
+    assert flatness["rms_mm"] < flatness["staged"]["rms_mm"]
+    # On at least as many points and as large a part of the board as the simple pipeline took.
+    assert flatness["points"] >= 2763
+    assert min(flatness["extent_mm"]) > 0.95 * 85
+    assert max(flatness["extent_mm"]) > 0.95 * 147
+
+
+def test_frames_that_were_left_out_are_as_flat(line_laser):
+    left_out = line_laser["flatness"]["leave_one_out"]
+    assert left_out["rms_mm"] < 0.448
+    assert [frame["name"] for frame in left_out["per_frame"]] == [f["name"] for f in line_laser["frames"]]
+
+
+def test_camera_hand_eye_and_plane_are_those_of_the_simple_pipeline(line_laser):
+    assert all(frame["used"] for frame in line_laser["frames"])
+    assert line_laser["intrinsics_from_pictures"]["rms_px"] < 0.36
+    assert line_laser["intrinsics"]["fx"] == pytest.approx(2366, rel=0.01)
+    assert line_laser["intrinsics"]["fy"] == pytest.approx(2372, rel=0.01)
+    hand_eye = line_laser["hand_eye"]
+    assert hand_eye["setup"] == "eye_in_hand"
+    assert np.linalg.norm(np.subtract(hand_eye["translation_mm"], (102.2, 212.9, 353.0))) < 5
+    assert hand_eye["closed_form"]["scatter_mm"] < 0.633
+    assert line_laser["light_plane"]["rms_mm"] < 0.481
+
+
+def test_the_report_is_plain_json(line_laser):
+    assert json.loads(json.dumps(line_laser, allow_nan=False))["board"] == "chessboard:7x6:10mm"
+
+
+def test_without_poses_the_camera_and_the_light_plane_are_had(tmp_path):
+    for path in recording("robot_line_laser").glob("*.png"):
+        shutil.copy(path, tmp_path)
+    found = calibrate_folder(tmp_path, CHESS)
+    assert found["intrinsics"]["rms_px"] < 0.36
+    assert found["light_plane"]["rms_mm"] < 0.6
+    assert found["hand_eye"] is None
+    assert found["flatness"] is None
+    assert any("pose" in note for note in found["notes"])
+
+
+def test_spoilt_frames_are_refused_one_by_one_with_the_reason(tmp_path):
+    source = recording("robot_line_laser")
+    for path in source.iterdir():
+        shutil.copyfile(path, tmp_path / path.name)
+
+    def spoil(number: int, of: int, picture: np.ndarray | None = None, data: bytes | None = None) -> None:
+        shutil.copyfile(source / f"pose{of:04d}.txt", tmp_path / f"pose{number:04d}.txt")
+        target = tmp_path / f"frame{number:04d}.png"
+        if data is None:
+            cv2.imwrite(str(target), picture)
+        else:
+            target.write_bytes(data)
+
+    def frame(number: int) -> np.ndarray:
+        return cv2.imread(str(source / f"frame{number:04d}.png"), cv2.IMREAD_GRAYSCALE)
+
+    spoil(20, 2, frame(2) // 30)
+    spoil(21, 2, np.full((1024, 1280), 255, np.uint8))
+    spoil(22, 3, data=(source / "frame0003.png").read_bytes()[:700_000])
+    spoil(23, 4, cv2.resize(frame(4), None, fx=0.5, fy=0.5))
+    spoil(24, 4, np.full((1024, 1280), 60, np.uint8))
+    spoil(25, 5, cv2.rotate(frame(5), cv2.ROTATE_180))
+    spoil(26, 6, np.ascontiguousarray(frame(6)[:, ::-1]))
+    spoil(27, 7, data=b"")
+    spoil(28, 8, frame(8))
+    (tmp_path / "pose0028.txt").write_text("((1.3, 0.1, 1.4), (0.0, 0.0, 0.0, 9.0))")
+    spoil(29, 8, frame(8))
+    (tmp_path / "pose0029.txt").write_text((source / "pose0008.txt").read_text().replace("((1.3101837", "((1.3601837"))
+    found = calibrate_folder(tmp_path, CHESS)
+    reasons = {f["name"]: f["reason"] for f in found["frames"] if not f["used"]}
+    assert reasons == {
+        "frame0020.png": "black",
+        "frame0021.png": "saturated",
+        "frame0022.png": "cut",
+        "frame0023.png": "wrong_size",
+        "frame0024.png": "no_board",
+        "frame0025.png": "turned",
+        "frame0026.png": "turned",
+        "frame0027.png": "unreadable",
+        "frame0028.png": "no_pose",
+        "frame0029.png": "no_pose",
+    }
+    assert all(len(f["text"]) > 20 for f in found["frames"] if not f["used"])
+    assert found["flatness"]["leave_one_out"]["rms_mm"] < 0.448
+
+
+def test_the_dot_board_gives_the_published_camera():
+    found = calibrate_folder(recording("dot_board"), parse_board("dots:6x6:34mm"))
+    assert sum(f["used"] for f in found["frames"]) == 5
+    assert all(f["order_assumed"] for f in found["frames"])
+    camera = found["intrinsics_without_distortion"]
+    assert camera["rms_px"] < 0.33
+    assert camera["fx"] == pytest.approx(276.509794, rel=0.01)
+    assert camera["fy"] == pytest.approx(272.959474, rel=0.01)
+    assert camera["cx"] == pytest.approx(163.865226, abs=1.0)
+    assert camera["cy"] == pytest.approx(113.304585, abs=1.0)
+
+
+def test_the_recorded_pose_pairs_give_the_expected_hand_eye():
+    hand_eye = calibrate_folder(recording("hand_eye"), None)["hand_eye"]
+    assert hand_eye["setup"] == "eye_to_hand"
+    np.testing.assert_allclose(hand_eye["translation_mm"], (659, -249, 830), rtol=0.01)
+    about = [cv2.Rodrigues(np.eye(3)[k] * angle)[0] for k, angle in enumerate((0.230, -2.540, 1.950))]
+    turn = np.array(hand_eye["rotation"]).T @ about[0] @ about[1] @ about[2]
+    assert np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) < 0.02
+
+
+def test_an_empty_or_missing_folder_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="no pictures"):
+        calibrate_folder(tmp_path, CHESS)
+    with pytest.raises(ConfigError, match="not a folder"):
+        calibrate_folder(tmp_path / "none", CHESS)
+    with pytest.raises(ConfigError, match="--board"):
+        calibrate_folder(tmp_path, None)

@@ -1,0 +1,94 @@
+"""Promises of `cell calibrate --from` on recordings: what it prints, when it fails, and where a camera is mounted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cell.calibration.recorded import calibrate_folder
+from cell.cli.app import app
+from cell.vision import parse_board
+from drivers.errors import ConfigError
+
+RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[3] / "shared" / "data"))
+
+pytestmark = pytest.mark.recorded
+
+
+def recording(name: str) -> Path:
+    folder = RECORDED / name
+    if not folder.is_dir():
+        pytest.skip(f"recorded data are missing: {folder} (set CELL_RECORDED_DATA)")
+    return folder
+
+
+def calibrate(folder: Path, *options: str):
+    return CliRunner().invoke(app, ["calibrate", "--from", str(folder), *options])
+
+
+def test_json_goes_to_scripts_without_nan():
+    ran = calibrate(recording("dot_board"), "--board", "dots:6x6:34mm", "--json")
+    assert ran.exit_code == 0, ran.output
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    assert json.loads(ran.stdout, parse_constant=refuse)["board"] == "dots:6x6:34mm"
+
+
+def test_people_get_tables_with_units():
+    ran = calibrate(recording("dot_board"), "--board", "dots:6x6:34mm")
+    assert ran.exit_code == 0, ran.output
+    assert "circles-03.jpg" in ran.stdout
+    assert "px" in ran.stdout
+
+
+def test_pairs_of_poses_need_no_board():
+    ran = calibrate(recording("hand_eye"))
+    assert ran.exit_code == 0, ran.output
+    assert "eye to hand" in ran.stdout
+    assert "mm" in ran.stdout
+
+
+def test_another_board_than_that_in_the_pictures_is_an_error(tmp_path):
+    shutil.copy(recording("dot_board") / "circles-01.jpg", tmp_path)
+    ran = calibrate(tmp_path, "--board", "dots:9x7:34mm", "--json")
+    assert isinstance(ran.exception, ConfigError)
+    assert "is dots:9x7:34mm the board in the pictures" in str(ran.exception)
+    assert json.loads(ran.stdout)["frames"][0]["reason"] == "no_board"
+
+
+def test_too_few_pictures_are_an_error_that_says_how_many_are_needed(tmp_path):
+    for number in (1, 2):
+        shutil.copy(recording("dot_board") / f"circles-{number:02d}.jpg", tmp_path)
+    ran = calibrate(tmp_path, "--board", "dots:6x6:34mm", "--json")
+    assert isinstance(ran.exception, ConfigError)
+    assert "needs 3 or more" in str(ran.exception)
+
+
+def test_a_pose_without_a_picture_is_named(tmp_path):
+    for name in ("frame0002.png", "pose0002.txt", "pose0003.txt"):
+        shutil.copy(recording("robot_line_laser") / name, tmp_path)
+    notes = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm"))["notes"]
+    assert any("pose0003.txt" in note for note in notes)
+
+
+def test_inverted_pairs_are_recognised_as_a_camera_on_the_flange(tmp_path):
+    pairs = json.loads((recording("hand_eye") / "pose_samples.json").read_text())
+    inverted = [[np.linalg.inv(flange).tolist(), board] for flange, board in pairs]
+    (tmp_path / "pose_samples.json").write_text(json.dumps(inverted))
+    hand_eye = calibrate_folder(tmp_path, None)["hand_eye"]
+    assert hand_eye["setup"] == "eye_in_hand"
+    np.testing.assert_allclose(hand_eye["translation_mm"], (659, -249, 830), rtol=0.01)
+
+
+def test_the_angles_are_those_of_the_published_hand_eye():
+    hand_eye = calibrate_folder(recording("hand_eye"), None)["hand_eye"]
+    published = np.array([0.230, -2.540, 1.950])
+    assert np.linalg.norm(hand_eye["euler_xyz_rad"] - published) < 0.01 * np.linalg.norm(published)
