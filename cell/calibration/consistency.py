@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.folder import RecordedFrame
-from cell.calibration.hand_eye import HandEye, solve_hand_eye
+from cell.calibration.hand_eye import park_martin
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board import board_pose
 from cell.vision.pictures import Reason
@@ -22,7 +22,9 @@ from drivers.errors import RefusedError
 LARGEST_ANGLE = np.deg2rad(3.0)
 # A board further from where the others see it than this share of its distance, and than this many times what is
 # usual in the folder, was not where the flange pose says.
-MISPLACED_SHARE, MISPLACED_RATIO = 0.02, 6.0
+MISPLACED_SHARE, MISPLACED_RATIO = 0.012, 5.0
+REWEIGHTINGS = 40
+LEAST_OFF_M = 1e-4
 
 
 def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
@@ -93,27 +95,34 @@ def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> li
 
 
 def _misplacements(frames: Sequence[RecordedFrame], camera: CameraModel) -> tuple[Array, Array]:
-    """How far each frame's board (n,) lies from where the others put it, and from the camera (n,), both in m.
+    """How far each frame's board (n,) lies from where most put it, and from the camera (n,), both in m.
 
     For the camera on the flange or standing before it, whichever fits better.
     """
     boards = [board_pose(f.view, camera).camera_from_board for f in frames if f.view is not None]
     reported = [f.base_from_flange for f in frames if f.base_from_flange is not None]
     reach = np.array([np.linalg.norm(b.translation) for b in boards])
-    tried = []
-    for flanges in (reported, [f.inverse() for f in reported]):
-        off = np.zeros(len(frames))
-        for k in range(len(frames)):
-            rest = [j for j in range(len(frames)) if j != k]
-            found = solve_hand_eye([flanges[j] for j in rest], [boards[j] for j in rest])
-            off[k] = _away(found, flanges[k], boards[k])
-        tried.append(off)
+    tried = [_away(flanges, boards) for flanges in (reported, [f.inverse() for f in reported])]
     return min(tried, key=lambda off: float(np.median(off))), reach
 
 
-def _away(found: HandEye, flange: pin.SE3, board: pin.SE3) -> float:
-    seen = flange * found.flange_from_camera * board
-    return float(np.linalg.norm(seen.translation - found.base_from_board.translation))
+def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
+    """Distance (n,) in m of each board's origin from the place, in the base, with the least sum of distances.
+
+    The rotation is Park and Martin's, which wrong positions do not touch; camera and board place by reweighting.
+    """
+    rotation = park_martin(flanges, boards)
+    # R_F (R_X c + t) + t_F = b, linear in t and b.
+    design = np.array([np.hstack([f.rotation, -np.eye(3)]) for f in flanges])
+    known = np.array(
+        [f.rotation @ rotation @ c.translation + f.translation for f, c in zip(flanges, boards, strict=True)]
+    )
+    off = np.ones(len(flanges))
+    for _ in range(REWEIGHTINGS):
+        root = np.sqrt(1 / np.maximum(off, LEAST_OFF_M))[:, None]
+        solution = np.linalg.lstsq((design * root[:, :, None]).reshape(-1, 6), -(known * root).ravel(), rcond=None)[0]
+        off = np.linalg.norm(design @ solution + known, axis=1)
+    return off
 
 
 def _apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -77,6 +78,17 @@ def test_a_pose_without_a_picture_is_named(tmp_path):
         shutil.copy(recording("robot_line_laser") / name, tmp_path)
     notes = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm"))["notes"]
     assert any("pose0003.txt" in note for note in notes)
+
+
+def test_two_frames_with_poses_of_elsewhere_do_not_hide_each_other(tmp_path):
+    for path in recording("robot_line_laser").iterdir():
+        shutil.copy(path, tmp_path)
+    for number, shift in ((5, 0.006), (8, 0.05)):
+        path = tmp_path / f"pose{number:04d}.txt"
+        (x, *rest), turn = ast.literal_eval(path.read_text())
+        path.write_text(str(((x + shift, *rest), turn)))
+    frames = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm"))["frames"]
+    assert [f["name"] for f in frames if not f["used"]] == ["frame0005.png", "frame0008.png"]
 
 
 def test_inverted_pairs_are_recognised_as_a_camera_on_the_flange(tmp_path):
