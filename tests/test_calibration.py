@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import replace
@@ -15,8 +16,8 @@ from cell.calibration import Priors, ScanObservation, TargetObservation, calibra
 from cell.calibration.adjustment import Adjustment, shared_mask
 from cell.calibration.blocks import COLUMNS, OWN, SHARED, State, dots_block, stripe_block
 from cell.calibration.hand_eye import refine_hand_eye, solve_hand_eye
-from cell.calibration.joint import solve_staged, start_state, view_data
-from cell.calibration.results import PARAMETERS
+from cell.calibration.joint import solve_joint, solve_staged, start_state, view_data
+from cell.calibration.results import PARAMETERS, ScanCalibration
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import difference, from_axes, from_parts, perturbed
@@ -142,6 +143,34 @@ def test_the_scan_head_is_found_within_its_stated_deviations(scan):
     z = np.array([error[name] / sigma[name] for name in error if sigma[name] > 0])
     assert np.sqrt(np.mean(z**2)) < 1.8
     assert np.abs(z).max() < 4.0
+
+
+def test_errors_over_many_draws_are_as_large_as_stated():
+    z = []
+    for seed in range(20, 28):
+        observations = observe(np.random.default_rng(seed), 12)
+        staged = solve_staged(observations, NOMINAL, np.array([1.0, 0, 0]))
+        found = solve_joint(observations, staged, PRIORS, held_out=False).adjusted
+        sigma, state = np.sqrt(np.diag(found.covariance)), found.state
+        z.append(difference(state.flange_from_camera, FLANGE_FROM_CAMERA) / sigma[15:21])
+        z.append((state.rail_direction - RAIL) / sigma[12:15])
+        z.append((state.camera.parameters - CAMERA.parameters)[:4] / sigma[:4])
+        assert 0.8 < found.chi2_per_dof < 1.2
+    # 104 correlated values: their RMS is 1 give or take some tenths.
+    assert 0.6 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 1.5
+    assert np.abs(np.concatenate(z)).max() < 4.5
+
+
+def test_a_stored_calibration_round_trips(scan):
+    stored = json.loads(json.dumps(scan[0].as_dict(), allow_nan=False))
+    back = ScanCalibration.from_dict(stored)
+    assert back.camera == scan[0].camera
+    assert back.quality == scan[0].quality
+    np.testing.assert_allclose(back.light_plane.n, scan[0].light_plane.n, atol=1e-12)
+    np.testing.assert_allclose(back.covariance, scan[0].covariance)
+    np.testing.assert_allclose(back.flange_from_camera.homogeneous, scan[0].flange_from_camera.homogeneous, atol=1e-12)
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        ScanCalibration.from_dict({"camera": stored["camera"]})
 
 
 def test_the_scan_head_measures_to_hundredths_of_a_millimetre(scan):

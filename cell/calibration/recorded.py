@@ -23,8 +23,8 @@ from cell.calibration.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
 from cell.calibration.intrinsics import Intrinsics, choose_lens
 from cell.calibration.joint import Joint, Staged, solve_joint, solve_staged, start_state
 from cell.calibration.observations import ScanObservation
-from cell.calibration.starts import plane_from_board
-from cell.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.calibration.starts import plane_from_board, stripe_pixels
+from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.vision.board import board_pose
 from cell.vision.board_spec import BoardSpec
@@ -60,10 +60,10 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
     - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
       it), `held_out_rms_px`, `sigma_px`; `intrinsics_without_distortion`, `intrinsics_from_pictures` likewise;
     - `hand_eye`: `method`, `setup` (eye_in_hand, eye_to_hand), `translation_mm`, `rotation` (3×3),
-      `rotation_vector_rad`, `euler_xyz_rad` (rotations about x, then the new y, then the new z;
-      the first in 0 … π), `scatter_mm`,
-      `scatter_deg`, of the closed form under `closed_form`;
-    - `light_plane`: `normal`, `distance_mm` (normal · point = distance in the camera frame), `rms_mm`;
+      `rotation_vector_rad`, `euler_xyz_rad` (rotations about x, then the new y, then the new z; the
+      first in 0 … π), `scatter_mm`, `scatter_deg`, of the closed form under `closed_form`;
+    - `light_plane`: `normal`, `distance_mm` (normal · point = distance in the camera frame), `rms_mm`,
+      `depth_range_mm`;
     - `flatness`: `rms_mm`, `p95_mm`, `points`, `extent_mm`, `per_frame`, `leave_one_out`, `staged`;
     - `noise`: what the adjustment assumed and found; `notes`: what could not be had, and why.
 
@@ -255,6 +255,7 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
     result["light_plane"] = {
         **_plane_dict(state.plane),
         "rms_mm": 1e3 * adjusted.stripe_rms_m,
+        "depth_range_mm": _depths(state.plane, state.camera, [v.stripe for v in chain.joint.views]),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
         "method": "joint adjustment",
         "staged": {
@@ -288,9 +289,11 @@ def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: 
     except RefusedError as error:
         result["notes"].append(f"no light plane: {error}")
         return
+    seen = [stripe_pixels(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None]
     result["light_plane"] = {
         **_plane_dict(plane.plane),
         "rms_mm": 1e3 * plane.rms,
+        "depth_range_mm": _depths(plane.plane, camera, seen),
         "method": "fit on the board's poses",
     }
     result["stripe_points"] = {f.path.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
@@ -383,6 +386,12 @@ def _hand_eye_dict(setup: str, pose: pin.SE3) -> dict[str, Any]:
 
 def _plane_dict(plane: LightPlane) -> dict[str, Any]:
     return {"normal": list(plane.normal), "distance_mm": 1e3 * plane.distance}
+
+
+def _depths(plane: LightPlane, camera: CameraModel, stripes: Sequence[Array]) -> list[float]:
+    """Least and largest distance in mm before the camera at which the stripe was seen on the board."""
+    depths = plane.intersect(camera.rays(np.concatenate(stripes)))[:, 2]
+    return [1e3 * float(np.nanmin(depths)), 1e3 * float(np.nanmax(depths))]
 
 
 def _flatness_dict(flat: Flatness, names: Sequence[str]) -> dict[str, Any]:

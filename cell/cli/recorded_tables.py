@@ -33,6 +33,8 @@ def print_recorded(result: Mapping[str, Any]) -> None:
     if plane is not None:
         values.add_row("light plane normal", ", ".join(f"{v:.5f}" for v in plane["normal"]), "")
         values.add_row("light plane distance", f"{plane['distance_mm']:.3f}", "mm")
+        low, high = plane["depth_range_mm"]
+        values.add_row("light plane seen from the camera at", f"{low:.0f} … {high:.0f}", "mm")
         values.add_row("light plane RMS", f"{plane['rms_mm']:.4f}", "mm")
     if values.row_count:
         console.print(values)
