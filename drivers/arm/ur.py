@@ -37,7 +37,7 @@ _CALL_S = 5.0
 _OUTPUT_S = 1.0
 _CLOSE_S = 4.0
 _UNLOCK_S = 20.0
-_SWITCH_OFF_TRIES = 3
+_SWITCH_OFF_S, _SWITCH_OFF_LEAST_S = 3.0, 0.3
 _STATE_FLOOR_S, _STATE_FLOOR_FAST_S = 0.5, 3.0
 _FIRST_POINT = 0.02
 _WATCHDOG_S = 1.5
@@ -341,14 +341,15 @@ class UrArm:
             Dashboard(self.name, self._address).ask("stop")
         except DeviceError:
             self.statistics.count("emergency stop of the program failed")
-        for _ in range(_SWITCH_OFF_TRIES if self._safe_off else 0):
-            if switch_off(self._address, self._safe_off, deadline=2.0):
+        end = time.monotonic() + _SWITCH_OFF_S
+        while self._safe_off and (left := end - time.monotonic()) > _SWITCH_OFF_LEAST_S:
+            if switch_off(self._address, self._safe_off, deadline=min(2.0, left)):
                 return
             self.statistics.count("emergency switching of outputs failed")
 
     def _join_safing(self) -> None:
         if self._safing is not None:
-            self._safing.join(_SWITCH_OFF_TRIES * 2.0 + 2.0)
+            self._safing.join(_SWITCH_OFF_S + 1.0)
 
     def _end_motion(self, error: Exception) -> None:
         if self._motion is not None:
