@@ -134,8 +134,9 @@ class AgilexVehicle:
                     f"did not change to CAN mode within {ENABLE_TIMEOUT_S:.0f} s. Is the remote control in charge?",
                 )
         self._link.send("BrakeCommand", Locked=0)
-        self._braked = False
-        self._enabled = True
+        with self._command:
+            self._braked = False
+            self._enabled = True
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero.
@@ -147,12 +148,13 @@ class AgilexVehicle:
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
         self._link.check()
         self._feedback.check()
-        if self._braked or not self._enabled or self._feedback.get("SystemState")[1]["Mode"] != CAN_MODE:
-            reason = "the brake is locked" if self._braked else "it is not under CAN command"
-            raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
+        in_command = self._enabled and self._feedback.get("SystemState")[1]["Mode"] == CAN_MODE
         with self._command:
             if self._stopping:
                 raise Aborted(f"{self.name}: a stop is under way")
+            if self._braked or not in_command:
+                reason = "the brake is locked" if self._braked else "it is not under CAN command"
+                raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
             self._velocity = (speed, yaw_rate)
             self._renewed = self._clock.now()
             self._send_velocity()
@@ -181,10 +183,15 @@ class AgilexVehicle:
 
         The brake is locked also when standstill is not reported in time, which is raised afterwards.
         """
+        with self._command:
+            self._stopping += 1
         try:
             self.stop()
         finally:
-            self._braked = True
+            # No drive() between the standstill and the brake.
+            with self._command:
+                self._braked = True
+                self._stopping -= 1
             self._link.send("BrakeCommand", Locked=1)
 
     def close(self) -> None:

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.wire
 
 SPEED = 5.0
 TRACK = 0.583
+# The protocol reports speed in mm/s: what it calls standstill is less than half of one.
+STANDSTILL = 0.0005
 
 
 @dataclass
@@ -118,7 +120,7 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     state = enabled.vehicle.state()
     assert (state.speed, state.yaw_rate) == pytest.approx((0.3, 0.4), abs=0.005)
     enabled.vehicle.stop()
-    assert enabled.true_speed() == 0.0
+    assert enabled.true_speed() <= STANDSTILL
     x, y, yaw = enabled.truth()
     assert math.hypot(x, y) > 0.5
     enabled.until(lambda: abs(enabled.vehicle.state().x - x) < 0.003)
@@ -150,7 +152,7 @@ def test_a_velocity_that_nobody_renews_is_dropped(enabled: Bench) -> None:
 def test_stop_returns_when_the_vehicle_stands(enabled: Bench) -> None:
     enabled.drive_for(1.5, 0.5)
     enabled.vehicle.stop()
-    assert enabled.true_speed() == 0.0
+    assert enabled.true_speed() <= STANDSTILL
     enabled.vehicle.stop()
     assert enabled.vehicle.state().speed == 0.0
 
