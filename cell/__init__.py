@@ -8,15 +8,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from cell.job_run import RunOutcome as RunOutcome
     from cell.supervisor import Cell as Cell
-    from cell.supervisor import RunOutcome as RunOutcome
 
 __all__ = ["Cell", "RunOutcome"]
 
 
 def __getattr__(name: str) -> object:
-    if name in __all__:
-        from cell import supervisor
+    match name:
+        case "Cell":
+            from cell.supervisor import Cell
 
-        return getattr(supervisor, name)
+            return Cell
+        case "RunOutcome":
+            from cell.job_run import RunOutcome
+
+            return RunOutcome
     raise AttributeError(f"module 'cell' has no attribute {name!r}")

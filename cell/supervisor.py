@@ -7,66 +7,31 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from cell.assembly import Devices, connect
 from cell.config import CellConfig, load_config
-from cell.frames import FrameStore
+from cell.guard import guarded
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job, require_fit
-from cell.report.report import make_report
-from cell.report.truth import Witness
-from cell.runs import CellLock, new_run, write_json
+from cell.job_run import JobRun, Observer, RunOutcome, stop_cell
+from cell.runs import CellLock
 from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
 from cell.stored_calibration import CellCalibration, find_calibration, save_calibration
-from cell.work import JobWork
-from drivers.errors import (
-    Aborted,
-    CalibrationStale,
-    CellError,
-    ConfigError,
-    DeadlineError,
-    DeviceError,
-    DeviceFault,
-    Interrupted,
-    RefusedError,
-)
-from drivers.interfaces import ArmSafety
-from statemachine.journal import Journal, JournalError
-from statemachine.policy import Failure, Outcome, Policy
-from statemachine.runner import Event, Runner
-from statemachine.sequence import Sequence
-from statemachine.watch import Call, SignalWatch
+from drivers.errors import CalibrationStale, ConfigError
+from statemachine.runner import Event
+from statemachine.watch import SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
 
-Observer = Callable[[Event], None]
 Made = TypeVar("Made")
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds."""
-
-    outcome: str
-    reason: str
-    folder: Path
-    report: Mapping[str, Any]
-    interrupted: bool = False
-
-    @property
-    def exit_code(self) -> int:
-        """0 placed, 130 interrupted, 1 otherwise."""
-        return 0 if self.outcome == "placed" else 130 if self.interrupted else 1
 
 
 class Cell:
@@ -151,15 +116,7 @@ class Cell:
 
         Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
         """
-        problems = self.devices.stop()
-        if problems:
-            raise DeviceFault(
-                "cell",
-                "safe_stop",
-                "; ".join(problems),
-                recoverable=False,
-                hint="Look at the cell before going near it.",
-            )
+        stop_cell(self.devices)
 
     def close(self) -> None:
         """Stop and disconnect everything and let go of the cell. Idempotent, and shielded from interrupts."""
@@ -194,100 +151,12 @@ class Cell:
             if observer is not None:
                 observer(Event("note", None, {"text": "this simulated cell has no calibration yet: calibrating first"}))
             calibration = self.calibrate(observer, job)
-        with SignalWatch() as signals:
-            try:
-                folder = new_run(self.runs_folder)
-                self._keep_inputs(folder, loaded, calibration)
-                journal = Journal(folder, folder.name, self._info(loaded, calibration))
-            except (OSError, JournalError) as error:
-                raise CellError(f"no run can be recorded in {self.runs_folder}: {error}") from error
-            try:
-                return self._run_recorded(folder, journal, loaded, nominal, calibration, observer, signals)
-            finally:
-                journal.close()
-
-    def _run_recorded(
-        self,
-        folder: Path,
-        journal: Journal,
-        job: Job,
-        nominal: NominalSurface,
-        calibration: CellCalibration,
-        observer: Observer | None,
-        signals: SignalWatch,
-    ) -> RunOutcome:
-        started = time.time()
-        info = self._info(job, calibration)
-        witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
-        with FrameStore(folder / "frames") as frames:
-            work = JobWork(self.config, job, nominal, calibration, self.devices, frames, folder, self._odometry)
-            runner = Runner(
-                Sequence(), work.steps(), Policy(), journal, self.devices.clock, classify,
-                lambda reason: self.stop(), _both(observer, witness), self._recover, self._health,
-            )  # fmt: skip
-            if signals.reason is not None:
-                runner.abort(signals.reason)
-            result = runner.run()
-            self._odometry = work.odometry
-        report = make_report(
-            folder, self.config, job, nominal, work.repeatability, result, info, started, witness, frames.failure
-        )
-        interrupted = result.signal is not None or signals.reason is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
-
-    def _health(self) -> None:
-        """Raise when a safety system has stopped the arm or the vehicle, whichever device is being waited for.
-
-        A reading that is too old says nothing here: the next command to that device finds a silent link.
-        """
-        try:
-            safety = self.devices.arm.state().safety
-            if safety is not ArmSafety.NORMAL:
-                raise DeviceFault(
-                    "arm",
-                    f"arm.{safety.name.lower()}",
-                    f"the arm is in {safety.value}",
-                    recoverable=safety is ArmSafety.PROTECTIVE_STOP,
-                    hint="Look for the reason and clear the way.",
-                )
-            if self.devices.vehicle.state().emergency_stop:
-                raise DeviceFault(
-                    "vehicle",
-                    "vehicle.emergency_stop",
-                    "the vehicle's emergency stop is pressed",
-                    recoverable=False,
-                    hint="Release it when it is safe, then run the job again.",
-                )
-        except DeadlineError:
-            return
-
-    def _recover(self, error: BaseException) -> None:
-        """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
-        if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-            self.devices.arm.recover()
-        elif isinstance(error, DeviceError) and error.device == "vehicle":
-            self.devices.gate.enter()
-            self.devices.vehicle.enable()
-            self.devices.vehicle.brake()
-
-    def _info(self, job: Job, calibration: CellCalibration) -> dict[str, Any]:
-        endpoints = {} if self.simulated is None else self.simulated.endpoints
-        return {
-            "cell": self.config.cell.name,
-            "job": job.job.name,
-            "simulated": self.simulated is not None,
-            "seed": endpoints.get("seed"),
-            "level": endpoints.get("level"),
-            "speed": self.config.cell.time_scale,
-            "configuration_hash": self.config.calibration_hash(),
-            "calibration_hash": calibration.hash(),
-            "calibration_date": calibration.date,
-        }
-
-    def _keep_inputs(self, folder: Path, loaded: Job, calibration: CellCalibration) -> None:
-        write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
-        write_json(folder / "job.json", loaded.model_dump(mode="json"))
-        save_calibration(calibration, folder / "calibration.json")
+        info = {"simulated": self.simulated is not None, "seed": None, "level": None}
+        if self.simulated is not None:
+            info |= {key: self.simulated.endpoints[key] for key in ("seed", "level")}
+        job_run = JobRun(self.config, self.devices, loaded, nominal, calibration, info, observer)
+        outcome, self._odometry = job_run.perform(self.runs_folder, self._odometry)
+        return outcome
 
     # --- calibration ---
 
@@ -345,68 +214,5 @@ class Cell:
         self.guarded("homing", work)
 
     def guarded(self, what: str, work: Callable[[Callable[[], None]], Made]) -> Made:
-        """Do `work` in a thread; on Ctrl-C or any error stop the cell first, then raise. For work outside a job.
-
-        `work` is given a function that raises once the work is to end, to be called between motions.
-        """
-        made: list[Made] = []
-        with SignalWatch() as signals:
-
-            def check() -> None:
-                if signals.reason is not None:
-                    raise Aborted(f"{what} {signals.reason}")
-
-            def begin() -> None:
-                self.devices.gate.enter()
-                check()
-                made.append(work(check))
-
-            call = Call(what, begin)
-            while not call.done.wait(0.05) and signals.reason is None:
-                pass
-            if signals.reason is not None or call.error is not None:
-                problems = self.devices.stop()
-                call.done.wait(5.0)
-                unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
-                if signals.reason is not None:
-                    raise Interrupted(f"{what} {signals.reason}; the cell was stopped{unconfirmed}")
-                if problems:
-                    raise DeviceFault(
-                        "cell",
-                        "safe_stop",
-                        f"{what}: {call.error}{unconfirmed}",
-                        recoverable=False,
-                        hint="Look at the cell before going near it.",
-                    ) from call.error
-                assert call.error is not None
-                raise call.error
-        return made[0]
-
-
-def _both(first: Observer | None, second: Observer | None) -> Observer:
-    """One observer that tells two."""
-    observers = [observer for observer in (first, second) if observer is not None]
-
-    def tell(event: Event) -> None:
-        for observer in list(observers):
-            try:
-                observer(event)
-            except Exception as error:  # one who cannot listen any more must not keep the other from listening
-                observers.remove(observer)
-                print(f"an observer of the run failed and is told nothing more: {error}", file=sys.stderr)
-
-    return tell
-
-
-def classify(error: BaseException) -> Failure:
-    """What a step's exception means for the run."""
-    match error:
-        case RefusedError() | CalibrationStale() | ConfigError():
-            return Failure(Outcome.REFUSED, str(error), type(error).__name__)
-        case Aborted():
-            return Failure(Outcome.ABORTED, str(error), "aborted")
-        case DeviceFault():
-            return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable)
-        case CellError():
-            return Failure(Outcome.FAULTED, str(error), type(error).__name__)
-    return Failure(Outcome.FAULTED, f"unexpected {type(error).__name__}: {error}", "internal")
+        """Do `work` outside a job; see `cell.guard.guarded`."""
+        return guarded(self.devices, what, work)
