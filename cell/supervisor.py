@@ -7,17 +7,18 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from cell.assembly import Devices, connect
 from cell.config import CellConfig, load_config
 from cell.guard import guarded
+from cell.injection import Injection, Injector
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job, require_fit
-from cell.job_run import JobRun, Observer, RunOutcome, stop_cell
+from cell.job_run import JobRun, Observer, RunOutcome, both, stop_cell
 from cell.runs import CellLock
 from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
@@ -135,11 +136,15 @@ class Cell:
 
     # --- jobs ---
 
-    def run(self, job: str | Path = "pot", observer: Observer | None = None) -> RunOutcome:
+    def run(self, job: str | Path = "pot", observer: Observer | None = None, inject: Sequence[str] = ()) -> RunOutcome:
         """Run a job to its end and write its folder. Raises only for what is wrong before anything moves.
 
-        A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`.
+        A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
+        schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
         """
+        injections = [Injection.parse(text) for text in inject]
+        if injections and self.simulated is None:
+            raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
@@ -151,9 +156,12 @@ class Cell:
             if observer is not None:
                 observer(Event("note", None, {"text": "this simulated cell has no calibration yet: calibrating first"}))
             calibration = self.calibrate(observer, job)
-        info = {"simulated": self.simulated is not None, "seed": None, "level": None}
+        info: dict[str, Any] = {"simulated": self.simulated is not None, "seed": None, "level": None}
         if self.simulated is not None:
             info |= {key: self.simulated.endpoints[key] for key in ("seed", "level")}
+        if injections:
+            info["injected"] = [str(injection) for injection in injections]
+            observer = both(observer, Injector(self.config.cell.truth, injections))
         job_run = JobRun(self.config, self.devices, loaded, nominal, calibration, info, observer)
         outcome, self._odometry = job_run.perform(self.runs_folder, self._odometry)
         return outcome

@@ -17,12 +17,17 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-from sim_backends.peers.agilex import FAULTS as VEHICLE_FAULTS
+from sim_backends.faults import (
+    ARM_FAULTS,
+    CAMERA_FAULTS,
+    FAULT_NAMES,
+    RAIL_FAULTS,
+    TARGET_CAMERA_FAULTS,
+    VEHICLE_FAULTS,
+)
 from sim_backends.peers.agilex import AgilexPeer
-from sim_backends.peers.frames import FAULTS as CAMERA_FAULTS
 from sim_backends.peers.frames import CameraSpec, FramePeer
 from sim_backends.peers.rtde import RtdePeer
-from sim_backends.peers.tmcl import FAULTS as RAIL_FAULTS
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
 from sim_backends.world import nominal
@@ -32,7 +37,6 @@ from sim_backends.world.surfaces import SURFACES
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
 
-ARM_FAULTS = ("arm.protective_stop", "arm.emergency_stop")
 SPEEDS = (0.05, 50.0)
 """World seconds per wall second that can be asked for."""
 
@@ -68,7 +72,10 @@ class ServedCell:
             **{name: partial(self._rail.fault, name) for name in RAIL_FAULTS},
             **{name: partial(self._vehicle.fault, name) for name in VEHICLE_FAULTS},
             **{name: partial(self._cameras["scan"].fault, name) for name in CAMERA_FAULTS},
-            **{f"target_{name}": partial(self._cameras["target"].fault, name) for name in CAMERA_FAULTS},
+            **{
+                name: partial(self._cameras["target"].fault, name.removeprefix("target_"))
+                for name in TARGET_CAMERA_FAULTS
+            },
         }
 
     def start(self) -> None:
@@ -108,7 +115,7 @@ class ServedCell:
     def fault(self, name: str) -> None:
         """Cause the fault `name`, of the scan camera where it says only `camera.`; ValueError that lists the names."""
         if name not in self._faults:
-            raise ValueError(f"unknown fault {name!r}; known: {', '.join(sorted(self._faults))}")
+            raise ValueError(f"unknown fault {name!r}; known: {', '.join(FAULT_NAMES)}")
         self._faults[name]()
 
     def reset(self) -> None:

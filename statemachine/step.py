@@ -65,7 +65,8 @@ class StepContext:
             raise StepCancelled(self._cancelled)
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Tell the observer how far the step is, 0 to 1; not written to the journal."""
+        """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""
+        self.check()
         self._tell(Event("progress", self.step.name, {"fraction": fraction, "text": text}))
 
     def note(self, **data: object) -> None:

@@ -202,6 +202,18 @@ def test_a_step_that_overruns_is_stopped_and_named(tmp_path):
     assert result.code == "step.deadline"
 
 
+def test_a_step_that_only_reports_progress_learns_that_it_is_to_end(tmp_path):
+    def work(context):
+        while True:
+            context.progress(0.5, "going through what has piled up")
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.policy("laser_sweep", 0.05)
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "still busy" not in result.reason
+
+
 def test_an_overrun_can_be_retried(tmp_path):
     def work(context):
         if context.attempt == 1:

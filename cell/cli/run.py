@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,15 +55,22 @@ def dry_run(
     speed: Annotated[
         float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
     ] = None,
+    inject: Annotated[
+        list[str] | None,
+        typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     from cell.config import load_config
+    from cell.injection import Injection
     from cell.job import load_job, require_fit
     from cell.supervisor import SIM_SPEED, Cell
 
     loaded, _ = load_job(job)
     require_fit(loaded, load_config(config))
+    for text in inject or ():
+        Injection.parse(text)
     with Cell.open(
         config,
         sim="all",
@@ -71,15 +79,15 @@ def dry_run(
         speed=speed or SIM_SPEED,
         surface=Path(loaded.surface.mesh).stem,
     ) as cell:
-        code = _perform(cell, job, json)
+        code = _perform(cell, job, json, inject or ())
     raise typer.Exit(code)
 
 
-def _perform(cell: Cell, job: str, json: bool) -> int:
+def _perform(cell: Cell, job: str, json: bool, inject: Sequence[str] = ()) -> int:
     from cell.cli.display import ProgressDisplay, print_report
 
     with ProgressDisplay() as display:
-        outcome = cell.run(job, display)
+        outcome = cell.run(job, display, inject)
     if json:
         print_json(outcome.report)
     else:

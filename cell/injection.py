@@ -1,0 +1,81 @@
+"""Scheduled faults of a simulated cell: `arm.protective_stop@laser_sweep:40%` happens when that step is 40 % done."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.errors import CellError, ConfigError
+from sim_backends.faults import FAULT_NAMES
+from statemachine.runner import Event
+from statemachine.sequence import STEPS
+
+_FORM = re.compile(r"(?P<fault>[a-z_.]+)@(?P<step>[a-z_]+)(:(?P<percent>\d+(\.\d+)?)\s*%)?")
+TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Injection:
+    """A fault by name, and the step and the fraction (0 to 1) of it at which it happens."""
+
+    fault: str
+    step: str
+    fraction: float
+
+    @classmethod
+    def parse(cls, text: str) -> Injection:
+        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known."""
+        match = _FORM.fullmatch(text.strip())
+        if match is None:
+            raise ConfigError(f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"')
+        fault, step, percent = match["fault"], match["step"], float(match["percent"] or 0.0)
+        if fault not in FAULT_NAMES:
+            raise ConfigError(f'"{text}": the simulated cell has no fault "{fault}"; known: {", ".join(FAULT_NAMES)}')
+        steps = [state.value for state in STEPS]
+        if step not in steps:
+            raise ConfigError(f'"{text}": there is no step "{step}"; the steps are {", ".join(steps)}')
+        if percent > 100.0:
+            raise ConfigError(f'"{text}": {percent:g} % is outside 0 % to 100 %')
+        return cls(fault, step, percent / 100.0)
+
+    def __str__(self) -> str:
+        return f"{self.fault}@{self.step}:{100 * self.fraction:g}%"
+
+
+class Injector:
+    """An observer of a run that causes each fault once, over the simulated cell's truth endpoint `address`."""
+
+    def __init__(self, address: str, injections: Sequence[Injection]) -> None:
+        self._address = address
+        self._waiting = list(injections)
+
+    def __call__(self, event: Event) -> None:
+        """Take an event of the runner."""
+        match event.kind:
+            case "step_started":
+                fraction = 0.0
+            case "progress":
+                fraction = float(str(event.data["fraction"]))
+            case "step_done":
+                fraction = 1.0
+            case _:
+                return
+        for injection in list(self._waiting):
+            if injection.step == event.step and fraction >= injection.fraction:
+                self._waiting.remove(injection)
+                self._cause(injection.fault)
+
+    def _cause(self, fault: str) -> None:
+        host, port = self._address.rsplit(":", 1)
+        try:
+            with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
+                file.write(json.dumps({"op": "fault", "name": fault}).encode() + b"\n")
+                file.flush()
+                answer = json.loads(file.readline())
+        except (OSError, ValueError) as error:
+            raise CellError(f"the simulated cell at {self._address} did not take the fault {fault}: {error}") from error
+        if not answer["ok"]:
+            raise CellError(f"the simulated cell did not take the fault {fault}: {answer['error']}")

@@ -1,0 +1,36 @@
+"""Scheduled faults: how they are written, and when they happen. That they do happen is shown with the whole job."""
+
+from __future__ import annotations
+
+import pytest
+
+from cell.injection import Injection
+from drivers.errors import ConfigError
+from sim_backends.faults import FAULT_NAMES
+
+
+def test_a_scheduled_fault_is_written_as_fault_step_and_share() -> None:
+    assert Injection.parse("arm.protective_stop@laser_sweep:40%") == Injection(
+        "arm.protective_stop", "laser_sweep", 0.4
+    )
+    assert Injection.parse("can.bus_off@drive_to_target") == Injection("can.bus_off", "drive_to_target", 0.0)
+
+
+def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
+    for name in FAULT_NAMES:
+        assert str(Injection.parse(f"{name}@place:12.5%")) == f"{name}@place:12.5%"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("laser_sweep", "write it as"),
+        ("arm.explodes@laser_sweep:40%", "known: arm.protective_stop"),
+        ("arm.protective_stop@dance:40%", "the steps are drive_to_target, board_photo"),
+        ("arm.protective_stop@place:140%", "140 % is outside 0 % to 100 %"),
+        ("arm.protective_stop@place:-1%", "write it as"),
+    ],
+)
+def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Injection.parse(text)
