@@ -14,7 +14,7 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
 from cell.report.pictures import run_picture
-from cell.report.truth import Witness, ask_truth, expected_error, place_error, sensor_error
+from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
 from cell.runs import REPORT, write_json
 from cell.steps.laser_sweep import SweepRecord
 from drivers.interfaces import Image, Vector
@@ -119,6 +119,8 @@ def _add_truth(
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part")}
     sweep, cloud, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
+    if isinstance(pose, PlacePose) and witness.at_sweep is not None:
+        report["pose_error"] = pose_error(pose, witness.at_sweep)
     if report["outcome"] != "placed" or not isinstance(pose, PlacePose):
         return
     report["truth"] = place_error(job, nominal, now)

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import cKDTree
 
-from cell.geometry.poses import from_matrix, transform
+from cell.geometry.poses import difference, from_matrix, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
@@ -64,6 +64,15 @@ def part_points(nominal: NominalSurface) -> Vector:
     )
     _, nearest = cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
     return nominal.samples[nearest]
+
+
+def pose_error(pose: PlacePose, truth: dict[str, Any]) -> dict[str, Any]:
+    """How far the inverted pose of the surface is from the true one at the sweep, arm base axes; also when refused."""
+    error = difference(pose.base_from_surface, pose_of(truth, "base_from_surface"))
+    return {
+        "translation_mm": [round(1e3 * float(v), 4) for v in error[:3]],
+        "rotation_mrad": [round(1e3 * float(v), 4) for v in error[3:]],
+    }
 
 
 def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, float] | None:
