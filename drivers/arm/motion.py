@@ -1,4 +1,4 @@
-"""A motion of the arm as its caller holds it, and what its ways of ending mean."""
+"""A motion of the arm as its caller holds it."""
 
 from __future__ import annotations
 
@@ -6,35 +6,11 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
+from drivers.arm.faults import fault
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceError, DeviceFault
+from drivers.errors import Aborted, DeadlineError, DeviceError
 
 _WALL_MARGIN_S = 0.5
-
-_FAULTS: dict[str, tuple[str, bool, str]] = {
-    "arm.protective_stop": (
-        "the arm is in protective stop", True, "Look for what it ran into, clear the way, then recover().",
-    ),
-    "arm.emergency_stop": (
-        "the emergency stop is pressed", False,
-        "Make the cell safe, release the button, switch the arm on at the pendant, brakes too, then recover().",
-    ),
-    "arm.safeguard_stop": ("the safeguard is open", False, "Close and acknowledge the safeguard, then go on."),
-    "arm.safety_fault": ("the arm's safety system reports a fault", False, "Read the pendant's log; restart the arm."),
-    "arm.not_powered": (
-        "the arm is not powered", False, "Power it on and release its brakes at the pendant, then recover().",
-    ),
-    "arm.program_stopped": ("the control program does not run on the arm", True, "recover() starts it again."),
-    "arm.not_arrived": ("the motion ended away from its target", True, "See what hinders the arm, then recover()."),
-    "arm.not_stopped": ("the arm does not come to rest", False, "Use the emergency stop."),
-    "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
-}  # fmt: skip
-
-
-def fault(device: str, code: str, text: str = "") -> DeviceFault:
-    """The `DeviceFault` for a code of the child process, with its text added."""
-    what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
-    return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 
 class UrMotion:

@@ -10,16 +10,17 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from drivers.arm.dashboard import Dashboard
+from drivers.arm.faults import fault, unlock
+from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
 from drivers.arm.link import ArmLink, switch_off
-from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, Snapshot, safety_code
-from drivers.arm.motion import UrMotion, fault
+from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, safety_code
+from drivers.arm.motion import UrMotion
 from drivers.clock import Clock
 from drivers.errors import (
     Aborted,
@@ -36,9 +37,7 @@ from drivers.quantities import check_positive, shown
 _CALL_S = 5.0
 _OUTPUT_S = 1.0
 _CLOSE_S = 4.0
-_UNLOCK_S = 20.0
 _SWITCH_OFF_S, _SWITCH_OFF_LEAST_S = 3.0, 0.3
-_STATE_FLOOR_S, _STATE_FLOOR_FAST_S = 0.5, 3.0
 _FIRST_POINT = 0.02
 _WATCHDOG_S = 1.5
 _OUTPUTS = 18
@@ -82,8 +81,7 @@ class UrArm:
         self._braking = check_positive(name, "braking", braking, 20.0, "rad/s^2")
         self._dashboard = Dashboard(name, address)
         self._numbers = itertools.count(1)
-        self._news = threading.Condition()
-        self._snapshot: Snapshot | None = None
+        self._feed = StateFeed(name, clock, lambda: self._link.lost is not None, self._alive, self.statistics)
         self._starting = threading.Lock()
         self._motion: UrMotion | None = None
         self._safing: threading.Thread | None = None
@@ -113,7 +111,7 @@ class UrArm:
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` s old (or received after the call), else `DeadlineError`."""
-        snapshot, age = self._fresh(max_age)
+        snapshot, age = self._feed.fresh(max_age)
         return ArmState(
             stamp=self._clock.now() - age,
             joints=np.array(snapshot.joints),
@@ -132,7 +130,7 @@ class UrArm:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
         joints = self.limits.check_joints(self.name, joints)
         self.limits.check_joint_move(self.name, speed, acceleration)
-        way = np.abs(joints - np.array(self._fresh(0.1)[0].joints))
+        way = np.abs(joints - np.array(self._feed.fresh(0.1)[0].joints))
         leading = max(float(way.max()), 1e-9)
         for index, (part, limit) in enumerate(zip(way, self.limits.joint_speeds, strict=True)):
             check_positive(
@@ -155,7 +153,7 @@ class UrArm:
         times, joints = self.limits.check_trajectory(self.name, times, joints)
         if force_limit is not None:
             check_positive(self.name, "force limit", force_limit, 500.0, "N")
-        gaps = np.abs(joints[0] - np.array(self._fresh(0.1)[0].joints))
+        gaps = np.abs(joints[0] - np.array(self._feed.fresh(0.1)[0].joints))
         if gaps.max() > _FIRST_POINT:
             gap, joint = shown(float(gaps.max()), "rad"), int(gaps.argmax()) + 1
             raise InterlockError(
@@ -186,7 +184,7 @@ class UrArm:
         """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
         _check_output(self.name, index)
         self._ask("output", index, bool(value), deadline=_OUTPUT_S)
-        if not self._wait_for(lambda snapshot: bool(snapshot.outputs >> index & 1) == bool(value), _OUTPUT_S):
+        if not self._feed.wait_for(lambda snapshot: bool(snapshot.outputs >> index & 1) == bool(value), _OUTPUT_S):
             self.statistics.count("output not shown")
             raise DeadlineError(
                 self.name,
@@ -197,7 +195,7 @@ class UrArm:
     def digital_input(self, index: int) -> bool:
         """Read a digital input (0-7 standard, 8-15 configurable, 16-17 tool) from the newest state."""
         _check_output(self.name, index)
-        return bool(self._fresh(0.1)[0].inputs >> index & 1)
+        return bool(self._feed.fresh(0.1)[0].inputs >> index & 1)
 
     # --- ends and new beginnings ---
 
@@ -210,11 +208,11 @@ class UrArm:
         if self._closed:
             raise NotConnectedError(self.name, "the driver was closed. Open a new one.")
         self._dashboard.ask("stop")
-        self._unlock()
+        unlock(self.name, self._dashboard, self._clock)
         self._link.close(_CLOSE_S)
         self._end_motion(fault(self.name, "arm.program_stopped", "the arm was recovered"))
         self._join_safing()
-        self._snapshot = None
+        self._feed.forget()
         self._link = self._connect()
         self._require_ready()
 
@@ -232,7 +230,7 @@ class UrArm:
 
     def _connect(self) -> ArmLink:
         setup = Setup(self._address, self._clock.rate, self._safe_off, self._payload, _WATCHDOG_S, self._braking)
-        return ArmLink(self.name, setup, self._connect_timeout, self._on_snapshot, self._on_ended, self._on_lost)
+        return ArmLink(self.name, setup, self._connect_timeout, self._feed.take, self._on_ended, self._on_lost)
 
     def _alive(self) -> None:
         if self._closed:
@@ -266,61 +264,13 @@ class UrArm:
 
     def _require_ready(self) -> None:
         """Raise the `DeviceFault` that keeps the arm from moving, if any."""
-        snapshot, _ = self._fresh(0.1)
+        snapshot, _ = self._feed.fresh(0.1)
         if code := safety_code(snapshot.safety_bits):
             raise fault(self.name, code)
         if snapshot.mode != MODE_RUNNING:
             raise fault(self.name, "arm.not_powered")
         if not snapshot.program_running:
             raise fault(self.name, "arm.program_stopped")
-
-    def _unlock(self) -> None:
-        """Release a protective stop; the controller allows it only some seconds after its beginning."""
-        deadline = time.monotonic() + _UNLOCK_S
-        while (status := self._dashboard.ask("safetystatus").rpartition(":")[2].strip()) != "NORMAL":
-            if status != "PROTECTIVE_STOP":
-                code = "arm.emergency_stop" if "EMERGENCY" in status else "arm.safety_fault"
-                raise fault(self.name, "arm.safeguard_stop" if "SAFEGUARD" in status else code, status)
-            self._dashboard.ask("close safety popup")
-            reply = self._dashboard.ask("unlock protective stop")
-            if time.monotonic() > deadline:
-                raise fault(self.name, "arm.protective_stop", f"it could not be unlocked: {reply}")
-            self._clock.sleep(0.1 * self._clock.rate)
-
-    def _fresh(self, max_age: float) -> tuple[Snapshot, float]:
-        """The newest snapshot and its age in s of the clock."""
-        self._alive()
-        called = time.monotonic()
-
-        def usable(snapshot: Snapshot) -> bool:
-            return snapshot.stamp >= called or self._age(snapshot) <= max_age
-
-        # Only simulated arms are driven faster than the wall, and they share a busy machine with everything else.
-        floor = _STATE_FLOOR_S if self._clock.rate <= 1.0 else _STATE_FLOOR_FAST_S
-        if not self._wait_for(usable, max(floor, self._clock.wall(max_age))):
-            self.statistics.count("state too old")
-            raise DeadlineError(self.name, f"no state of the arm that is at most {shown(max_age, 's')} old")
-        snapshot = self._snapshot
-        assert snapshot is not None
-        return snapshot, self._age(snapshot)
-
-    def _age(self, snapshot: Snapshot) -> float:
-        return (time.monotonic() - snapshot.stamp) * self._clock.rate
-
-    def _wait_for(self, holds: Callable[[Snapshot], bool], wall_seconds: float) -> bool:
-        """Wait until the newest snapshot satisfies `holds`; raises the fault when the link is lost meanwhile."""
-        with self._news:
-            met = self._news.wait_for(
-                lambda: self._link.lost is not None or (self._snapshot is not None and holds(self._snapshot)),
-                wall_seconds,
-            )
-        self._alive()
-        return met
-
-    def _on_snapshot(self, snapshot: Snapshot) -> None:
-        with self._news:
-            self._snapshot = snapshot
-            self._news.notify_all()
 
     def _on_ended(self, ended: Ended) -> None:
         motion = self._motion
@@ -332,8 +282,7 @@ class UrArm:
         self._safing = threading.Thread(target=self._make_safe, name=f"{self.name} make safe", daemon=True)
         self._safing.start()
         self._end_motion(error)
-        with self._news:
-            self._news.notify_all()
+        self._feed.wake()
 
     def _make_safe(self) -> None:
         """Without the child: end the arm's program, which stops it, and switch the safe outputs off."""
