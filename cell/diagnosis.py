@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ from drivers.errors import CellError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
 
 PINGS = 100
+
+Entry = tuple[str, str, Callable[[], Any], Callable[[Any], str]]
+"""Name, address, how to connect, and how to tell its state."""
 
 
 @dataclass
@@ -71,16 +75,22 @@ def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed
 def _diagnose(config: CellConfig) -> list[Diagnosis]:
     clock = Clock(config.cell.time_scale)
     with CellLock(config):
-        rows, arm = _open_and_ask("arm", config.arm.address, lambda: assembly.connect_arm(config, clock), _arm_state)
+        rows, arm = _open_and_ask("arm", config.arm.address, partial(assembly.connect_arm, config, clock), _arm_state)
+        scan, target = config.scan_camera, config.target_camera
+        connect_camera = assembly.connect_camera
         try:
-            more: list[tuple[str, str, Callable[[], Any], Callable[[Any], str]]] = [
-                ("rail", config.rail.url, lambda: assembly.connect_rail(config, clock), _rail_state),
-                ("vehicle", config.vehicle.channel, lambda: assembly.connect_vehicle(config, clock), _vehicle_state),
-            ]
-            for name, camera in (("scan_camera", config.scan_camera), ("target_camera", config.target_camera)):
-                build = lambda name=name, camera=camera: assembly.connect_camera(name, camera, clock)  # noqa: E731
-                more.append((name, camera.address, build, _camera_state))
-            for entry in more:
+            others: tuple[Entry, ...] = (
+                ("rail", config.rail.url, partial(assembly.connect_rail, config, clock), _rail_state),
+                ("vehicle", config.vehicle.channel, partial(assembly.connect_vehicle, config, clock), _vehicle_state),
+                ("scan_camera", scan.address, partial(connect_camera, "scan_camera", scan, clock), _camera_state),
+                (
+                    "target_camera",
+                    target.address,
+                    partial(connect_camera, "target_camera", target, clock),
+                    _camera_state,
+                ),
+            )
+            for entry in others:
                 found, device = _open_and_ask(*entry)
                 rows += found
                 if device is not None:

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivers.arm.dashboard import Dashboard
+from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import safety_code
-from drivers.arm.faults import fault
 from drivers.arm.motion import UrMotion
 from drivers.arm.trajectory import Trajectory, pose_difference
 from drivers.clock import Clock
