@@ -1,7 +1,8 @@
 """From stripe profiles to the organised cloud: each profile is triangulated as it arrives, no frame is kept.
 
-Stripe pixel → ray → light plane → carriage position → flange → arm base (paper, equation 2 with the calibrated sweep
-direction; theory sheet, part 1). What belongs to the surface and what does not is decided in `outliers`.
+Stripe pixel → ray → light plane while the frames come; carriage and flange → arm base once the sweep has ended and it
+is known where they were (paper, equation 2 with the calibrated sweep direction; theory sheet, part 1). What belongs to
+the surface and what does not is decided in `outliers`.
 """
 
 from __future__ import annotations
@@ -10,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane, triangulate
 from cell.reconstruction.cloud import Array, Cloud
 from cell.reconstruction.outliers import find_outliers
 from cell.vision.stripe import StripeProfile
-from drivers.errors import RefusedError
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class ScanGeometry:
 
 
 class ProfileBuilder:
-    """Collects the profiles of one sweep as points in the flange frame."""
+    """Collects the profiles of one sweep as points in the camera's frame, and places them when the sweep is over."""
 
     def __init__(self, geometry: ScanGeometry, expected_lines: int = 256) -> None:
         self.geometry = geometry
@@ -59,8 +60,8 @@ class ProfileBuilder:
         """Profiles so far."""
         return self._lines
 
-    def add(self, profile: StripeProfile, rail_position: float, rail_sigma: float) -> int:
-        """Triangulate one profile taken at `rail_position` ± `rail_sigma` (m); the number of its points.
+    def see(self, profile: StripeProfile) -> int:
+        """Triangulate a profile in the camera's frame, as the next line; the number of its points.
 
         `ValueError` when the profile is not one centre per row of this camera.
         """
@@ -71,42 +72,68 @@ class ProfileBuilder:
         if self._lines == len(self._points):
             self._grow()
         line, rows = self._lines, profile.rows
-        points, by_pixel = self.geometry.solve(profile.pixels(), np.full(len(rows), rail_position))
+        points, by_pixel = triangulate(self.geometry.camera, self.geometry.light_plane, profile.pixels())
         self._points[line, rows] = points
         self._spread[line, rows] = by_pixel[:, :, 0] * profile.sigma[rows, None]
         self._centres[line, rows] = profile.centres[rows]
-        self._rail[line] = rail_position, rail_sigma
         self._lines += 1
         return int(np.count_nonzero(np.isfinite(points[:, 0])))
 
+    def add(self, profile: StripeProfile, rail_position: float, rail_sigma: float) -> int:
+        """`see` a profile whose rail position is known already, ± `rail_sigma` (m)."""
+        count = self.see(profile)
+        self._rail[self._lines - 1] = rail_position, rail_sigma
+        return count
+
     def finish(self, base_from_flange: pin.SE3, least_points: int = 500) -> Cloud:
-        """The organised cloud in the arm base, outliers removed; the flange stood at `base_from_flange` all along.
+        """The cloud of the profiles that were `add`ed, in the order of the rail; the flange stood still all along.
 
         Raises `RefusedError` when fewer than `least_points` points are left.
         """
         n = self._lines
         order = np.argsort(self._rail[:n, 0], kind="stable")
-        points, spread, centres = self._points[order], self._spread[order], self._centres[order]
-        view = self.geometry.flange_from_camera.rotation[:, 2]
+        flanges = np.broadcast_to(base_from_flange.homogeneous, (n, 4, 4))
+        rail = self._rail[order]
+        spread = rail[:, 1:] * self.sweep_direction(base_from_flange)
+        return self.place(order, flanges, rail[:, 0], spread).require(least_points)
+
+    def sweep_direction(self, base_from_flange: pin.SE3) -> Array:
+        """Metres (3,) that the camera moves in the arm base, per metre of rail reading."""
+        mount = self.geometry.flange_from_camera.rotation
+        return np.asarray(base_from_flange.rotation @ mount @ np.asarray(self.geometry.rail_direction))
+
+    def place(self, lines: NDArray[np.intp], flanges: Array, rail: Array, line_spread: Array) -> Cloud:
+        """The organised cloud in the arm base of some of the profiles seen, outliers removed.
+
+        `lines` (n,): which profiles, in the order that they lie beside each other; for each of them base_from_flange
+        `flanges` (n, 4, 4), the `rail`'s position (n,) in m, and `line_spread` (n, 3): where one standard deviation
+        of the line's place along the sweep moves its points, m in base axes.
+        """
+        geometry = self.geometry
+        lines = np.asarray(lines, dtype=np.intp)
+        whole = len(lines) > 0 and bool(np.all(np.diff(lines) == 1))
+        which = slice(int(lines[0]), int(lines[-1]) + 1) if whole else lines
+        carriage = np.asarray(rail)[:, None] * geometry.rail_direction
+        turn = flanges[:, :3, :3] @ geometry.flange_from_camera.rotation
+        origin = np.einsum("nij,j->ni", flanges[:, :3, :3], geometry.flange_from_camera.translation)
+        origin = origin + flanges[:, :3, 3] + np.einsum("nij,nj->ni", turn, carriage)
+        back = turn.transpose(0, 2, 1)
+        points = np.matmul(self._points[which], back)
+        points += origin[:, None]
+        spread = np.matmul(self._spread[which], back.astype(np.float32))
+        view = turn[len(lines) // 2, :, 2] if len(lines) else np.array([0.0, 0.0, 1.0])
         rejected = find_outliers(points @ view, np.abs(spread @ view.astype(np.float32)))
-        rotation = base_from_flange.rotation
-        points = (points.reshape(-1, 3) @ rotation.T + base_from_flange.translation).reshape(points.shape)
         points[rejected] = np.nan
-        along = rotation @ self.geometry.flange_from_camera.rotation @ np.asarray(self.geometry.rail_direction)
-        cloud = Cloud(
+        return Cloud(
             points=points,
-            stripe_spread=(spread.reshape(-1, 3) @ rotation.T.astype(np.float32)).reshape(spread.shape),
-            rail_spread=self._rail[order, 1:] * along,
-            centres=centres,
-            rail=self._rail[order, 0],
+            stripe_spread=spread,
+            rail_spread=np.asarray(line_spread, dtype=np.float64),
+            centres=self._centres[which].copy(),
+            rail=np.asarray(rail, dtype=np.float64),
             rejected=rejected,
+            flanges=np.array(flanges),
+            sweeps=np.zeros(len(lines), dtype=np.intp),
         )
-        if cloud.size < least_points:
-            raise RefusedError(
-                f"the sweep gave {cloud.size} points in {n} profiles ({int(rejected.sum())} rejected), at least "
-                f"{least_points} are needed. Check that the laser lights the surface, and the scan camera's exposure"
-            )
-        return cloud
 
     def _grow(self) -> None:
         """Double the room for lines."""

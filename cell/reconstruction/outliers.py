@@ -6,11 +6,15 @@ the deviations around it, so that near outliers and streaks stand out (theory sh
 
 from __future__ import annotations
 
+import threading
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 THRESHOLD = 6.5
 """Deviation, in median absolute deviations, from which on a point is an outlier.
@@ -42,9 +46,25 @@ def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> N
         return outliers
     noise = np.where(measured, np.maximum(noise, 0.2 * float(np.median(noise[measured]))), 1.0)
     level = _level(values, noise)
-    for _ in range(2):
-        outliers = _judge(values, np.where(outliers, np.nan, values), noise, level)
-    return outliers
+    first, settled = _pass(values, values, noise, level, np.zeros(values.shape, dtype=np.bool_))
+    # A point that its neighbours supported stays supported unless one of them was found to be an outlier.
+    settled &= ~ndimage.maximum_filter(first, size=5)
+    return _pass(values, np.where(first, np.nan, values), noise, level, settled)[0]
+
+
+def _pass(values: Array, kept: Array, noise: Array, level: float, settled: Mask) -> tuple[Mask, Mask]:
+    """Outliers with respect to the `kept` values, and the points that their neighbours supported; those `settled` are
+    not looked at. Two threads take half of the lines each."""
+    outliers = np.zeros(values.shape, dtype=np.bool_)
+    supported = settled.copy()
+    middle = len(values) // 2
+    other = threading.Thread(
+        target=_judge, args=(values, kept, noise, level, middle, len(values), supported, outliers), daemon=True
+    )
+    other.start()
+    _judge(values, kept, noise, level, 0, middle, supported, outliers)
+    other.join()
+    return outliers, supported
 
 
 def _level(values: Array, noise: Array) -> float:
@@ -177,34 +197,54 @@ def _supported(values: Array, kept: Array, reach: float, line: int, row: int, bu
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge(values: Array, kept: Array, noise: Array, level: float) -> NDArray[np.bool_]:
-    """Outliers among `values` with respect to the `kept` ones: further off than so many local or global scales."""
-    outliers = np.zeros(values.shape, dtype=np.bool_)
-    known = np.full(values.shape, np.inf)
+def _quiet_around(values: Array, kept: Array, noise: Array, most: float, line: int, row: int, buffer: Array) -> bool:
+    """True when the lower quartile of the deviations around is surely less than `most`: counted without a sort."""
+    present, near = 0, 0
+    for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
+        for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
+            present += (i != line or j != row) and not np.isnan(kept[i, j])
+    for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
+        for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
+            if (i != line or j != row) and not np.isnan(kept[i, j]):
+                near += _supported(kept, kept, most * noise[i, j], i, j, buffer)
+                if near > present // 4:
+                    return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _judge(
+    values: Array, kept: Array, noise: Array, level: float, first: int, last: int, supported: Mask, outliers: Mask
+) -> None:
+    """Mark in lines `first` to `last` what is further off the `kept` ones than so many local or global scales."""
+    known = np.full((last - first + 4, values.shape[1]), np.inf)
     buffer, sizes = np.empty(25), np.empty(25)
-    for line in range(values.shape[0]):
+    for line in range(first, last):
         for row in range(values.shape[1]):
-            if np.isnan(values[line, row]):
+            if supported[line, row] or np.isnan(values[line, row]):
                 continue
             if _supported(values, kept, THRESHOLD * level * noise[line, row], line, row, buffer):
+                supported[line, row] = True
                 continue
             own = _deviation(values, kept, noise, line, row, buffer)
             if np.isnan(own):
                 outliers[line, row] = True
+                continue
+            if _quiet_around(values, kept, noise, abs(own) / (THRESHOLD * SCALE_OF_QUARTILE), line, row, buffer):
+                outliers[line, row] = abs(own) > THRESHOLD * level
                 continue
             count = 0
             for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
                 for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
                     if (i == line and j == row) or np.isnan(kept[i, j]):
                         continue
-                    if known[i, j] == np.inf:
-                        known[i, j] = abs(_deviation(kept, kept, noise, i, j, buffer))
-                    if not np.isnan(known[i, j]):
-                        sizes[count] = known[i, j]
+                    if known[i - first + 2, j] == np.inf:
+                        known[i - first + 2, j] = abs(_deviation(kept, kept, noise, i, j, buffer))
+                    if not np.isnan(known[i - first + 2, j]):
+                        sizes[count] = known[i - first + 2, j]
                         count += 1
             scale = level
             if count > 0:
                 _sort(sizes, count)
                 scale = max(level, SCALE_OF_QUARTILE * sizes[count // 4])
             outliers[line, row] = abs(own) > THRESHOLD * scale
-    return outliers

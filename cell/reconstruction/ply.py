@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from cell.reconstruction.cloud import Cloud
+from drivers.errors import ConfigError
+
+_WORDS = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}
+_KINDS = {
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1", "char": "i1",
+    "int8": "i1", "ushort": "<u2", "uint16": "<u2", "short": "<i2", "int16": "<i2", "int": "<i4", "int32": "<i4",
+    "uint": "<u4", "uint32": "<u4",
+}  # fmt: skip
 
 
 def write_ply(
@@ -15,12 +27,13 @@ def write_ply(
     normals: ArrayLike | None = None,
     quality: ArrayLike | None = None,
     colours: ArrayLike | None = None,
+    scalars: Mapping[str, NDArray[np.generic]] | None = None,
     comment: str = "",
 ) -> int:
     """Write the finite points (…, 3), in m; their number. Rows with NaN are left out.
 
-    Optional, one per point: unit `normals` (…, 3), a scalar `quality` (such as the deviation in m) and `colours`
-    (…, 3) uint8. Raises ValueError when the sizes differ.
+    Optional, one per point: unit `normals` (…, 3), a scalar `quality` (such as the deviation in m), `colours` (…, 3)
+    uint8, and `scalars` by name, of type float32, uint8, uint16 or int32. Raises ValueError when the sizes differ.
     """
     xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     columns: list[tuple[str, str, NDArray[np.generic]]] = [(n, "<f4", xyz[:, i]) for i, n in enumerate("xyz")]
@@ -32,19 +45,92 @@ def write_ply(
         columns += [(n, "u1", rgb[:, i]) for i, n in enumerate(("red", "green", "blue"))]
     if quality is not None:
         columns.append(("quality", "<f4", np.asarray(quality, dtype=np.float64).reshape(-1)))
+    for name, values in (scalars or {}).items():
+        columns.append((name, np.dtype(values.dtype).newbyteorder("<").str.lstrip("|"), values.reshape(-1)))
     for name, _, values in columns:
         if len(values) != len(xyz):
             raise ValueError(f"{name} has {len(values)} values for {len(xyz)} points")
     keep = np.isfinite(xyz).all(axis=1)
     records = np.empty(int(keep.sum()), dtype=[(name, kind) for name, kind, _ in columns])
     for name, _, values in columns:
-        records[name] = values[keep]
-    words = {"<f4": "float", "u1": "uchar"}
+        records[name] = values if len(records) == len(xyz) else values[keep]
     header = ["ply", "format binary_little_endian 1.0", "comment coordinates in metres"]
     header += [f"comment {line}" for line in comment.splitlines()]
-    header += [f"element vertex {len(records)}", *(f"property {words[kind]} {name}" for name, kind, _ in columns)]
+    header.append(f"element vertex {len(records)}")
+    header += [f"property {_WORDS[kind.lstrip('<')]} {name}" for name, kind, _ in columns]
     path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace") + records.tobytes())
     return len(records)
+
+
+def write_cloud(path: Path, cloud: Cloud) -> int:
+    """Write a cloud with all that a later export needs of it, interpolated points at its end; the number of points.
+
+    Properties beside x, y, z: `sigma` (one standard deviation, m, in the direction in which the point is least
+    certain), `line`, `row` and `sweep` (where it lies in the organised cloud), `interpolated` (1 for a point that was
+    not measured but interpolated).
+    """
+    lines, rows = np.nonzero(cloud.valid)
+    filled = cloud.filled
+    a, b = cloud.stripe_spread[lines, rows].astype(np.float64), cloud.rail_spread[lines]
+    aa, bb, ab = (np.einsum("ni,ni->n", u, v) for u, v in ((a, a), (b, b), (a, b)))
+    # The larger eigenvalue of a aᵀ + b bᵀ.
+    most = 0.5 * (aa + bb) + np.sqrt(0.25 * (aa - bb) ** 2 + ab**2)
+    most_filled = np.linalg.eigvalsh(filled.covariances)[:, 2] if len(filled.lines) else np.empty(0)
+    line = np.concatenate([lines, filled.lines])
+    sweeps = cloud.sweeps if len(cloud.sweeps) else np.zeros(cloud.shape[0], dtype=np.intp)
+    flag = np.zeros(len(line), dtype=np.uint8)
+    flag[len(lines) :] = 1
+    return write_ply(
+        path,
+        np.concatenate([cloud.points[lines, rows], filled.points]),
+        scalars={
+            "sigma": np.sqrt(np.concatenate([most, most_filled])).astype(np.float32),
+            "line": line.astype(np.int32),
+            "row": np.concatenate([rows, filled.rows]).astype(np.int32),
+            "sweep": sweeps[line].astype(np.uint8),
+            "interpolated": flag,
+        },
+        comment="frame: arm base\nsigma in metres; interpolated: 1 where the point was not measured",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class StoredCloud:
+    """A cloud read back: points (n, 3) in m, arm base, and what was written of each: `sigma` (n,) in m, `line`, `row`
+    and `sweep` (n,), `interpolated` (n,)."""
+
+    points: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    line: NDArray[np.intp]
+    row: NDArray[np.intp]
+    sweep: NDArray[np.intp]
+    interpolated: NDArray[np.bool_]
+
+
+def read_cloud(path: Path) -> StoredCloud:
+    """Read what `write_cloud` wrote. Raises `ConfigError` when the file is not there or holds something else."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"the cloud {path} cannot be read: {error}; did the run come as far as `reconstruct`?"
+        ) from error
+    head, mark, body = data.partition(b"end_header\n")
+    words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    kinds = [(w[2], _KINDS.get(w[1], "")) for w in words if w[:1] == ["property"] and len(w) == 3]
+    count = next((int(w[2]) for w in words if w[:2] == ["element", "vertex"]), -1)
+    needed = {"x", "y", "z", "sigma", "line", "row", "sweep", "interpolated"} - {name for name, _ in kinds}
+    if not mark or needed or not all(kind for _, kind in kinds) or count * np.dtype(kinds).itemsize != len(body):
+        lacking = f"lacks {', '.join(sorted(needed))}" if needed else "is not whole"
+        raise ConfigError(f"{path} is no cloud of this program: it {lacking}; name the folder of a run of this version")
+    records = np.frombuffer(body, dtype=kinds, count=count)
+    whole = {name: records[name].astype(np.intp) for name in ("line", "row", "sweep")}
+    return StoredCloud(
+        points=np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64),
+        sigma=records["sigma"].astype(np.float64),
+        interpolated=records["interpolated"] > 0,
+        **whole,
+    )
 
 
 def deviation_colours(deviations: ArrayLike, limit: float) -> NDArray[np.uint8]:
