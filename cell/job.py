@@ -66,14 +66,26 @@ class SurfaceSection(Table):
     prior_sigma_angle: Annotated[float, quantity("deg", 0.01, 20)]
 
 
+class SwathSection(Table):
+    """One sweep of several: `across` along the surface's y axis from its middle, the head turned about the surface's x
+    axis (`roll`) and y axis (`pitch`) through the middle of what it scans."""
+
+    across: Annotated[float, quantity("mm", -200, 200)] = 0.0
+    roll: Annotated[float, quantity("deg", -40, 40)] = 0.0
+    pitch: Annotated[float, quantity("deg", -20, 20)] = 0.0
+
+
 class ScanSection(Table):
-    """The laser sweep."""
+    """The laser sweep: along the surface's x axis by the rail, or with mode "arm" by the arm alone."""
 
     stand_off: Annotated[float, quantity("mm", 50, 1000)]
     length: Annotated[float, quantity("mm", 1, 2000)]
     speed: Speed
     frame_rate: Annotated[float, quantity("Hz", 1, 1000)]
     exposure: Annotated[float, quantity("ms", 0.01, 1000)]
+    mode: Literal["rail", "arm"] = "rail"
+    largest_hole: Annotated[float, quantity("mm", 0, 10)] = 0.0015
+    swath: Annotated[tuple[SwathSection, ...], Field(min_length=1, max_length=20)] = (SwathSection(),)
 
 
 class GraspSection(Table):
@@ -147,7 +159,7 @@ def require_fit(job: Job, config: CellConfig) -> None:
     ramps = job.scan.speed**2 / rail.acceleration + 2 * RAMP_MARGIN
     room = rail.travel[1] - rail.travel[0]
     problems = []
-    if job.scan.length + ramps > room:
+    if job.scan.mode == "rail" and job.scan.length + ramps > room:
         problems.append(
             f"scan.length {1e3 * job.scan.length:g} mm and its ramps of {1e3 * ramps:.2f} mm exceed rail.travel, "
             f"{1e3 * room:g} mm"

@@ -21,9 +21,13 @@ from drivers.interfaces import Vector
 
 @dataclass(frozen=True)
 class ScanPlan:
-    """A planned sweep: the flange's pose in the base and the rail positions between which the velocity is constant."""
+    """A planned sweep: where the flange begins and ends, in the base, and the rail positions at these two places.
+
+    Between them the velocity is constant. Either the flange stands still, or the rail.
+    """
 
     base_from_flange: pin.SE3
+    base_from_flange_end: pin.SE3
     rail_start: float
     rail_stop: float
 
@@ -69,24 +73,39 @@ def photo_pose(job: Job, board: BoardSpec, base_from_board: pin.SE3, flange_from
     return facing(board, base_from_board, job.photo.stand_off) * flange_from_camera.inverse()
 
 
-def scan_plan(config: CellConfig, job: Job, base_from_surface: pin.SE3, calibration: ScanCalibration) -> ScanPlan:
-    """The sweep over the surface's centre along its x axis, with the rail in the middle of its travel at half-way.
+def scan_plans(
+    config: CellConfig, job: Job, base_from_surface: pin.SE3, calibration: ScanCalibration
+) -> list[ScanPlan]:
+    """The job's sweeps, each along the surface's x axis over its own part of the surface.
 
-    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x; the stripe crosses
-    the optical axis's height where the calibrated light plane does, so the camera runs behind by that much.
+    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x, then turned about
+    the middle of what it scans; the stripe crosses the optical axis's height where the calibrated light plane does, so
+    the camera runs behind by that much. The rail is in the middle of its travel at half-way, or all along when the arm
+    moves the head.
     """
     low, high = config.rail.travel
-    middle = 0.5 * (low + high)
-    if job.scan.length > high - low:
+    middle, half = 0.5 * (low + high), 0.5 * job.scan.length
+    by_arm = job.scan.mode == "arm"
+    if not by_arm and job.scan.length > high - low:
         raise ValueError(
             f"scan.length {job.scan.length * 1e3:g} mm exceeds the rail's travel {1e3 * (high - low):g} mm"
         )
     normal, distance = np.array(calibration.light_plane.normal), calibration.light_plane.distance
     stripe_x = (distance - normal[2] * job.scan.stand_off) / normal[0]
     looking_down = np.diag([1.0, -1.0, -1.0])
-    surface_from_camera = from_parts((-stripe_x, 0.0, job.scan.stand_off), looking_down)
-    base_from_flange = base_from_surface * surface_from_camera * calibration.flange_from_camera_at(middle).inverse()
-    return ScanPlan(base_from_flange, middle - 0.5 * job.scan.length, middle + 0.5 * job.scan.length)
+    head = from_parts((-stripe_x, 0.0, job.scan.stand_off), looking_down)
+    plans = []
+    for swath in job.scan.swath:
+        turn = pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0)
+        centre = base_from_surface * from_parts((0.0, swath.across, 0.0), turn)
+        camera_from_flange = calibration.flange_from_camera_at(middle).inverse()
+        if by_arm:
+            ends = [centre * from_parts((x, 0.0, 0.0)) * head * camera_from_flange for x in (-half, half)]
+            plans.append(ScanPlan(ends[0], ends[1], middle, middle))
+        else:
+            stand = centre * head * camera_from_flange
+            plans.append(ScanPlan(stand, stand, middle - half, middle + half))
+    return plans
 
 
 def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:

@@ -17,8 +17,7 @@ from cell.config import CellConfig
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
-from cell.planning import look_pose, photo_pose, scan_plan
-from cell.reconstruction import Cloud
+from cell.planning import look_pose, photo_pose, scan_plans
 from cell.steps.approach import Odometry, Planar
 from cell.steps.board_photo import board_photo
 from cell.steps.drive_to_target import Arrival, drive_to_target
@@ -27,7 +26,8 @@ from cell.steps.laser_sweep import SweepRecord, laser_sweep
 from cell.steps.moves import HOME, Mover
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.place import PlaceResult, place
-from cell.steps.reconstruct import reconstruct
+from cell.steps.reconstruct import Reconstruction, reconstruct
+from cell.steps.swath import SweepErrors
 from cell.stored_calibration import CellCalibration
 from cell.vision import parse_board
 from drivers.interfaces import Vector
@@ -121,37 +121,27 @@ class JobWork:
             context.progress(0.0, "homing the rail")
             devices.rail.home().wait(60.0)
         return laser_sweep(
-            scan_plan(self._config, self._job, base_from_surface, self._calibration.scan),
+            scan_plans(self._config, self._job, base_from_surface, self._calibration.scan),
             self._job.scan,
+            self._calibration.scan.geometry(),
+            SweepErrors(self.repeatability, self._config.calibration.rail_sigma, devices.clock.rate),
             self._mover,
-            devices.arm,
-            devices.rail,
-            devices.scan_camera,
-            devices.laser,
+            devices,
             lambda frame: self._frames.keep("stripe", frame),
+            context.check,
             context.progress,
         )
 
-    def reconstruct(self, context: StepContext) -> Cloud:
+    def reconstruct(self, context: StepContext) -> Reconstruction:
         """See `cell.steps.reconstruct`."""
         sweep = cast(SweepRecord, context.results["laser_sweep"])
-        rail_sigma = self._config.calibration.rail_sigma
-        return reconstruct(sweep, self._calibration.scan, rail_sigma, self._folder / "cloud.ply")
+        return reconstruct(sweep, self._calibration.scan, self._job.scan.largest_hole, self._folder / "cloud.ply")
 
     def invert_pose(self, context: StepContext) -> PlacePose:
         """See `cell.steps.invert_pose`."""
         fix = cast(BoardFix, context.results["board_photo"])
-        cloud = cast(Cloud, context.results["reconstruct"])
-        sweep = cast(SweepRecord, context.results["laser_sweep"])
-        return invert_pose(
-            cloud,
-            sweep.base_from_flange,
-            fix,
-            self._job,
-            self._nominal,
-            self._calibration.scan,
-            self.repeatability,
-        )
+        scan = cast(Reconstruction, context.results["reconstruct"])
+        return invert_pose(scan, fix, self._job, self._nominal)
 
     def place(self, context: StepContext) -> PlaceResult:
         """See `cell.steps.place`."""

@@ -209,7 +209,8 @@ class ArmState:
     """One state packet.
 
     `flange` is base_from_flange as (x, y, z, rx, ry, rz), m and rotation vector in rad, as the arm reports it from its
-    joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m.
+    joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m. `stamp` is the host time at
+    which the packet arrived, `device_time` in s the arm's own clock when it was measured.
     """
 
     stamp: float
@@ -221,6 +222,7 @@ class ArmState:
     moving: bool
     digital_inputs: int
     digital_outputs: int
+    device_time: float = 0.0
 
 
 class ArmMotion(Motion, Protocol):
@@ -234,6 +236,9 @@ class Arm(Device, Protocol):
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` seconds old, else `DeadlineError`."""
+
+    def record(self) -> AbstractContextManager[list[ArmState]]:
+        """Every state that arrives while the context is open, in order, in a list that grows."""
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""

@@ -12,11 +12,11 @@ from cell.config import CellConfig
 from cell.geometry.poses import to_ur, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
-from cell.reconstruction import Cloud
 from cell.report.pictures import run_picture
 from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
 from cell.runs import REPORT, write_json
 from cell.steps.laser_sweep import SweepRecord
+from cell.steps.reconstruct import Reconstruction
 from drivers.interfaces import Image, Vector
 from statemachine.runner import RunResult
 
@@ -53,8 +53,12 @@ def make_report(
         "place_pose": None,
         "place_sigma": None,
         "assumed_noise": {"level": info["level"], "sigmas": _configured_noise(config)},
+        "scan": None,
         "truth": None,
     }
+    made = result.results.get("reconstruct")
+    if isinstance(made, Reconstruction):
+        report["scan"] = made.summary()
     if isinstance(pose, PlacePose):
         report["place_pose"] = _pose(pose, job)
         report["place_sigma"] = _sigma(pose)
@@ -118,7 +122,7 @@ def _add_truth(
     now = ask_truth(config.cell.truth)
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part")}
-    sweep, cloud, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
+    sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     if isinstance(pose, PlacePose) and witness.at_sweep is not None:
         report["pose_error"] = pose_error(pose, witness.at_sweep)
     if report["outcome"] != "placed" or not isinstance(pose, PlacePose):
@@ -126,8 +130,8 @@ def _add_truth(
     report["truth"] = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
     report["truth"]["bound_mm"] = expected_error(job, nominal, pose, sweep.base_from_flange, repeatability, now)
-    if isinstance(cloud, Cloud) and witness.at_sweep is not None:
-        report["truth"]["sensor_mm"] = sensor_error(cloud, nominal, witness.at_sweep)
+    if isinstance(made, Reconstruction) and witness.at_sweep is not None:
+        report["truth"]["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
 
 
 def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, report: dict[str, Any]) -> None:
@@ -137,9 +141,9 @@ def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, re
     if isinstance(sweep, SweepRecord):
         profile = sweep.middle_profile
         stripe = (sweep.middle.image, profile.rows.astype(float), profile.centres[profile.rows])
-    if isinstance(made, Cloud) and isinstance(pose, PlacePose):
-        lines, rows = made.valid.nonzero()
-        points = transform(pose.base_from_surface.inverse(), made.points[lines, rows])
+    if isinstance(made, Reconstruction) and isinstance(pose, PlacePose):
+        lines, rows = made.cloud.valid.nonzero()
+        points = transform(pose.base_from_surface.inverse(), made.cloud.points[lines, rows])
         deviations = nominal.deviations(points)
         on_surface = np.isfinite(deviations)
         cloud = (points[on_surface], deviations[on_surface])

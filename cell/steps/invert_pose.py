@@ -3,45 +3,30 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
-from cell.calibration import ScanCalibration
-from cell.geometry.poses import compose_covariance, composition_jacobians
+from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
 from cell.job import Job
-from cell.reconstruction import Cloud, calibration_motions
 from cell.steps.photograph import BoardFix
-from drivers.interfaces import Vector
+from cell.steps.reconstruct import Reconstruction
 
 
-def invert_pose(
-    cloud: Cloud,
-    base_from_flange: pin.SE3,
-    fix: BoardFix,
-    job: Job,
-    nominal: NominalSurface,
-    calibration: ScanCalibration,
-    repeatability: Vector,
-) -> PlacePose:
+def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
-    `base_from_flange` is where the flange stood during the sweep, `repeatability` its (6, 6) covariance. The prior is
-    the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board do not fit together
-    and `NotObservable` when a direction is not known to the job's tolerance.
+    The prior is the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board do not
+    fit together and `NotObservable` when a direction is not known to the job's tolerance.
     """
     board_from_surface = job.place_from_board.inverse() * job.surface.place_from_surface.se3()
     expected = fix.base_from_board * board_from_surface
     surface = job.surface
     mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
     spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
-    by_flange, _ = composition_jacobians(base_from_flange, base_from_flange.inverse() * expected)
-    geometry, variants = calibration.geometry(), calibration.variants()
     return register(
-        cloud,
+        scan.cloud,
         nominal,
         Prior(expected, spread),
         Tolerance(job.place.tolerance, job.place.tolerance_angle),
-        systematic=by_flange @ repeatability @ by_flange.T,
-        calibration=lambda lines, rows: calibration_motions(cloud, lines, rows, base_from_flange, geometry, variants),
+        calibration=scan.motions,
     )

@@ -18,7 +18,7 @@ from cell.motion.trajectory import LineLimits, Trajectory
 from cell.planning import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
-from drivers.interfaces import Arm
+from drivers.interfaces import Arm, ArmMotion
 
 PLATE_THICKNESS = 0.01
 GRACE_WALL_S = 10.0
@@ -82,6 +82,19 @@ class Mover:
         """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
         limits = LineLimits(speed=min(speed, self._line_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
         return self.follow(self._planner.line(self.joints, base_from_flange, limits, allowed), force_limit)
+
+    def plan_line(
+        self, base_from_start: pin.SE3, base_from_end: pin.SE3, speed: float
+    ) -> tuple[Trajectory, Trajectory]:
+        """A free motion to the start of a straight line, and the line itself at `speed` m/s; nothing moves yet."""
+        way = self.plan_to(base_from_start, "the start of the line")
+        limits = LineLimits(speed=min(speed, self._line_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
+        return way, self._planner.line(way.end, base_from_end, limits)
+
+    def begin(self, trajectory: Trajectory) -> tuple[ArmMotion, float]:
+        """Have the arm begin a trajectory; the motion, and in how many seconds it must have ended."""
+        motion = self._arm.follow(trajectory.times, trajectory.joints)
+        return motion, 3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate
 
     def follow(self, trajectory: Trajectory, force_limit: float | None = None) -> bool:
         """Have the arm follow a trajectory to its end and settle; True when it ended early in contact."""

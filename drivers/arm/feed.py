@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from drivers.arm.messages import Snapshot
 from drivers.clock import Clock
@@ -33,12 +34,26 @@ class StateFeed:
         self._statistics = statistics
         self._news = threading.Condition()
         self._snapshot: Snapshot | None = None
+        self._listeners: list[Callable[[Snapshot], None]] = []
 
     def take(self, snapshot: Snapshot) -> None:
         """A new snapshot has come."""
         with self._news:
             self._snapshot = snapshot
+            for listener in self._listeners:
+                listener(snapshot)
             self._news.notify_all()
+
+    @contextmanager
+    def listening(self, listener: Callable[[Snapshot], None]) -> Iterator[None]:
+        """`listener` is told every snapshot that comes while the context is open, in order, by the link's thread."""
+        with self._news:
+            self._listeners = [*self._listeners, listener]
+        try:
+            yield
+        finally:
+            with self._news:
+                self._listeners = [kept for kept in self._listeners if kept is not listener]
 
     def forget(self) -> None:
         """What was seen before a new link says nothing any more."""
@@ -59,7 +74,7 @@ class StateFeed:
         called = time.monotonic()
 
         def usable(snapshot: Snapshot) -> bool:
-            return snapshot.stamp >= called or self._age(snapshot) <= max_age
+            return snapshot.stamp >= called or self.age(snapshot) <= max_age
 
         # Only simulated arms are driven faster than the wall, and they share a busy machine with everything else.
         floor = _FLOOR_S if self._clock.rate <= 1.0 else _FLOOR_FAST_S
@@ -68,7 +83,7 @@ class StateFeed:
             raise DeadlineError(self._name, f"no state of the arm that is at most {shown(max_age, 's')} old")
         snapshot = self._snapshot
         assert snapshot is not None
-        return snapshot, self._age(snapshot)
+        return snapshot, self.age(snapshot)
 
     def wait_for(self, holds: Callable[[Snapshot], bool], wall_seconds: float) -> bool:
         """Wait until the newest snapshot satisfies `holds`; raises the fault when the link is lost meanwhile."""
@@ -79,5 +94,6 @@ class StateFeed:
         self._alive()
         return met
 
-    def _age(self, snapshot: Snapshot) -> float:
+    def age(self, snapshot: Snapshot) -> float:
+        """How old a snapshot is, in s of the clock."""
         return (time.monotonic() - snapshot.stamp) * self._clock.rate

@@ -49,7 +49,8 @@ class Reply:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One state packet of the arm; `stamp` is when it arrived.
+    """One state packet of the arm; `stamp` is when it arrived, `device_time` in s when the controller measured it, on
+    the controller's own clock.
 
     `safety_bits`, `mode` and `program_running` as the controller reports them; `wrench` at the flange in base axes.
     """
@@ -64,6 +65,7 @@ class Snapshot:
     program_running: bool
     inputs: int
     outputs: int
+    device_time: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from drivers.arm.faults import fault, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
 from drivers.arm.link import ArmLink, switch_off
-from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, safety_code
+from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.clock import Clock
 from drivers.errors import (
@@ -111,9 +113,19 @@ class UrArm:
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` s old (or received after the call), else `DeadlineError`."""
-        snapshot, age = self._feed.fresh(max_age)
+        snapshot, _ = self._feed.fresh(max_age)
+        return self._state(snapshot)
+
+    @contextmanager
+    def record(self) -> Iterator[list[ArmState]]:
+        """Every state that arrives while the context is open, in order; see `drivers.interfaces.Arm`."""
+        states: list[ArmState] = []
+        with self._feed.listening(lambda snapshot: states.append(self._state(snapshot))):
+            yield states
+
+    def _state(self, snapshot: Snapshot) -> ArmState:
         return ArmState(
-            stamp=self._clock.now() - age,
+            stamp=self._clock.now() - self._feed.age(snapshot),
             joints=np.array(snapshot.joints),
             joint_speeds=np.array(snapshot.speeds),
             flange=np.array(snapshot.flange),
@@ -122,6 +134,7 @@ class UrArm:
             moving=max(abs(speed) for speed in snapshot.speeds) >= AT_REST,
             digital_inputs=snapshot.inputs,
             digital_outputs=snapshot.outputs,
+            device_time=snapshot.device_time,
         )
 
     # --- moving ---

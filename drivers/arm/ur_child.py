@@ -152,6 +152,7 @@ class Child:
                 program_running=receive.getRuntimeState() == _PLAYING,
                 inputs=receive.getActualDigitalInputBits(),
                 outputs=receive.getActualDigitalOutputBits(),
+                device_time=self._controller_time,
             )
             if receive.getTimestamp() == self._controller_time:
                 return snapshot

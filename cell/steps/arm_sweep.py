@@ -1,0 +1,96 @@
+"""A sweep by the arm alone: the rail stands still, the flange runs along a straight line under the lit laser.
+
+Every line has a flange pose of its own, between the states that the arm reported. What the two clocks differ by shifts
+the whole sweep along its way; the shift is stated in the covariance.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+
+from cell.assembly import Devices
+from cell.geometry.poses import from_parts
+from cell.motion.track import LONGEST_GAP_S, FlangeTrack
+from cell.planning import ScanPlan
+from cell.steps.moves import Mover
+from cell.steps.swath import Collector, Swath, SweepErrors
+from drivers.errors import CellError, DeviceFault
+
+RUN_UP_S = 0.7
+"""Seconds at full speed by which the line is longer at both ends: the arm gains its speed and its wobble dies out."""
+LATENCY_S = 0.002
+"""What the arm's time stamps may lag behind those of the frames, 1 sigma, wall seconds: a packet's way and a poll."""
+JITTER_S = 0.0003
+"""The same from one line to the next."""
+
+
+def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
+    """Move the scan head over the placement area and pair every profile with the flange's pose.
+
+    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, or the arm's
+    states have gaps; whatever happens meanwhile, the arm is stopped before the error goes on.
+    """
+    scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
+    shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
+    length = float(np.linalg.norm(shift))
+    along = shift / length
+    run_up = RUN_UP_S * scan.speed * along
+    start, stop = from_parts(-run_up) * plan.base_from_flange, from_parts(run_up) * plan.base_from_flange_end
+    devices.rail.move_to(plan.rail_start).wait(30.0)
+    way, line = mover.plan_line(start, stop, scan.speed)
+    mover.follow(way)
+    rail = devices.rail.state().position
+    camera.configure(scan.exposure, scan.frame_rate)
+    with devices.laser.lit(), arm.record() as states, camera.stream() as frames:
+        motion, patience = mover.begin(line)
+        over: list[float] = []
+        deadline = devices.clock.now() + patience
+
+        def ended() -> float | None:
+            if motion.done or devices.clock.now() > deadline:
+                motion.wait(0.0)  # raises what ended it early, and the deadline
+                over.append(devices.clock.now())
+            return over[0] if over else None
+
+        try:
+            collector.take(frames, ended)
+        except BaseException:
+            with suppress(CellError):
+                arm.stop()
+            raise
+    track = FlangeTrack(arm.name, states, LONGEST_GAP_S * errors.rate)
+    times = np.array(collector.times)
+    seen = np.flatnonzero(track.inside(times))
+    flanges = track.at(times[seen])
+    done = (flanges[:, :3, 3] - plan.base_from_flange.translation) @ along
+    within = (done >= 0) & (done <= length)
+    lines, flanges, done = seen[within], flanges[within], done[within]
+    middle = collector.require_frames(camera.name, lines)
+    if len(lines) < 3:
+        raise DeviceFault(
+            arm.name,
+            "arm.sweep_too_short",
+            f"only {len(lines)} profiles were taken on the planned {1e3 * length:.1f} mm",
+            recoverable=True,
+            hint="Lower scan.speed or raise scan.frame_rate.",
+        )
+    even = np.polynomial.Polynomial.fit(times[lines], done, 1)
+    residual = float(np.std(done - even(times[lines])))
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = np.outer(along, along) * (scan.speed * LATENCY_S * errors.rate) ** 2
+    own = scan.speed * JITTER_S * errors.rate * along
+    return Swath(
+        builder=collector.builder,
+        lines=lines,
+        flanges=flanges,
+        rail=np.full(len(lines), rail),
+        line_spread=np.tile(own, (len(lines), 1)),
+        covariance=errors.repeatability + shared,
+        lost=collector.lost,
+        residual=residual,
+        points=sum(collector.counts[k] for k in lines),
+        middle=middle[0],
+        middle_profile=middle[1],
+    )

@@ -1,0 +1,67 @@
+"""A sweep by the rail: the arm stands still, the carriage runs at constant velocity under the lit laser."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cell.assembly import Devices
+from cell.geometry.poses import from_ur
+from cell.planning import ScanPlan
+from cell.steps.moves import Mover
+from cell.steps.swath import Collector, Swath, SweepErrors
+from drivers.errors import DeviceFault
+
+MAX_FLANGE_MOTION = 1e-4
+
+
+def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
+    """Sweep the scan head over the placement area and pair every profile with the rail's position.
+
+    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the constant-velocity part, or the
+    flange moved by more than 0.1 mm meanwhile.
+    """
+    scan, rail, arm = collector.scan, devices.rail, devices.arm
+    mover.to(plan.base_from_flange, "the scan pose")
+    rail.move_to(rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)).wait(30.0)
+    devices.scan_camera.configure(scan.exposure, scan.frame_rate)
+    base_from_flange = from_ur(arm.state().flange)
+    with devices.laser.lit(), devices.scan_camera.stream() as frames:
+        sweep = rail.sweep(plan.rail_start, plan.rail_stop, scan.speed)
+
+        def ended() -> float | None:
+            if not sweep.done:
+                return None
+            sweep.wait(1.0)
+            return sweep.window[1]
+
+        collector.take(frames, ended)
+    begin, end = sweep.window
+    times = np.array(collector.times)
+    lines = np.flatnonzero((times >= begin) & (times <= end))
+    middle = collector.require_frames(devices.scan_camera.name, lines)
+    moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
+    if moved > MAX_FLANGE_MOTION:
+        raise DeviceFault(
+            arm.name,
+            "arm.moved_in_sweep",
+            f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
+            recoverable=True,
+            hint="See what pushed the arm; the sweep is of no use.",
+        )
+    samples = sweep.samples
+    moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
+    deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
+    spread = errors.rail * collector.builder.sweep_direction(base_from_flange)
+    return Swath(
+        builder=collector.builder,
+        lines=lines,
+        flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
+        rail=np.array([sweep.position_at(time) for time in times[lines]]),
+        line_spread=np.tile(spread, (len(lines), 1)),
+        covariance=errors.repeatability,
+        lost=collector.lost,
+        residual=float(np.median(deviations)) if deviations else 0.0,
+        points=sum(collector.counts[k] for k in lines),
+        middle=middle[0],
+        middle_profile=middle[1],
+    )

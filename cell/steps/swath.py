@@ -1,0 +1,106 @@
+"""One sweep over a strip of the surface: frames are turned into points while they come, and paired with poses after.
+
+A frame is let go as soon as its profile has been triangulated, so memory does not grow with the sweep's frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.geometry.poses import from_matrix
+from cell.job import ScanSection
+from cell.reconstruction import ProfileBuilder, ScanGeometry
+from cell.vision import StripeProfile, extract
+from drivers.errors import DeviceFault
+from drivers.interfaces import Frame, FrameStream, Vector
+
+MAX_LOST_FRACTION = 0.05
+
+
+@dataclass(frozen=True)
+class SweepErrors:
+    """What a sweep's pose may be off by: `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m²
+    and rad²; `rail` one standard deviation of a rail position in m; `rate` seconds of the clock per wall second."""
+
+    repeatability: Vector
+    rail: float
+    rate: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Swath:
+    """What one sweep brought. For each of its n lines: the profile's number in `builder`, base_from_flange in `flanges`
+    (n, 4, 4) and the rail's position in `rail` (n,) at the middle of the exposure, and `line_spread` (n, 3), m in base
+    axes, one standard deviation of the line's own place along the sweep.
+
+    `covariance` (6, 6) of base_from_flange is common to all lines. `lost` frames are known from the gaps of the frame
+    ids; `residual` in m is how far the readings scatter about an even motion.
+    """
+
+    builder: ProfileBuilder
+    lines: NDArray[np.intp]
+    flanges: Vector
+    rail: Vector
+    line_spread: Vector
+    covariance: Vector
+    lost: int
+    residual: float
+    points: int
+    middle: Frame
+    middle_profile: StripeProfile
+
+    @property
+    def base_from_flange(self) -> pin.SE3:
+        """Where the flange was half-way."""
+        return from_matrix(self.flanges[len(self.flanges) // 2])
+
+
+@dataclass(eq=False)
+class Collector:
+    """Takes the frames of one sweep: keeps them, triangulates their profiles, remembers when they were exposed."""
+
+    geometry: ScanGeometry
+    scan: ScanSection
+    keep_frame: Callable[[Frame], None]
+    progress: Callable[[float, str], None]
+    times: list[float] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    middle: tuple[Frame, StripeProfile] | None = None
+    lost: int = 0
+
+    def __post_init__(self) -> None:
+        self.expected = self.scan.length / self.scan.speed * self.scan.frame_rate
+        self.builder = ProfileBuilder(self.geometry, int(1.3 * self.expected) + 32)
+
+    def take(self, frames: FrameStream, ended: Callable[[], float | None]) -> None:
+        """Take frames until one was exposed after the time that `ended` gives once the motion is over: their delivery
+        may lag behind it."""
+        for frame in frames:
+            end = ended()
+            if end is not None and frame.mid_exposure > end:
+                break
+            self.keep_frame(frame)
+            profile = extract(frame.image)
+            self.counts.append(self.builder.see(profile))
+            self.times.append(frame.mid_exposure)
+            if self.middle is None and len(self.times) >= self.expected / 2:
+                self.middle = frame, profile
+            self.progress(min(0.99, len(self.times) / self.expected), f"{len(self.times)} profiles")
+        self.lost = frames.lost
+
+    def require_frames(self, camera: str, lines: NDArray[np.intp]) -> tuple[Frame, StripeProfile]:
+        """The middle frame and profile; raises `DeviceFault` when no line is left or over 5 % of the frames are lost."""
+        if not len(lines) or self.middle is None or self.lost > MAX_LOST_FRACTION * self.expected:
+            raise DeviceFault(
+                camera,
+                "camera.frames_lost",
+                f"{len(lines)} frames came from the sweep and {self.lost} were lost, of about {self.expected:.0f}",
+                recoverable=True,
+                hint="Lower scan.frame_rate or look at the camera's link.",
+            )
+        return self.middle
