@@ -19,6 +19,7 @@ from cell.report.report import make_report
 from cell.report.truth import Witness
 from cell.runs import new_run, write_json
 from cell.steps.approach import Odometry
+from cell.steps.stored_sweep import StoredSweep
 from cell.stored_calibration import CellCalibration, save_calibration
 from cell.work import JobWork
 from drivers.errors import (
@@ -59,7 +60,10 @@ class RunOutcome:
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report."""
+    """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report.
+
+    `earlier` is the sweep of a run that this one resumes.
+    """
 
     config: CellConfig
     devices: Devices
@@ -68,6 +72,7 @@ class JobRun:
     calibration: CellCalibration
     info: Mapping[str, Any]
     observer: Observer | None = None
+    earlier: StoredSweep | None = None
 
     def perform(self, root: Path, odometry: Odometry | None) -> tuple[RunOutcome, Odometry | None]:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there.
@@ -93,7 +98,15 @@ class JobRun:
         witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
         with FrameStore(folder / "frames") as frames:
             work = JobWork(
-                self.config, self.job, self.nominal, self.calibration, self.devices, frames, folder, odometry
+                self.config,
+                self.job,
+                self.nominal,
+                self.calibration,
+                self.devices,
+                frames,
+                folder,
+                odometry,
+                self.earlier,
             )
             runner = Runner(
                 Sequence(), work.steps(), Policy(), journal, self.devices.clock, classify,

@@ -18,7 +18,7 @@ from typing import Any
 from cell.config import CellConfig, default_toml
 from drivers.errors import ConfigError, DeviceFault
 
-START_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 
 
 class SimulatedCell:

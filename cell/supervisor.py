@@ -19,7 +19,8 @@ from cell.injection import Injection, Injector
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job, require_fit
 from cell.job_run import JobRun, Observer, RunOutcome, both, stop_cell
-from cell.runs import CellLock
+from cell.resumption import Interrupted, job_source
+from cell.runs import CellLock, find_run
 from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
@@ -145,24 +146,47 @@ class Cell:
         injections = [Injection.parse(text) for text in inject]
         if injections and self.simulated is None:
             raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
+        info: dict[str, Any] = {}
+        if injections:
+            info["injected"] = [str(injection) for injection in injections]
+            observer = both(observer, Injector(self.config.cell.truth, injections))
+        return self._perform(job, observer, info, None)
+
+    def resume(self, run: str | Path | None = None, observer: Observer | None = None) -> RunOutcome:
+        """Do the job of a run that was aborted, faulted or cut short, as a new run; without `run` the newest.
+
+        The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
+        the board has not moved. Raises `ConfigError` when there is nothing to resume.
+        """
+        before = Interrupted.find(find_run(self.runs_folder, None if run is None else str(run)))
+        return self._perform(before.job, observer, {"resumed_from": before.folder.name}, before)
+
+    def _perform(
+        self, job: str | Path, observer: Observer | None, info: dict[str, Any], before: Interrupted | None
+    ) -> RunOutcome:
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
+
+        def note(text: str) -> None:
+            if observer is not None:
+                observer(Event("note", None, {"text": text}))
+
         try:
             calibration = self.calibration()
         except CalibrationStale:
             if self.simulated is None:
                 raise
-            if observer is not None:
-                observer(Event("note", None, {"text": "this simulated cell has no calibration yet: calibrating first"}))
+            note("this simulated cell has no calibration yet: calibrating first")
             calibration = self.calibrate(observer, job)
-        info: dict[str, Any] = {"simulated": self.simulated is not None, "seed": None, "level": None}
+        info |= {"simulated": self.simulated is not None, "seed": None, "level": None, **job_source(job)}
         if self.simulated is not None:
             info |= {key: self.simulated.endpoints[key] for key in ("seed", "level")}
-        if injections:
-            info["injected"] = [str(injection) for injection in injections]
-            observer = both(observer, Injector(self.config.cell.truth, injections))
-        job_run = JobRun(self.config, self.devices, loaded, nominal, calibration, info, observer)
+        earlier = None
+        if before is not None:
+            earlier, why = before.sweep(loaded, self.config, calibration)
+            note(why if earlier is not None else f"{why}: sweeping again")
+        job_run = JobRun(self.config, self.devices, loaded, nominal, calibration, info, observer, earlier)
         outcome, self._odometry = job_run.perform(self.runs_folder, self._odometry)
         return outcome
 

@@ -27,9 +27,11 @@ from cell.steps.moves import HOME, Mover
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.place import PlaceResult, place
 from cell.steps.reconstruct import Reconstruction, reconstruct
+from cell.steps.stored_sweep import StoredSweep, save_sweep
 from cell.steps.swath import SweepErrors
 from cell.stored_calibration import CellCalibration
 from cell.vision import parse_board
+from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 
@@ -47,6 +49,7 @@ class JobWork:
         frames: FrameStore,
         folder: Path,
         odometry: Odometry | None = None,
+        earlier: StoredSweep | None = None,
     ) -> None:
         self._config = config
         self._job = job
@@ -57,6 +60,7 @@ class JobWork:
         self._folder = folder
         self._board = parse_board(job.board.spec)
         self._mover = Mover(devices.arm, devices.clock, config, job)
+        self._earlier = earlier
         # Kept over retries and runs: the vehicle may stand anywhere when the step is done again.
         self.odometry = odometry
 
@@ -80,6 +84,11 @@ class JobWork:
     def drive_to_target(self, context: StepContext) -> Arrival:
         """See `cell.steps.drive_to_target`."""
         context.progress(0.0, "arm to the looking pose")
+        if not self._devices.claw.holding:
+            raise RefusedError(
+                f"the claw holds no part: put the part of job {self._job.job.name} into it, or see whether it was "
+                "placed already"
+            )
         vehicle = self._devices.vehicle
         vehicle.enable()
         vehicle.brake()
@@ -112,8 +121,22 @@ class JobWork:
         return board_photo(goal, self._mover, self._photograph, self._job.photo.count, context.progress)
 
     def laser_sweep(self, context: StepContext) -> SweepRecord:
-        """See `cell.steps.laser_sweep`."""
+        """See `cell.steps.laser_sweep`; not swept again what an earlier run has swept, if the board has not moved."""
         fix = cast(BoardFix, context.results["board_photo"])
+        if self._earlier is not None:
+            try:
+                sweep = self._earlier.confirmed_by(fix)
+            except CalibrationStale as moved:
+                context.note(text=f"{moved}: sweeping again")
+            else:
+                self._earlier.copy_to(self._folder)
+                context.note(text=f"the board has not moved: the sweep of run {self._earlier.folder.name} holds")
+                return sweep
+        sweep = self._sweep(context, fix)
+        save_sweep(self._folder, sweep, fix)
+        return sweep
+
+    def _sweep(self, context: StepContext, fix: BoardFix) -> SweepRecord:
         base_from_place = fix.base_from_board * self._job.place_from_board.inverse()
         base_from_surface = base_from_place * self._job.surface.place_from_surface.se3()
         devices = self._devices

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +19,7 @@ from cell.cli.options import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.job_run import Observer, RunOutcome
 
 RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
 
@@ -28,6 +28,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command()(run)
     app.command("dry-run")(dry_run)
+    app.command()(resume)
     app.command()(abort)
     app.command()(runs)
     app.command()(report)
@@ -43,7 +44,7 @@ def run(job: JobOption = "pot", config: ConfigOption = None, json: JsonOption = 
             "`cell run` moves real devices and needs --config; `cell init` writes one, `cell dry-run` simulates"
         )
     with Cell.open(config) as cell:
-        code = _perform(cell, job, json)
+        code = _perform(lambda display: cell.run(job, display), json)
     raise typer.Exit(code)
 
 
@@ -79,15 +80,42 @@ def dry_run(
         speed=speed or SIM_SPEED,
         surface=Path(loaded.surface.mesh).stem,
     ) as cell:
-        code = _perform(cell, job, json, inject or ())
+        code = _perform(lambda display: cell.run(job, display, inject or ()), json)
     raise typer.Exit(code)
 
 
-def _perform(cell: Cell, job: str, json: bool, inject: Sequence[str] = ()) -> int:
+def resume(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Go on with a run that was aborted, faulted or cut short: its job again, without sweeping what still holds.
+
+    A dry run's world has ended with it: its job is done again in the same simulated world from the start.
+    """
+    from cell.job import load_job
+    from cell.resumption import Interrupted
+    from cell.runs import find_run
+    from cell.supervisor import SIM_SPEED, Cell
+    from drivers.errors import ConfigError
+
+    before = Interrupted.find(find_run(_runs_folder(config), name))
+    simulated = before.info["simulated"]
+    if not simulated and config is None:
+        raise ConfigError(f"run {before.folder.name} moved real devices: `cell resume` needs their --config")
+    with Cell.open(
+        config,
+        sim="all" if simulated else None,
+        seed=before.info["seed"] if simulated else 1,
+        level=before.info["level"] if simulated else "nominal",
+        speed=before.info["speed"] if simulated else SIM_SPEED,
+        surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
+    ) as cell:
+        code = _perform(lambda display: cell.resume(before.folder, display), json)
+    raise typer.Exit(code)
+
+
+def _perform(work: Callable[[Observer], RunOutcome], json: bool) -> int:
     from cell.cli.display import ProgressDisplay, print_report
 
     with ProgressDisplay() as display:
-        outcome = cell.run(job, display, inject)
+        outcome = work(display)
     if json:
         print_json(outcome.report)
     else:

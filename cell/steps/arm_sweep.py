@@ -84,6 +84,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     return Swath(
         builder=collector.builder,
         lines=lines,
+        frame_ids=np.array(collector.frame_ids)[lines],
         flanges=flanges,
         rail=np.full(len(lines), rail),
         line_spread=np.tile(own, (len(lines), 1)),

@@ -34,9 +34,9 @@ class SweepErrors:
 
 @dataclass(frozen=True, eq=False)
 class Swath:
-    """What one sweep brought. For each of its n lines: the profile's number in `builder`, base_from_flange in `flanges`
-    (n, 4, 4) and the rail's position in `rail` (n,) at the middle of the exposure, and `line_spread` (n, 3), m in base
-    axes, one standard deviation of the line's own place along the sweep.
+    """What one sweep brought. For each of its n lines: the profile's number in `builder`, the frame's id in
+    `frame_ids`, base_from_flange in `flanges` (n, 4, 4) and the rail's position in `rail` (n,) at the middle of the
+    exposure, and `line_spread` (n, 3), m in base axes, one standard deviation of the line's own place along the sweep.
 
     `covariance` (6, 6) of base_from_flange is common to all lines. `lost` frames are known from the gaps of the frame
     ids; `residual` in m is how far the readings scatter about an even motion.
@@ -44,6 +44,7 @@ class Swath:
 
     builder: ProfileBuilder
     lines: NDArray[np.intp]
+    frame_ids: NDArray[np.intp]
     flanges: Vector
     rail: Vector
     line_spread: Vector
@@ -70,6 +71,7 @@ class Collector:
     progress: Callable[[float, str], None]
     times: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
+    frame_ids: list[int] = field(default_factory=list)
     middle: tuple[Frame, StripeProfile] | None = None
     lost: int = 0
 
@@ -85,16 +87,21 @@ class Collector:
             if end is not None and frame.mid_exposure > end:
                 break
             self.keep_frame(frame)
-            profile = extract(frame.image)
-            self.counts.append(self.builder.see(profile))
-            self.times.append(frame.mid_exposure)
-            if self.middle is None and len(self.times) >= self.expected / 2:
-                self.middle = frame, profile
+            self.see(frame)
             self.progress(min(0.99, len(self.times) / self.expected), f"{len(self.times)} profiles")
         self.lost = frames.lost
 
+    def see(self, frame: Frame) -> None:
+        """Triangulate the stripe of one frame."""
+        profile = extract(frame.image)
+        self.counts.append(self.builder.see(profile))
+        self.times.append(frame.mid_exposure)
+        self.frame_ids.append(frame.frame_id)
+        if self.middle is None and len(self.times) >= self.expected / 2:
+            self.middle = frame, profile
+
     def require_frames(self, camera: str, lines: NDArray[np.intp]) -> tuple[Frame, StripeProfile]:
-        """The middle frame and profile; raises `DeviceFault` when no line is left or over 5 % of the frames are lost."""
+        """The middle frame and profile; raises `DeviceFault` without a line or with over 5 % of the frames lost."""
         if not len(lines) or self.middle is None or self.lost > MAX_LOST_FRACTION * self.expected:
             raise DeviceFault(
                 camera,

@@ -20,15 +20,6 @@ pytestmark = pytest.mark.wire
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the calibration of the simulated cell of seed 3 in it."""
-    folder = tmp_path_factory.mktemp("cell")
-    done = cell("calibrate", "--sim", "all", "--seed", "3", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
-    return folder
-
-
-@pytest.fixture(scope="module")
 def placed(place: Path) -> dict[str, Any]:
     """The report of a dry run that ended placed."""
     done = cell("dry-run", "--seed", "3", "--json", folder=place)

@@ -1,0 +1,130 @@
+"""A sweep on the disk: which frames it took and where the scan head was, so that a run can be resumed without it.
+
+The frames themselves are the run's PNG files, from which the stripe is extracted again. A stored sweep holds only as
+long as arm base and station have not moved against each other, which a new photograph of the board must confirm.
+"""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.poses import difference, from_matrix
+from cell.job import ScanSection
+from cell.reconstruction import ScanGeometry
+from cell.steps.laser_sweep import SweepRecord
+from cell.steps.photograph import BoardFix
+from cell.steps.swath import Collector, Swath
+from drivers.camera.folder import read_image
+from drivers.errors import CalibrationStale, RefusedError
+from drivers.interfaces import Frame, Vector
+
+FILE = "sweep.npz"
+FORMAT = 1
+MOVED = 22.46
+"""Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
+
+_ARRAYS = ("frame_ids", "flanges", "rail", "line_spread", "covariance")
+
+
+def frame_path(folder: Path, frame_id: int) -> Path:
+    """Where the run in `folder` keeps the frame `frame_id` of its sweep."""
+    return folder / "frames" / f"stripe-{frame_id:06d}.png"
+
+
+def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
+    """Write what a sweep was taken with, and where the board was seen before it, into the run's `folder`."""
+    data: dict[str, Any] = {
+        "format": np.array(FORMAT),
+        "base_from_board": fix.base_from_board.homogeneous,
+        "board_covariance": fix.covariance,
+    }
+    for k, swath in enumerate(sweep.swaths):
+        data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
+        data[f"figures_{k}"] = np.array([swath.lost, swath.residual])
+    with (folder / FILE).open("wb") as file:
+        np.savez(file, **data)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSweep:
+    """The sweep of the run in `folder`, and the board's pose (covariance (6, 6), base axes) that belongs to it."""
+
+    folder: Path
+    sweep: SweepRecord
+    base_from_board: pin.SE3
+    board_covariance: Vector
+
+    @classmethod
+    def load(cls, folder: Path, geometry: ScanGeometry, scan: ScanSection) -> StoredSweep:
+        """Read it, and extract the stripe from the frames again; `RefusedError` when anything of it is missing."""
+        path = folder / FILE
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                stored = {name: data[name] for name in data.files}
+            if stored["format"] != FORMAT:
+                raise ValueError(f"format {stored['format']}, this program reads {FORMAT}")
+            count = sum(name.startswith("frame_ids_") for name in stored)
+            swaths = tuple(_swath(folder, stored, k, geometry, scan) for k in range(count))
+            if not swaths:
+                raise ValueError("it holds no sweep")
+            base_from_board, covariance = from_matrix(stored["base_from_board"]), stored["board_covariance"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise RefusedError(f"{path} cannot be read as a sweep: {error}") from error
+        return cls(folder, SweepRecord(swaths), base_from_board, covariance)
+
+    def confirmed_by(self, fix: BoardFix) -> SweepRecord:
+        """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open.
+
+        Raises `CalibrationStale` when the board is seen elsewhere: then the sweep says nothing any more.
+        """
+        moved = difference(fix.base_from_board, self.base_from_board)
+        spread = fix.covariance + self.board_covariance
+        distance = float(moved @ np.linalg.solve(spread, moved))
+        if distance > MOVED:
+            raise CalibrationStale(
+                f"the board has moved by {1e3 * np.linalg.norm(moved[:3]):.2f} mm and "
+                f"{np.degrees(np.linalg.norm(moved[3:])):.3f} deg since the sweep of run {self.folder.name}"
+            )
+        return SweepRecord(tuple(self._loosened(swath, spread) for swath in self.sweep.swaths))
+
+    def _loosened(self, swath: Swath, spread: Vector) -> Swath:
+        """With the motion that may have gone unnoticed, (6, 6) at the board's origin, added to the flange's pose."""
+        carried = np.eye(6)
+        carried[:3, 3:] = -pin.skew(swath.base_from_flange.translation - self.base_from_board.translation)
+        return replace(swath, covariance=swath.covariance + carried @ spread @ carried.T)
+
+    def copy_to(self, folder: Path) -> None:
+        """Let the run in `folder` hold the sweep too, so that it can be resumed in its turn."""
+        (folder / "frames").mkdir(parents=True, exist_ok=True)
+        for swath in self.sweep.swaths:
+            for frame_id in swath.frame_ids:
+                shutil.copyfile(frame_path(self.folder, frame_id), frame_path(folder, frame_id))
+        shutil.copyfile(self.folder / FILE, folder / FILE)
+
+
+def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeometry, scan: ScanSection) -> Swath:
+    arrays: dict[str, Any] = {name: stored[f"{name}_{k}"] for name in _ARRAYS}
+    lost, residual = stored[f"figures_{k}"]
+    shape = (geometry.camera.height, geometry.camera.width)
+    collector = Collector(geometry, scan, lambda frame: None, lambda fraction, text: None)
+    for frame_id in arrays["frame_ids"]:
+        image = read_image(frame_path(folder, int(frame_id)), shape)
+        collector.see(Frame(image, int(frame_id), scan.exposure, 0.0, 0.0, 0.0))
+    middle = collector.require_frames("stored sweep", np.arange(len(collector.times)))
+    return Swath(
+        builder=collector.builder,
+        lines=np.arange(len(collector.times)),
+        **arrays,
+        lost=int(lost),
+        residual=float(residual),
+        points=sum(collector.counts),
+        middle=middle[0],
+        middle_profile=middle[1],
+    )

@@ -1,0 +1,102 @@
+"""Runs that something interrupts: scheduled faults and what the cell makes of them, and going on afterwards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell.resumption import Interrupted
+from cell.steps.stored_sweep import FILE
+from drivers.errors import ConfigError
+from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
+
+pytestmark = pytest.mark.wire
+
+
+def dry_run(folder: Path, *faults: str) -> dict[str, Any]:
+    """The report of a dry run in which the faults happen."""
+    options = [word for fault in faults for word in ("--inject", fault)]
+    done = cell("dry-run", "--seed", "3", "--json", *options, folder=folder)
+    assert "Traceback" not in done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["injected"] == list(faults)
+    assert done.returncode == (0 if report["outcome"] == "placed" else 1)
+    return report
+
+
+def retries(report: dict[str, Any], step: str) -> int:
+    return int(next(row["retries"] for row in report["steps"] if row["name"] == step))
+
+
+def test_the_cell_recovers_from_a_protective_stop_in_the_sweep_and_a_lost_bus_on_the_way(place: Path) -> None:
+    report = dry_run(place, "can.bus_off@drive_to_target:30%", "arm.protective_stop@laser_sweep:40%")
+    assert report["outcome"] == "placed", report["reason"]
+    assert retries(report, "drive_to_target") >= 1
+    assert retries(report, "laser_sweep") >= 1
+    assert report["truth"]["error_mm"]["d"]["mean"] <= 0.60
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        ("vehicle.emergency_stop@drive_to_target:30%", "vehicle"),
+        ("arm.protective_stop@place:40%", "arm"),
+        ("target_camera.silent@board_photo:0%", "target_camera"),
+    ],
+)
+def test_a_fault_that_a_program_may_not_clear_ends_the_run_safe_and_names_the_device(
+    place: Path, fault: str, named: str
+) -> None:
+    report = dry_run(place, fault)
+    assert report["outcome"] == "faulted"
+    assert report["reason"].startswith(named)
+    end = report["end_state"]
+    assert not end["laser_on"]
+    assert end["vehicle"]["stopped"]
+    assert end["vehicle"]["braked"]
+    assert not end["arm"]["moving"]
+    assert not end["rail_moving"]
+    assert end["part"]["held"], "whatever fails before the release, the part stays in the claw"
+
+
+def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path) -> None:
+    with served(place, "--seed", "3") as endpoints:
+        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+            folder = wait_for_step(place, "place")
+            assert cell("abort", "-c", "sim.toml", folder=place).returncode == 0
+            run.communicate(timeout=30)
+        assert_safe(endpoints)
+        stood = ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"]
+        done = cell("resume", "-c", "sim.toml", "--json", folder=place)
+        assert done.returncode == 0, done.stderr
+        report = json.loads(done.stdout)
+        assert report["outcome"] == "placed"
+        assert report["resumed_from"] == folder.name
+        assert "has not moved" in done.stderr
+        assert ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"] == stood
+        assert report["truth"]["error_mm"]["d"]["mean"] <= 0.60
+        again = cell("resume", "-c", "sim.toml", folder=place)
+        empty = cell("run", "-c", "sim.toml", "--json", folder=place)
+    assert again.returncode == 2
+    assert "has ended placed" in again.stderr
+    assert empty.returncode == 1
+    assert "holds no part" in json.loads(empty.stdout)["reason"]
+    with pytest.raises(ConfigError, match="only a run that was aborted"):
+        Interrupted.find(place / "runs" / report["run"])
+    assert (place / "runs" / report["run"] / FILE).exists()
+
+
+def test_a_vehicle_that_was_pushed_meanwhile_makes_the_resumed_run_sweep_again(place: Path) -> None:
+    with served(place, "--seed", "3"):
+        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+            wait_for_step(place, "place")
+            assert cell("abort", "-c", "sim.toml", folder=place).returncode == 0
+            run.communicate(timeout=30)
+        assert cell("jog", "vehicle", "-0.003m", "-c", "sim.toml", folder=place).returncode == 0
+        done = cell("resume", "-c", "sim.toml", "--json", folder=place)
+    assert done.returncode == 0, done.stderr
+    assert "sweeping again" in done.stderr
+    assert json.loads(done.stdout)["truth"]["error_mm"]["d"]["mean"] <= 0.60
