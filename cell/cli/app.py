@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from cell.cli import calibrate, devices, run, setup, sim
+from cell.cli import bench_reconstruction, calibrate, devices, export, run, setup, sim
 
 app = typer.Typer(
     name="cell",
@@ -14,6 +14,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for register in (run.register, calibrate.register, devices.register, setup.register):
+for register in (run.register, export.register, calibrate.register, devices.register, setup.register):
     register(app)
 app.add_typer(sim.app, name="sim")
+bench = typer.Typer(
+    help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
+)
+app.add_typer(bench, name="bench")
+bench_reconstruction.register(bench)

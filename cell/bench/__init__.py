@@ -1,0 +1,1 @@
+"""Campaigns and comparisons behind `cell bench`: never imported by the product's own path."""

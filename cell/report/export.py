@@ -1,0 +1,77 @@
+"""A finished run's cloud in the formats of other programs, coloured by its deviation from the nominal surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.poses import from_ur, transform
+from cell.inversion import NominalSurface
+from cell.job import load_job
+from cell.reconstruction.e57 import write_e57
+from cell.reconstruction.mesh import triangles, write_mesh
+from cell.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
+from cell.runs import read_report
+from drivers.errors import ConfigError
+
+SUFFIXES = {"ply": ".ply", "e57": ".e57", "stl": ".stl", "mesh": ".ply"}
+"""Of each format; "mesh" is a coloured mesh, "ply" a coloured cloud."""
+
+
+def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float) -> dict[str, Any]:
+    """Write the cloud of the run in `folder` to `out`; what was written, JSON-ready.
+
+    `kind` is one of `SUFFIXES`. With a place pose in the report the points are coloured by their distance from the
+    nominal surface of `job` (the run's own, unless given), the colours' ends at ±`limit` m. Raises `ConfigError` when
+    the run has no cloud or the job is not found.
+    """
+    cloud = read_cloud(folder / "cloud.ply")
+    deviations = _deviations(cloud, read_report(folder), job)
+    colours = None if deviations is None else deviation_colours(deviations, limit)
+    written: dict[str, Any] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
+    if kind == "e57":
+        written["points"] = write_e57(out, cloud, colours)
+    elif kind == "ply":
+        scalars: dict[str, NDArray[np.generic]] = {
+            "sigma": cloud.sigma.astype(np.float32),
+            "interpolated": cloud.interpolated.astype(np.uint8),
+        }
+        write_ply(out, cloud.points, quality=deviations, colours=colours, scalars=scalars, comment=_comment(deviations))
+    else:
+        try:
+            faces = triangles(cloud.points, cloud.line, cloud.row, cloud.sweep)
+        except ValueError as error:
+            raise ConfigError(f"run {folder.name}: {error}") from error
+        written["triangles"] = write_mesh(out, cloud.points, faces, colours)
+    if deviations is not None:
+        known = 1e3 * deviations[np.isfinite(deviations) & ~cloud.interpolated]
+        if len(known):
+            written["deviation_mm"] = {
+                "points": len(known),
+                "mean": float(known.mean()),
+                "rms": float(np.sqrt(np.mean(known**2))),
+                "p95": float(np.percentile(np.abs(known), 95)),
+            }
+    return written
+
+
+def _comment(deviations: NDArray[np.float64] | None) -> str:
+    return "frame: arm base" + ("" if deviations is None else "\nquality: distance from the nominal surface in metres")
+
+
+def _deviations(cloud: StoredCloud, report: dict[str, Any], name: str | None) -> NDArray[np.float64] | None:
+    """Signed distances (n,) in m from the nominal surface where the run found it; None without a place pose."""
+    pose = report.get("place_pose")
+    if pose is None:
+        return None
+    try:
+        job, mesh = load_job(name or report["job"])
+    except ConfigError as error:
+        raise ConfigError(f"{error}; name the run's job file with --job") from error
+    values = np.array([*(1e-3 * v for v in pose["translation_mm"]), *pose["rotation_vector_rad"]])
+    base_from_surface = from_ur(values) * job.place.surface_from_part.se3().inverse()
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    return nominal.deviations(transform(base_from_surface.inverse(), cloud.points))
