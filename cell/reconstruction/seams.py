@@ -13,14 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cell.reconstruction.cloud import Array, Cloud, Indices
+from cell.reconstruction.cloud import Array, Cloud, Indices, Mask
 
 Motions = Callable[[Indices, Indices], Array]
 
-NEIGHBOURS = 12
-"""Points of the other sweep through which its surface is laid."""
 REACH = 0.0008
-"""The neighbours must be within this distance, m, else the other sweep does not cover the place."""
+"""The other sweep must have a point within this distance, m, else it does not cover the place."""
 MOST_POINTS = 3000
 LEAST_POINTS = 50
 FLAT = 0.0001
@@ -64,7 +62,7 @@ def find_seams(cloud: Cloud, motions: Motions) -> list[Seam]:
     trees = [cKDTree(cloud.points[lines, rows]) for lines, rows in parts]
     found = []
     for a, b in itertools.combinations(range(len(parts)), 2):
-        if min(len(parts[a][0]), len(parts[b][0])) < NEIGHBOURS:
+        if min(len(parts[a][0]), len(parts[b][0])) < LEAST_POINTS:
             continue
         seam = _seam(cloud, (a, b), parts, trees[a], motions)
         if seam is not None:
@@ -91,28 +89,27 @@ def _seam(
     lines_b, rows_b = lines_b[keep], rows_b[keep]
     if len(lines_b) < LEAST_POINTS:
         return None
-    own = cloud.points[lines_b, rows_b]
-    distances, nearest = tree.query(own, k=NEIGHBOURS, distance_upper_bound=REACH)
-    full = np.isfinite(np.asarray(distances)).all(axis=1)
-    lines_b, rows_b, own, nearest = lines_b[full], rows_b[full], own[full], np.asarray(nearest)[full]
-    if len(own) < LEAST_POINTS:
+    nearest = np.asarray(tree.query(cloud.points[lines_b, rows_b], k=1)[1])
+    beside, full = _around(cloud, cloud.each_sweep()[pair[0]], lines_a[nearest], rows_a[nearest])
+    lines_b, rows_b, nearest = lines_b[full], rows_b[full], nearest[full]
+    if len(lines_b) < LEAST_POINTS:
         return None
-    around = cloud.points[lines_a[nearest], rows_a[nearest]]
+    own, around = cloud.points[lines_b, rows_b], cloud.points[beside[0], beside[1]]
     centre = around.mean(axis=1)
     spread, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around - centre[:, None], around - centre[:, None]))
     # A place at the rim of the other sweep has neighbours on one side only; there its plane would be continued.
-    inside = np.linalg.norm(own - centre, axis=1) < 0.5 * REACH
-    good = inside & (spread[:, 0] / NEIGHBOURS < FLAT**2) & (spread[:, 1] > 4 * spread[:, 0])
+    inside = np.linalg.norm(own - centre, axis=1) < REACH
+    count = around.shape[1]
+    good = inside & (spread[:, 0] / count < FLAT**2) & (spread[:, 1] > 9 * spread[:, 0])
     if good.sum() < LEAST_POINTS:
         return None
     normals, own, centre = vectors[good, :, 0], own[good], centre[good]
     normals = normals * np.sign(normals @ normals[0])[:, None]
     heights = np.einsum("ni,ni->n", own - centre, normals)
     noise = cloud.sigma_along(lines_b[good], rows_b[good], normals) ** 2
-    for k in range(NEIGHBOURS):
-        index = nearest[good, k]
-        noise += cloud.sigma_along(lines_a[index], rows_a[index], normals) ** 2 / NEIGHBOURS**2
-    first = nearest[good, 0]
+    for k in range(count):
+        noise += cloud.sigma_along(beside[0][good, k], beside[1][good, k], normals) ** 2 / count**2
+    first = nearest[good]
     apart = motions(lines_b[good], rows_b[good]) - motions(lines_a[first], rows_a[first])
     along = np.einsum("ni,nim->nm", normals, apart)
     return Seam(
@@ -125,3 +122,18 @@ def _seam(
         expected_mean=float(np.sqrt(np.sum(along.mean(axis=0) ** 2) + noise.mean() / len(noise))),
         expected_rms=float(np.sqrt(np.mean(noise + np.sum(along**2, axis=1)))),
     )
+
+
+def _around(cloud: Cloud, sweep: slice, lines: Indices, rows: Indices) -> tuple[tuple[Indices, Indices], Mask]:
+    """Lines and rows (m, 15) of the points around those of one sweep at (n,) lines and rows, about as far across the
+    lines as along them, and which of the n have all of them."""
+    ways = [cloud.points[sweep.start + 1 : sweep.stop] - cloud.points[sweep.start : sweep.stop - 1]]
+    ways.append(cloud.points[sweep, 1:] - cloud.points[sweep, :-1])
+    across, along = (float(np.nanmedian(np.linalg.norm(way, axis=2))) for way in ways)
+    stride = max(1, round(0.5 * across / along))
+    steps = np.array([(i, j * stride) for i in (-1, 0, 1) for j in (-2, -1, 0, 1, 2)])
+    line, row = lines[:, None] + steps[:, 0], rows[:, None] + steps[:, 1]
+    there = (line >= sweep.start) & (line < sweep.stop) & (row >= 0) & (row < cloud.shape[1])
+    line, row = np.where(there, line, sweep.start), np.where(there, row, 0)
+    full = (there & cloud.valid[line, row]).all(axis=1)
+    return (line[full], row[full]), full

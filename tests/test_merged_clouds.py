@@ -1,0 +1,197 @@
+"""Sweeps from several poses make one cloud; their seams show what the poses err by; the arm alone can sweep too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+from test_reconstruction import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
+
+from cell.geometry.poses import from_ur, to_ur
+from cell.motion.track import FlangeTrack
+from cell.reconstruction import Cloud, ProfileBuilder, calibration_motions, find_seams, flange_motions, merge
+from cell.vision.stripe import StripeProfile
+from drivers.errors import DeviceFault
+from drivers.interfaces import ArmSafety, ArmState
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+NOISE = 0.07
+
+
+def relief(x: Array, y: Array) -> Array:
+    """Height in the base, m."""
+    return np.asarray(TABLE + 0.002 * np.sin(120 * x) * np.cos(140 * y))
+
+
+def stripe(base_from_camera: pin.SE3) -> Array:
+    """Columns (480,) at which the laser line on the relief is seen: each image row's ray in the light plane, by
+    bisection between the heights that the relief stays within."""
+    columns = np.full(480, np.nan)
+    camera, plane = GEOMETRY.camera, GEOMETRY.light_plane
+    low, high = np.zeros(480), np.full(480, 639.0)
+
+    def above(column: Array) -> Array:
+        seen = plane.intersect(camera.rays(np.column_stack([column, np.arange(480.0)])))
+        points = seen @ base_from_camera.rotation.T + base_from_camera.translation
+        return np.asarray(points[:, 2] - relief(points[:, 0], points[:, 1]))
+
+    sign = np.sign(above(low))
+    for _ in range(34):
+        middle = 0.5 * (low + high)
+        same = np.sign(above(middle)) == sign
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    columns[:] = 0.5 * (low + high)
+    return columns
+
+
+def profile(centres: Array, rng: np.random.Generator) -> StripeProfile:
+    none, one = np.zeros(480, dtype=bool), np.ones(480)
+    return StripeProfile(
+        "rows", centres + NOISE * rng.standard_normal(480), NOISE * one, 150 * one, 2 * one, none, none
+    )
+
+
+def swept(shift: tuple[float, float, float], error: Array, seed: int, lines: int = 16) -> Cloud:
+    """A rail sweep from a flange moved by `shift`, which is told to stand `error` (translation) from where it is."""
+    rng = np.random.default_rng(seed)
+    true = pin.SE3(BASE_FROM_FLANGE.rotation, BASE_FROM_FLANGE.translation + shift)
+    told = pin.SE3(true.rotation, true.translation + error)
+    builder = ProfileBuilder(GEOMETRY)
+    for rail in np.linspace(0.047, 0.053, lines):
+        builder.add(profile(stripe(true * MOUNT * pin.SE3(np.eye(3), rail * RAIL)), rng), rail, 1e-6)
+    return builder.finish(told)
+
+
+ERROR = np.array([0.0, 0.0, 4e-5])
+
+
+@pytest.fixture(scope="module")
+def pair() -> Cloud:
+    return merge([swept((0, 0, 0), np.zeros(3), 1), swept((0.0, 0.012, 0.0), ERROR, 2)])
+
+
+def repeatability(sigma: float) -> list[Array]:
+    return [np.diag([sigma**2] * 3 + [0.0] * 3)] * 2
+
+
+def test_a_merged_cloud_is_wider_and_every_point_keeps_its_place(pair: Cloud) -> None:
+    first, second = pair.each_sweep()
+    assert pair.shape == (32, 480)
+    assert pair.sweeps.tolist() == [0] * 16 + [1] * 16
+    width = [np.ptp(pair.points[part][:, :, 1][pair.valid[part]]) for part in (first, second)]
+    assert np.ptp(pair.points[:, :, 1][pair.valid]) > max(width) + 0.011
+    deviation = pair.points[first][:, :, 2] - relief(*np.moveaxis(pair.points[first][:, :, :2], 2, 0))
+    assert np.sqrt(np.nanmean(deviation**2)) < 5e-5
+
+
+def test_the_seam_shows_the_error_between_two_sweeps_beside_what_is_expected(pair: Cloud) -> None:
+    (seam,) = find_seams(pair, lambda lines, rows: flange_motions(pair, lines, rows, repeatability(4e-5 / np.sqrt(2))))
+    assert (seam.first, seam.second) == (0, 1)
+    assert seam.points > 500
+    # The relief slopes a little, the error is along z: its part along the normals is nearly all of it.
+    assert abs(seam.mean) == pytest.approx(4e-5, rel=0.1)
+    assert seam.expected_mean == pytest.approx(4e-5, rel=0.05)
+    assert seam.rms == pytest.approx(seam.expected_rms, rel=0.15)
+
+
+def test_what_moves_both_sweeps_alike_is_not_expected_at_the_seam(pair: Cloud) -> None:
+    def alike(lines: Indices, rows: Indices) -> Array:
+        return np.full((len(lines), 3, 1), 1e-4)
+
+    (seam,) = find_seams(pair, alike)
+    assert seam.expected_mean < 2e-6
+
+
+def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
+    told = [np.zeros((6, 6)), np.diag([0, 0, 9e-10, 1e-8, 0, 0])]
+    cloud = merge([swept((0, 0, 0), np.zeros(3), 1, 8), swept((0, 0.012, 0), np.zeros(3), 2, 8)])
+    lines, rows = cloud.subsample(600)
+    motions = flange_motions(cloud, lines, rows, told)
+    covariance = np.einsum("nim,njm->nij", motions, motions)
+    assert np.abs(covariance[lines < 8]).max() == 0.0
+    arms = (cloud.points[lines, rows] - cloud.flanges[lines, :3, 3])[lines >= 8]
+    by_turn = np.stack([-pin.skew(arm)[:, 0] for arm in arms])
+    expected = 1e-8 * by_turn[:, :, None] * by_turn[:, None, :]
+    expected[:, 2, 2] += 9e-10
+    assert np.allclose(covariance[lines >= 8], expected, atol=1e-16)
+
+
+def test_a_cloud_of_moving_flanges_is_solved_again_with_each_lines_own(pair: Cloud) -> None:
+    lines, rows = pair.subsample(200)
+    own = calibration_motions(pair, lines, rows, None, GEOMETRY, [GEOMETRY])
+    assert np.abs(own).max() < 1e-12
+
+
+def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does() -> None:
+    rng = np.random.default_rng(3)
+    builder = ProfileBuilder(GEOMETRY)
+    flanges = []
+    for k in range(24):
+        turn = pin.exp3(np.array([0.0, 2e-4 * k, -1e-4 * k]))
+        flange = pin.SE3(
+            BASE_FROM_FLANGE.rotation @ turn, BASE_FROM_FLANGE.translation + np.array([0.0005 * k, 1e-5 * k, 0.0])
+        )
+        builder.see(profile(stripe(flange * MOUNT * pin.SE3(np.eye(3), 0.05 * RAIL)), rng))
+        flanges.append(flange.homogeneous)
+    cloud = builder.place(np.arange(24), np.array(flanges), np.full(24, 0.05), np.full((24, 3), 1e-7))
+    lines, rows = np.nonzero(cloud.valid)
+    assert len(lines) > 11_000
+    points = cloud.points[lines, rows]
+    height = points[:, 2] - relief(points[:, 0], points[:, 1])
+    slope = [
+        (relief(points[:, 0] + a, points[:, 1] + b) - relief(points[:, 0], points[:, 1])) / 1e-7
+        for a, b in ((1e-7, 0), (0, 1e-7))
+    ]
+    normals = np.column_stack([-slope[0], -slope[1], np.ones(len(points))])
+    z = height / cloud.sigma_along(lines, rows, normals)
+    assert np.std(z) == pytest.approx(1.0, abs=0.03)
+    assert abs(np.mean(z)) < 0.05
+
+
+def test_clouds_that_do_not_belong_together_are_not_merged() -> None:
+    one = swept((0, 0, 0), np.zeros(3), 1, 8)
+    without = Cloud(one.points, one.stripe_spread, one.rail_spread, one.centres, one.rail, one.rejected)
+    with pytest.raises(ValueError, match="does not know where the flange stood"):
+        merge([one, without])
+    with pytest.raises(ValueError, match="no clouds"):
+        merge([])
+    assert merge([one]) is one
+
+
+# --- the flange's track ---
+
+
+def states(delays: Array, period: float = 0.008) -> list[ArmState]:
+    """A straight way at 20 mm/s and 0.1 rad/s about z, told with a delay of its own for each packet."""
+    made = []
+    for k, delay in enumerate(delays):
+        time = k * period
+        flange = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.1 * time])), np.array([0.5 + 0.02 * time, 0.0, 0.3]))
+        six = np.zeros(6)
+        made.append(
+            ArmState(1000.0 + time + delay, six, six, to_ur(flange), six, ArmSafety.NORMAL, True, 0, 0, 77.0 + time)
+        )
+    return made
+
+
+def test_late_packets_do_not_move_the_flange() -> None:
+    delays = 0.0005 + np.random.default_rng(0).exponential(0.004, 200)
+    track = FlangeTrack("arm", states(delays))
+    times = 1000.0 + delays.min() + np.linspace(0.1, 1.5, 40)
+    poses = track.at(times)
+    assert np.abs(poses[:, 0, 3] - (0.5 + 0.02 * np.linspace(0.1, 1.5, 40))).max() < 1e-9
+    angle = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    assert np.abs(angle - 0.1 * np.linspace(0.1, 1.5, 40)).max() < 1e-9
+    assert track.inside(np.array([999.0, 1000.5, 1002.0])).tolist() == [False, True, False]
+
+
+def test_a_gap_in_the_states_is_a_fault_and_not_bridged() -> None:
+    given = states(np.zeros(100))
+    del given[40:80]
+    with pytest.raises(DeviceFault, match=r"no state of the arm came for 0\.3\d* s"):
+        FlangeTrack("arm", given).at(np.array([1000.5]))
+    with pytest.raises(DeviceFault, match="only 3 states"):
+        FlangeTrack("arm", given[:3])
+    assert from_ur(given[0].flange).translation[0] == pytest.approx(0.5)
