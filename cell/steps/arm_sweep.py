@@ -60,7 +60,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
             with suppress(CellError):
                 arm.stop()
             raise
-    track = FlangeTrack(arm.name, states, LONGEST_GAP_S * errors.rate)
+    track = FlangeTrack(arm.name, states, LONGEST_GAP_S * max(1.0, errors.rate))
     times = np.array(collector.times)
     seen = np.flatnonzero(track.inside(times))
     flanges = track.at(times[seen])

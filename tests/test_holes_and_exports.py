@@ -1,0 +1,172 @@
+"""Filled holes are as good as they say and never taken for measurements; other programs read what is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from cell.bench.reconstruction_scenes import KINDS, Scene, cut_holes, scene
+from cell.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
+from cell.reconstruction.e57 import write_e57
+from cell.reconstruction.mesh import triangles, write_mesh
+from cell.reconstruction.outliers import find_outliers
+from cell.reconstruction.ply import deviation_colours, read_cloud
+from drivers.errors import ConfigError
+
+
+def z_of(made: Scene, filled: Filled) -> np.ndarray:
+    error = filled.points[:, 2] - made.true[filled.lines, filled.rows]
+    return np.asarray(error / np.sqrt(filled.covariances[:, 2, 2]))
+
+
+# --- holes ---
+
+
+@pytest.mark.parametrize("surface", ["free-form", "steps"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 6), (1, 60)])
+def test_an_interpolated_point_errs_as_its_covariance_says(surface: str, size: tuple[int, int]) -> None:
+    made = scene(surface, "far", 0.0, 5)
+    cut = cut_holes(made.depth.shape, size, 150, 6)
+    filled = fill_holes(made.cloud(cut)).filled
+    asked = cut[filled.lines, filled.rows]
+    # Holes that happen to lie side by side are one wider hole, which stays open.
+    assert asked.sum() > 0.85 * cut.sum()
+    z = z_of(made, filled)[asked]
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.1
+    assert np.abs(filled.points[:, 0] - made.x[filled.lines, filled.rows]).max() < 1e-6
+
+
+def test_a_hole_wider_than_the_limit_stays_a_hole() -> None:
+    made = scene("free-form", "far", 0.0, 1)
+    cut = np.zeros(made.depth.shape, dtype=bool)
+    around = np.s_[95:110, 95:125]
+    made.depth[around] = made.true[around]
+    cut[100:104, 100:120] = True  # 5 × 0.25 mm and 21 × 0.078 mm between its borders
+    for largest, expected in ((0.0012, 0), (0.0013, cut.sum()), (0.0, 0)):
+        filled = fill_holes(made.cloud(cut), largest).filled
+        assert np.count_nonzero(cut[filled.lines, filled.rows]) == expected
+    with pytest.raises(ValueError, match="must be 0 or greater"):
+        fill_holes(made.cloud(cut), -0.001)
+
+
+def test_nothing_is_filled_across_a_depth_edge_or_beyond_the_border() -> None:
+    made = scene("free-form", "far", 0.0, 1)
+    made.depth[150:] += 0.0005
+    cut = np.zeros(made.depth.shape, dtype=bool)
+    cut[149:151, 50:400:20] = True
+    cut[:2], cut[:, :3] = True, True
+    filled = fill_holes(made.cloud(cut)).filled
+    assert len(filled.lines) > 100
+    assert not cut[filled.lines, filled.rows].any()
+
+
+def test_interpolated_points_are_never_measurements() -> None:
+    made = scene("free-form", "far", 0.0, 1)
+    cloud = made.cloud(cut_holes(made.depth.shape, (2, 6), 100, 1))
+    whole = fill_holes(cloud)
+    assert len(whole.filled.lines) > 1000
+    assert whole.size == cloud.size
+    lines, rows = whole.subsample(whole.size)
+    measured = np.zeros(whole.shape, dtype=bool)
+    measured[lines, rows] = True
+    assert not measured[whole.filled.lines, whole.filled.rows].any()
+
+
+# --- outliers ---
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_runs_and_near_outliers_are_found_too(kind: str) -> None:
+    made = scene("steps", kind, 0.03, 8)
+    found = find_outliers(made.depth, made.sigma)
+    assert np.count_nonzero(found & made.bad) >= 0.99 * np.count_nonzero(made.bad)
+    assert np.count_nonzero(found & made.bad) >= 0.90 * np.count_nonzero(found)
+
+
+# --- files ---
+
+
+def two_sweeps() -> Cloud:
+    made = scene("free-form", "far", 0.0, 1)
+    whole = made.cloud(cut_holes(made.depth.shape, (2, 6), 40, 1))
+    parts = []
+    for k in range(2):
+        part = slice(100 * k, 100 * k + 60)
+        arrays = {
+            name: getattr(whole, name)[part]
+            for name in ("points", "stripe_spread", "rail_spread", "centres", "rail", "rejected")
+        }
+        parts.append(fill_holes(replace(whole, **arrays, flanges=np.tile(np.eye(4), (60, 1, 1)))))
+    return merge(parts)
+
+
+def test_a_cloud_is_read_back_with_its_sweeps_its_sigma_and_its_flags(tmp_path: Path) -> None:
+    cloud = two_sweeps()
+    count = write_cloud(tmp_path / "cloud.ply", cloud)
+    stored = read_cloud(tmp_path / "cloud.ply")
+    assert count == len(stored.points) == cloud.size + len(cloud.filled.lines)
+    assert np.count_nonzero(stored.interpolated) == len(cloud.filled.lines) > 100
+    lines, rows = np.nonzero(cloud.valid)
+    measured = ~stored.interpolated
+    assert np.array_equal(stored.line[measured], lines) and np.array_equal(stored.row[measured], rows)
+    assert np.array_equal(stored.sweep, stored.line // 60)
+    assert np.allclose(stored.points[measured], cloud.points[lines, rows], atol=1e-8)
+    assert np.allclose(stored.sigma[measured], cloud.stripe_spread[lines, rows, 2], rtol=1e-6)
+    plain = trimesh.load(tmp_path / "cloud.ply")
+    assert np.allclose(plain.vertices, stored.points, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"ply\nend_header\n", b"ply\nelement vertex 3\nproperty float x\nend_header\n"]
+)
+def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "cloud.ply").write_bytes(content)
+    with pytest.raises(ConfigError, match="is no cloud of this program"):
+        read_cloud(tmp_path / "cloud.ply")
+    with pytest.raises(ConfigError, match="did the run come as far"):
+        read_cloud(tmp_path / "missing.ply")
+
+
+def test_an_e57_is_read_back_by_its_own_library(tmp_path: Path) -> None:
+    pye57 = pytest.importorskip("pye57")
+    write_cloud(tmp_path / "cloud.ply", two_sweeps())
+    stored = read_cloud(tmp_path / "cloud.ply")
+    colours = deviation_colours(stored.points[:, 2], 1e-3)
+    count = write_e57(tmp_path / "cloud.e57", stored, colours)
+    assert count == np.count_nonzero(~stored.interpolated)
+    file = pye57.E57(str(tmp_path / "cloud.e57"))
+    assert file.scan_count == 2
+    for k in range(2):
+        read = file.read_scan_raw(k)
+        mine = (stored.sweep == k) & ~stored.interpolated
+        assert np.allclose(np.column_stack([read[f"cartesian{a}"] for a in "XYZ"]), stored.points[mine], atol=1e-9)
+        assert np.array_equal(read["colorRed"], colours[mine, 0])
+        assert np.array_equal(read["rowIndex"], stored.row[mine])
+    file.close()
+
+
+def test_a_mesh_lies_on_the_surface_faces_the_camera_and_spans_no_edge(tmp_path: Path) -> None:
+    made = scene("free-form", "far", 0.0, 1)
+    made.depth[150:] += 0.003
+    cloud = made.cloud(np.zeros(made.depth.shape, dtype=bool))
+    line, row = np.nonzero(cloud.valid)
+    points = cloud.points[line, row]
+    faces = triangles(points, line, row, np.zeros(len(line), dtype=np.intp))
+    assert not ((line[faces] < 150).any(axis=1) & (line[faces] >= 150).any(axis=1)).any()
+    # x runs with the lines and y with the rows, so the camera's view is along +z and the normals point to −z.
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.all(normals[:, 2] < 0)
+    flat = -0.5 * normals[:, 2].sum()
+    assert flat == pytest.approx(np.ptp(made.x) * np.ptp(made.y), rel=0.06)
+    for name in ("mesh.ply", "mesh.stl"):
+        assert write_mesh(tmp_path / name, points, faces, deviation_colours(points[:, 2], 1e-3)) == len(faces)
+        loaded = trimesh.load(tmp_path / name)
+        assert len(loaded.faces) == len(faces)
+        assert np.ptp(loaded.vertices, axis=0) == pytest.approx(np.ptp(points[faces].reshape(-1, 3), axis=0), abs=1e-6)
+    with pytest.raises(ValueError, match="no neighbours"):
+        triangles(points[:1], line[:1], row[:1], np.zeros(1, dtype=np.intp))
