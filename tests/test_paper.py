@@ -1,0 +1,143 @@
+"""The paper's design study and equations, against the theory sheet's figures and the simulator's optics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.geometry.light_plane import closed_form
+from cell.paper import equations as eq
+from cell.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
+from cell.paper.equation_table import equation_table
+from cell.paper.figure2 import figure2, smallest_baseline
+from cell.paper.figure2_pictures import draw
+from cell.paper.traced import light_point, oblique_image
+from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
+from sim_backends.optics.stripe import crossings
+
+# --- Figure 2 ---
+
+
+@pytest.mark.parametrize(
+    ("focal_mm", "half_millimetre", "fifth"),
+    [(6.54, 0.242, 0.242), (8.0, 0.75, 0.537), (12.0, 2.72, 1.54), (16.0, 5.04, 2.67)],
+)
+def test_the_papers_claims_need_the_stripe_errors_of_the_theory_sheet(
+    focal_mm: float, half_millimetre: float, fifth: float
+) -> None:
+    limits = [
+        1e6 * delta_limit(Head.at_stand_off(baseline, 1e-3 * focal_mm), demand)
+        for baseline, demand in ((0.030, 0.5e-3), (0.035, 0.2e-3))
+    ]
+    assert limits == pytest.approx([half_millimetre, fifth], rel=3e-3)
+
+
+def test_light_is_as_even_as_the_theory_sheet_says() -> None:
+    found = [uniformity(Head.at_stand_off(1e-3 * mm, 8e-3), Light()) for mm in (20, 30, 35, 50, 80)]
+    assert found == pytest.approx([0.00, 0.11, 0.17, 0.33, 0.52], abs=0.005)
+
+
+def test_light_in_the_middle_hardly_changes_from_30_to_35_mm() -> None:
+    small, large = (float(peak_power(Head.at_stand_off(b, 8e-3), 0.0, Light())) for b in (0.030, 0.035))
+    assert large / small - 1 == pytest.approx(-0.011, abs=5e-4)
+
+
+def test_35_mm_is_the_smallest_that_meets_a_fifth_of_a_millimetre_at_a_tenth_of_a_pixel() -> None:
+    assert smallest_baseline(0.1 * 4.8e-6) == 0.035
+    assert smallest_baseline(0.31e-6) == 0.035
+    assert smallest_baseline(0.29e-6) == 0.030
+    assert smallest_baseline(0.55e-6) == 0.040
+
+
+def test_errors_are_what_moved_rays_do() -> None:
+    head = Head.at_stand_off(0.035, 8e-3)
+    x, y, delta = np.array([-0.8e-3, 0.0, 0.9e-3]), np.array([0.7e-3, -0.4e-3, -0.9e-3]), 1e-8
+    moved = {name: np.zeros(3) for name in ("dx", "dy", "dz")}
+    for first in (-delta, delta):
+        for second in (-delta, delta):
+            there = light_point(x + first, y + second, head.baseline, head.focal, head.theta)
+            off = np.abs(there - light_point(x, y, head.baseline, head.focal, head.theta))
+            for k, name in enumerate(moved):
+                moved[name] = np.maximum(moved[name], off[:, k])
+    found = errors(head, x, y, delta)
+    for name, value in moved.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-4)
+
+
+def test_beyond_the_vanishing_line_there_is_no_depth() -> None:
+    head = Head.at_stand_off(0.015, 8e-3)
+    assert head.vanishing == pytest.approx(0.8e-3)
+    assert np.isinf(largest_dz(head, 1e-7))
+    assert delta_limit(head, 1e-3) == 0.0
+    assert uniformity(head, Light()) == 0.0
+
+
+def test_the_paper_is_told_right_and_wrong() -> None:
+    result = figure2()
+    assert result["choice"]["chosen_mm"] == 35.0
+    assert result["choice"]["chosen_for_delta_um"] == pytest.approx([0.30, 0.5365], abs=1e-3)
+    verdicts = {row["paper"]: row for row in result["statements"]}
+    assert "0.358 and 0.200" in verdicts["error < 0.5 mm at l = 30 mm and < 0.2 mm at l = 35 mm"]["why"]
+    assert "0.419" in verdicts["with l = 35 mm, tanθ = 3.5 and the system at 150 mm"]["why"]
+    # With θ held, the error grows with the baseline, as 35 to 30; with the distance held it falls.
+    held = [row["largest_dz_mm"] for row in result["tan_3_5"]]
+    assert held[1] / held[0] == pytest.approx(35 / 30)
+    assert result["maps"][1]["largest_mm"]["dz"] < 0.6 * result["maps"][0]["largest_mm"]["dz"]
+
+
+def test_the_pictures_are_drawn(tmp_path) -> None:
+    for path in draw(tmp_path):
+        assert path.stat().st_size > 20_000
+
+
+# --- equations ---
+
+
+def test_the_traced_truth_is_where_the_simulators_light_plane_cuts_a_wall() -> None:
+    focal_px = 8e-3 / 4.8e-6
+    optics = CameraOptics(640, 480, focal_px, focal_px, 319.5, 239.5)
+    wall = np.eye(4)
+    wall[:3, :3] = [[0.9, 0.0, 0.43589], [0.0, 1.0, 0.0], [-0.43589, 0.0, 0.9]]
+    wall[2, 3] = 0.130
+    found = crossings(optics, LaserOptics(), PlaneInstance(wall, (0.2, 0.2)))
+    x, y = (found.columns - 319.5) * 4.8e-6, (found.rows - 239.5) * 4.8e-6
+    truth = light_point(x, y, 0.035, 8e-3, float(np.arctan(3.5)))
+    assert len(truth) == 480
+    assert np.abs(truth - found.points).max() < 1e-9
+    np.testing.assert_allclose(closed_form(x, y, 0.035, 8e-3, float(np.arctan(3.5))), found.points, atol=1e-9)
+
+
+def test_corrected_equations_are_exact_and_printed_ones_are_not() -> None:
+    rows = equation_table()["rows"]
+    assert max(row["corrected_mm"] for row in rows) < 1e-8
+    printed = {(row["equation"], row["compared"].split(",")[0]): row["printed_mm"] for row in rows}
+    assert printed["(1)", "point (x"] == pytest.approx(210.6, abs=0.1)
+    # 7 mrad beside x and 0.15 % of scale over 100 mm.
+    on_corrected = next(row for row in rows if row["compared"] == "the same on (1) as corrected")
+    assert on_corrected["printed_mm"] == pytest.approx(100 * np.hypot(0.007, 0.0015), rel=2e-3)
+    dy = next(row for row in rows if row["compared"].startswith("dy"))
+    assert dy["printed_mm"] > 0.5
+    assert all(row["printed_mm"] < 1e-8 for row in rows if row["compared"].startswith(("dx", "dz", "Z where")))
+
+
+def test_four_follows_from_three_and_holds_only_at_minus_45_degrees() -> None:
+    heights = np.linspace(-0.008, 0.008, 9)
+    for tilt_deg, exact in ((-45.0, True), (-30.0, False), (0.0, False), (45.0, False)):
+        tilt = float(np.radians(tilt_deg))
+        given = (0.3, 0.5, 0.15, 0.0085, tilt)
+        image = oblique_image(heights, *given)
+        np.testing.assert_allclose(eq.eq4_corrected(image, *given), heights, atol=1e-12)
+        np.testing.assert_allclose(eq.eq4_printed(image, *given), eq.eq3_solved(image, *given), atol=1e-12)
+        assert (np.abs(eq.eq4_printed(image, *given) - heights).max() < 1e-12) == exact
+
+
+def test_the_tilt_in_focus_images_the_beam_sharply() -> None:
+    theta_1, theta_2, distance, focal = 0.35, 0.44, 0.15, 8e-3
+    principal = focal * distance / (distance - focal)
+    tilt = eq.scheimpflug(theta_1, theta_2, distance, principal)
+    for height in (-0.006, 0.009):
+        along = height / np.cos(theta_1)
+        depth = distance - along * np.cos(theta_1 + theta_2)
+        image = float(oblique_image(height, theta_1, theta_2, distance, principal, tilt)[0])
+        behind = principal + image * np.sin(tilt)
+        assert 1 / depth + 1 / behind == pytest.approx(1 / focal, rel=1e-9)
