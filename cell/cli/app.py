@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from cell.cli import bench_reconstruction, calibrate, devices, export, run, setup, sim
+from cell.cli import bench_acceptance, bench_reconstruction, calibrate, devices, export, paper, run, setup, sim
 
 app = typer.Typer(
     name="cell",
@@ -14,11 +14,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for register in (run.register, export.register, calibrate.register, devices.register, setup.register):
+for register in (
+    run.register, export.register, calibrate.register, devices.register, setup.register, paper.register,
+):  # fmt: skip
     register(app)
 app.add_typer(sim.app, name="sim")
+
 bench = typer.Typer(
     help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
 )
+for register in (bench_acceptance.register, bench_reconstruction.register):
+    register(bench)
 app.add_typer(bench, name="bench")
-bench_reconstruction.register(bench)

@@ -1,0 +1,123 @@
+"""Small versions of the campaigns behind `cell paper`: on their bounds, reproducible, and outliers found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.geometry.poses import from_parts
+from cell.paper import campaign, solved
+from cell.paper.cited import SYSTEMS, cited
+from cell.paper.rig import RigSpec, dot_centres, draw_head
+from cell.paper.spoiled import spoil
+from cell.paper.stitching import surface_of
+from cell.paper.systems import one_system
+from cell.paper.table1 import SPEC, one_seed
+from cell.reconstruction import Cloud
+from sim_backends.optics import Board
+
+
+@pytest.fixture(scope="module")
+def run():
+    return one_seed(3)
+
+
+def test_a_calibrated_head_measures_as_well_as_its_covariance_says(run) -> None:
+    assert 0.9 < run["chi2_per_dof"] < 1.1
+    points = run["points"]["1000"]
+    # One head's mean error is one draw: it lies within a few times its expectation.
+    assert 0.2 * run["bound_scan_frame"] < points["joint"]["mean"] < 2.5 * run["bound_scan_frame"]
+    assert points["joint"]["aligned_mean"] < 0.04
+    assert points["nominal"]["mean"] > 10 * points["joint"]["mean"]
+    assert 0.4 * run["bound_arm_base"] < run["table"]["joint"]["d"]["mean"] < 2 * run["bound_arm_base"]
+    assert run["table"]["joint"]["d"]["max"] < 0.3
+
+
+def test_table_rows_are_possible(run) -> None:
+    # The printed Table 1 is not: its largest D is more than its largest X, Y and Z together.
+    for table in run["table"].values():
+        together = np.sqrt(sum(table[axis]["max"] ** 2 for axis in "xyz"))
+        assert table["d"]["max"] <= together + 1e-12
+
+
+def test_outliers_of_every_kind_are_found(run) -> None:
+    assert run["outliers"]["recall"] >= 0.99
+    assert run["outliers"]["precision"] >= 0.90
+    assert run["outliers"]["recall_near"] >= 0.99
+
+
+def test_outliers_are_put_in_at_the_share_asked_for() -> None:
+    from cell.paper.rig import Sweep
+
+    centres = np.full((60, 480), 300.0)
+    sweep = Sweep(centres, np.zeros(60), np.zeros((60, 480, 3)))
+    spoiled = spoil(sweep, SPEC, 0.03, np.random.default_rng(0))
+    assert spoiled.any.sum() == round(0.03 * centres.size)
+    assert sum(int(mask.sum()) for mask in spoiled.kinds.values()) == spoiled.any.sum()
+    assert (spoiled.centres[~spoiled.any] == 300.0).all()
+    # 0.3 mm of depth are more than a pixel here.
+    assert np.abs(spoiled.centres[spoiled.any] - 300.0).min() > 1.0
+
+
+def test_centres_of_dots_are_those_of_their_conics() -> None:
+    head = draw_head(RigSpec(), np.random.default_rng(0), "ideal")
+    board = Board.parse("marked_dots:11x9:3mm")
+    rotation = pin.exp3(np.array([0.5, -0.3, 0.2]))
+    pose = from_parts(np.array([-0.01, -0.01, 0.13]), rotation)
+    # The dual of the circle's image, C* = H diag(r², r², −1)* Hᵀ: its last column is the centre.
+    k = np.array([[head.optics.fx, 0, head.optics.cx], [0, head.optics.fy, head.optics.cy], [0, 0, 1.0]])
+    expected = []
+    for centre in board.points:
+        h = k @ np.column_stack([rotation[:, 0], rotation[:, 1], rotation @ centre + pose.translation])
+        dual = h @ np.diag([board.dot_radius**2, board.dot_radius**2, -1.0]) @ h.T
+        expected.append(dual[:2, 2] / dual[2, 2])
+    assert np.abs(dot_centres(head.optics, pose, board) - expected).max() < 2e-4
+
+
+def test_expected_length_of_a_round_error_is_that_of_maxwell() -> None:
+    sigma = 2e-5
+    found = solved.expected_length(np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
+    assert found == pytest.approx(sigma * np.sqrt(8 / np.pi), rel=0.05)
+
+
+def test_alignment_takes_out_a_rigid_motion_and_nothing_else() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(200, 3))
+    moved = points @ pin.exp3(np.array([0.1, 0.2, -0.3])).T + [1.0, 2.0, 3.0]
+    assert np.abs(solved.aligned(moved, points)).max() < 1e-12
+    assert np.linalg.norm(solved.aligned(1.01 * points, points), axis=1).mean() == pytest.approx(
+        0.01 * np.linalg.norm(points - points.mean(axis=0), axis=1).mean(), rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("key", ["hand_held", "dental"])
+def test_other_systems_tasks_are_met_at_their_expected_error(key: str) -> None:
+    found = one_system((key, 1))
+    assert 0.4 * found["expected"] < found["mean"] < 2.0 * found["expected"]
+    assert found["p95"] < cited(key).claim_mm
+
+
+def test_systems_have_their_own_names_and_an_unknown_one_is_refused() -> None:
+    assert len({system.key for system in SYSTEMS}) == len(SYSTEMS) == 5
+    with pytest.raises(ValueError, match="hand_held"):
+        cited("none")
+
+
+def test_a_cloud_becomes_a_surface_that_looks_at_the_camera() -> None:
+    x, y = np.meshgrid(np.arange(20) * 0.01, np.arange(160) * 0.002, indexing="ij")
+    points = np.stack([x, y, 1.0 + 0.1 * x], axis=-1)
+    empty = np.zeros((20, 160))
+    cloud = Cloud(points, np.zeros((20, 160, 3), np.float32), np.zeros((20, 3)), empty, empty[:, 0], empty > 0)
+    surface = surface_of(cloud)
+    assert (surface.normals[:, 2] < 0).all()
+    heights = surface.deviations(np.array([[0.1, 0.16, 1.01 - 0.002 * np.sqrt(1.01)]]), 0.01)
+    assert heights == pytest.approx([0.002], abs=1e-6)
+
+
+def test_results_come_in_the_order_of_the_seeds_and_progress_is_told() -> None:
+    told: list[tuple[int, int]] = []
+    results = campaign.run_all(lambda n: {"n": n}, [4, 2, 9], 1, lambda done, total: told.append((done, total)))
+    assert [row["n"] for row in results] == [4, 2, 9]
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert campaign.spread([1.0, 2.0, 9.0]) == pytest.approx({"mean": 4.0, "median": 2.0, "p95": 8.3, "max": 9.0})
