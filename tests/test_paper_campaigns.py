@@ -78,7 +78,11 @@ def test_centres_of_dots_are_those_of_their_conics() -> None:
 def test_expected_length_of_a_round_error_is_that_of_maxwell() -> None:
     sigma = 2e-5
     found = solved.expected_length(np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
-    assert found == pytest.approx(sigma * np.sqrt(8 / np.pi), rel=0.05)
+    assert found == pytest.approx(sigma * np.sqrt(8 / np.pi), rel=1e-9)
+    # Along one axis alone it is the mean absolute value of a normal variable; in a plane, Rayleigh's mean.
+    line, plane = np.diag([0.0, sigma**2, 0.0])[None], np.diag([sigma**2, 0.0, sigma**2])[None]
+    assert solved.expected_length(line) == pytest.approx(sigma * np.sqrt(2 / np.pi), rel=2e-3)
+    assert solved.expected_length(plane) == pytest.approx(sigma * np.sqrt(np.pi / 2), rel=2e-3)
 
 
 def test_alignment_takes_out_a_rigid_motion_and_nothing_else() -> None:
