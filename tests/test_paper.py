@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from cell.cli.app import app
 from cell.geometry.light_plane import closed_form
 from cell.paper import equations as eq
 from cell.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
 from cell.paper.equation_table import equation_table
 from cell.paper.figure2 import figure2, smallest_baseline
-from cell.paper.figure2_pictures import draw
 from cell.paper.traced import light_point, oblique_image
 from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
 from sim_backends.optics.stripe import crossings
@@ -85,11 +88,6 @@ def test_the_paper_is_told_right_and_wrong() -> None:
     assert result["maps"][1]["largest_mm"]["dz"] < 0.6 * result["maps"][0]["largest_mm"]["dz"]
 
 
-def test_the_pictures_are_drawn(tmp_path) -> None:
-    for path in draw(tmp_path):
-        assert path.stat().st_size > 20_000
-
-
 # --- equations ---
 
 
@@ -141,3 +139,25 @@ def test_the_tilt_in_focus_images_the_beam_sharply() -> None:
         image = float(oblique_image(height, theta_1, theta_2, distance, principal, tilt)[0])
         behind = principal + image * np.sin(tilt)
         assert 1 / depth + 1 / behind == pytest.approx(1 / focal, rel=1e-9)
+
+
+# --- commands ---
+
+
+def test_commands_print_json_alone_and_keep_numbers_and_pictures(tmp_path) -> None:
+    result = CliRunner().invoke(app, ["paper", "figure2", "--json", "--out", str(tmp_path)])
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["choice"]["chosen_mm"] == 35.0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "figure2.json",
+        "figure2_errors.png",
+        "figure2_choice.png",
+    }
+    assert all(path.stat().st_size > 20_000 for path in tmp_path.glob("*.png"))
+
+
+def test_equations_are_shown_with_their_verdicts() -> None:
+    result = CliRunner().invoke(app, ["paper", "equations"], env={"COLUMNS": "160"})
+    assert result.exit_code == 0
+    assert "27.5000" in result.stdout
+    assert "exact only for β = −45°" in result.stdout

@@ -12,11 +12,8 @@ from rich.table import Table
 
 from cell.paper.campaign import Progress as Report
 
-WAYS = {
-    "nominal": "before: as drawn",
-    "staged": "after: the paper's steps",
-    "joint": "after: joint adjustment",
-}
+WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
+"""The head as drawn; calibrated by the paper's steps one by one; by the joint adjustment."""
 
 
 @contextmanager
@@ -33,11 +30,12 @@ def campaign_progress(what: str) -> Iterator[Report]:
 
 
 def _table(title: str, *columns: str) -> Table:
-    """A table whose first column is text; columns that start with '<' are text too."""
+    """A table whose first column is text in one line; columns that start with '<' are text too, '<<' in one line."""
     table = Table(title=title)
     for index, name in enumerate(columns):
         left = index == 0 or name.startswith("<")
-        table.add_column(name.removeprefix("<"), justify="left" if left else "right", overflow="fold")
+        whole = index == 0 or name.startswith("<<")
+        table.add_column(name.lstrip("<"), justify="left" if left else "right", overflow="fold", no_wrap=whole)
     return table
 
 
@@ -72,9 +70,9 @@ def print_figure2(result: Mapping[str, Any]) -> None:
     _say(console, f"{result['choice']['rule']}: {result['choice']['chosen_mm']:g} mm, for every δ from {low:.3f} to "
          f"{high:.3f} µm. Light in the middle from 30 to 35 mm: "
          f"{100 * result['energy']['change_from_30_to_35']:.1f} %.")  # fmt: skip
-    verdicts = _table("what the paper says", "statement", "<verdict", "<why")
-    for row in result["statements"]:
-        verdicts.add_row(row["paper"], row["verdict"], row["why"])
+    verdicts = _table("what the paper says", "", "<statement", "<verdict", "<why")
+    for number, row in enumerate(result["statements"], 1):
+        verdicts.add_row(str(number), row["paper"], row["verdict"], row["why"])
     console.print(verdicts)
     _say(console, result["note"])
 
@@ -100,12 +98,12 @@ def print_table1(result: Mapping[str, Any]) -> None:
     console = Console()
     paper = result["paper"]["section_5_2"]
     points = _table(f"section 5.2: distance from the truth in mm, scan frame, {result['seeds']} heads (simulated)",
-                    "points", "<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
+                    "points", "<<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
     for count, ways in result["section_5_2"].items():
         for way, v in ways.items():
             points.add_row(count, WAYS[way], f"{v['mean']:.4f}", f"{v['max']:.4f}", f"{v['p85']:.4f}",
                            f"{100 * v['share_below_0.54']:.1f} %", f"{v['aligned_mean']:.4f}")  # fmt: skip
-    points.add_row("1000", "paper (its hardware)", "", "", "0.54", paper["points_below_0.54_mm"], "")
+    points.add_row("1000", "paper, hardware", "", "", "0.54", paper["points_below_0.54_mm"], "")
     console.print(points)
     change, outliers = result["mean_change_mm"], result["outliers"]
     _say(console, f"Expected mean for the assumed noise: {result['bound_scan_frame_mm']:.4f} mm. Mean change from "
@@ -116,12 +114,14 @@ def print_table1(result: Mapping[str, Any]) -> None:
          f"{outliers['recall_near']:.4f}; least of all heads {result['least_outlier_recall']:.4f} and "
          f"{result['least_outlier_precision']:.4f}. Paper: {paper['outliers']} seen, the largest "
          f"{paper['largest_outlier_mm']} mm off.")  # fmt: skip
-    table = _table("Table 1: 45 points in 5 segments, arm base, in mm (ours simulated, the paper's as printed)", "head",
-                   *(f"{axis} {kind}" for axis in ("X", "Y", "Z", "D") for kind in ("max", "mean")))  # fmt: skip
+    table = _table("Table 1: 45 points in 5 segments, arm base, mean/largest in mm (paper's as printed)", "head",
+                   "X", "Y", "Z", "D")  # fmt: skip
     rows = [(WAYS[way], entry) for way, entry in result["table_1"].items()]
-    rows += [(f"paper: {name}", entry) for name, entry in result["paper"]["table_1"].items()]
+    rows += [
+        (name, result["paper"]["table_1"][key]) for key, name in (("optimised", "paper"), ("handscan", "Handscan"))
+    ]
     for name, entry in rows:
-        table.add_row(name, *(f"{entry[axis][kind]:.4f}" for axis in ("x", "y", "z", "d") for kind in ("max", "mean")))
+        table.add_row(name, *(f"{entry[axis]['mean']:.3f}/{entry[axis]['max']:.3f}" for axis in ("x", "y", "z", "d")))
     console.print(table)
     _say(console, f"Expected mean D for the assumed noise: {result['bound_arm_base_mm']:.4f} mm; χ²/dof "
          f"{result['chi2_per_dof']:.3f}.")  # fmt: skip
@@ -135,25 +135,27 @@ def print_systems(result: Mapping[str, Any]) -> None:
     """A row for each system, then the head that was assumed for it."""
     console = Console()
     table = _table(f"other systems: theirs on hardware, ours simulated over {result['seeds']} heads each", "system",
-                   "<theirs", "<our task", "ours: mean in mm", "95 % below", "worst head's 95 %", "expected mean",
+                   "<theirs", "<our task", "ours in mm: mean", "95 % below", "worst 95 %", "expected mean",
                    "points/s")  # fmt: skip
     for row in result["systems"]:
         own = row["ours"]
         rate = own["points_per_s"]
-        table.add_row(f"{row['system']} {row['reference']}", row["theirs"]["headline"], TASKS[own["task"]],
+        table.add_row(row["reference"] + " " + row["system"].split()[0], row["theirs"]["headline"], TASKS[own["task"]],
                       *(f"{own[key]:.4f}" for key in ("mean_mm", "p95_mm", "worst_seed_p95_mm", "expected_mean_mm")),
                       "" if rate is None else f"{rate:,.0f}")  # fmt: skip
     console.print(table)
-    heads = _table("what was assumed for ours", "system", "<sensor", "pixel in µm", "f in mm", "l in mm",
-                   "meets axis in mm", "<depths in mm", "rail in mm", "stripe σ px", "rail σ mm", "arm σ mm",
-                   "arm σ mrad")  # fmt: skip
+    heads = _table("what was assumed for ours: lengths in mm, pixels in µm, noise 1σ", "system", "<sensor", "<optics",
+                   "<depths, rail", "<noise")  # fmt: skip
     for row in result["systems"]:
         head, noise = row["head"], row["noise"]
-        heads.add_row(row["system"], head["sensor_px"], f"{head['pixel_um']:g}", f"{head['focal_mm']:g}",
-                      f"{head['baseline_mm']:g}", f"{head['light_plane_meets_axis_mm']:g}",
-                      "…".join(f"{z:g}" for z in head["depths_mm"]), f"{head['rail_travel_mm']:g}",
-                      f"{noise['stripe_px']:g}", f"{noise['rail_mm']:g}", f"{noise['arm_mm_radial']:g}",
-                      f"{noise['arm_mrad_per_axis']:g}")  # fmt: skip
+        heads.add_row(
+            row["reference"] + " " + row["system"].split()[0],
+            f"{head['sensor_px']}, {head['pixel_um']:g}",
+            f"f {head['focal_mm']:g}, l {head['baseline_mm']:g}, meets axis at {head['light_plane_meets_axis_mm']:g}",
+            f"{head['depths_mm'][0]:g}…{head['depths_mm'][1]:g}, {head['rail_travel_mm']:g}",
+            f"stripe {noise['stripe_px']:g} px, dots {noise['dots_px']:g} px, rail {noise['rail_mm']:g}, arm "
+            f"{noise['arm_mm_radial']:g} and {noise['arm_mrad_per_axis']:g} mrad",
+        )
     console.print(heads)
     _say(console, result["note"])
 

@@ -44,11 +44,11 @@ SYSTEMS: tuple[CitedSystem, ...] = (
         "hand_held", "hand-held surface inspection", "[7]", "0.30 mm, cracks and depressions", 0.30, "dent", RigSpec()
     ),
     CitedSystem(
-        "arm_mounted", "module on a robot arm", "[12]", "better than 0.5 mm", 0.5, "arm_base",
+        "arm_mounted", "arm-mounted module", "[12]", "better than 0.5 mm", 0.5, "arm_base",
         RigSpec(noise=ORDINARY_ARM),
     ),
     CitedSystem(
-        "tracked", "hand-held with tracker", "[13]", "1 mm at 200 mm, 15,000 points/s", 1.0, "arm_base",
+        "tracked", "tracked hand-held scanner", "[13]", "1 mm at 200 mm, 15,000 points/s", 1.0, "arm_base",
         RigSpec(baseline=0.06, meeting=0.2, depths=(0.18, 0.23), board="marked_dots:11x9:4.5mm", noise=ORDINARY_ARM),
         claim_points_per_s=15_000.0,
     ),

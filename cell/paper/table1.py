@@ -33,7 +33,7 @@ SEGMENTS, PER_SEGMENT = 5, 9
 POINT_COUNTS = (100, 1000)
 PAPER_LIMIT_MM = 0.54
 PAPER: dict[str, float | int | str] = {
-    "points_below_0.54_mm": "over 85 %",
+    "points_below_0.54_mm": "> 85 %",
     "mean_change_mm": 0.67,
     "outliers": 3,
     "largest_outlier_mm": 0.85,
