@@ -157,6 +157,8 @@ def print_systems(result: Mapping[str, Any]) -> None:
             f"{noise['arm_mm_radial']:g} and {noise['arm_mrad_per_axis']:g} mrad",
         )
     console.print(heads)
+    for row in result["systems"]:
+        _say(console, f"{row['reference']} {row['remark']}.")
     _say(console, result["note"])
 
 
@@ -172,7 +174,7 @@ def print_acceptance(result: Mapping[str, Any]) -> None:
     """The worst of each figure, with what noise alone lets one expect."""
     console = Console()
     table = _table(f"acceptance after VDI/VDE 2634-2 and ISO 10360-13, level {result['level']} (simulated)", "figure",
-                   "worst place in mm", "expected from noise in mm")  # fmt: skip
+                   "worst place in mm", "expected from stated σ in mm")  # fmt: skip
     for key, name in ACCEPTANCE.items():
         expected = result["expected"].get(key)
         table.add_row(name, f"{result['worst'][key]:.4f}", "" if expected is None else f"{expected:.4f}")

@@ -61,6 +61,7 @@ def systems(seeds: Iterable[int], workers: int = 1, progress: Progress | None = 
                     "points_per_s": None if system.claim_points_per_s is None else points_per_second(system.spec),
                     "measured": "simulated",
                 },
+                "remark": system.remark,
                 "head": system.spec.as_dict(),
                 "noise": system.spec.noise.as_dict(),
             }
