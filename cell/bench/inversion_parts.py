@@ -17,7 +17,7 @@ from scipy.spatial import Delaunay
 
 from cell.geometry.poses import difference
 from cell.inversion import NominalSurface
-from cell.inversion.nominal import Array
+from cell.inversion.closest import Array
 
 Height = Callable[[Array, Array], Array]
 Symmetry = Literal["none", "axis", "centre"]

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from cell.bench.inversion_parts import PARTS, Part
 from cell.geometry.poses import perturbed
-from cell.inversion.nominal import Array
+from cell.inversion.closest import Array
 from cell.reconstruction import Cloud
 
 STRIPE_SIGMA, RAIL_SIGMA = 40e-6, 8e-6

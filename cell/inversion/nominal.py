@@ -1,7 +1,6 @@
 """The nominal surface of a job: a triangle mesh, the closest point on it, and its own normals.
 
-Candidates come from a KD-tree over dense samples, the closest point from the triangles themselves, so that the
-distance is exact to the tessellation. Points whose foot lies on the rim say nothing about the surface.
+Closest points are found on the triangles themselves, so that the distance is exact to the tessellation. Points whose foot lies on the rim say nothing about the surface.
 """
 
 from __future__ import annotations
@@ -10,20 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from cell.inversion.closest import Array, Grid, Indices, Walk, closest
 from drivers.errors import ConfigError
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 SPACING = 0.0004
 """Distance of the samples, m; a larger triangle carries several."""
-CANDIDATES = 4
-"""Samples whose triangles are tried for each point."""
 MOST_SAMPLES = 400_000
 
 
@@ -61,7 +55,8 @@ class NominalSurface:
         self.normals: Array = cross[solid] / twice_area[solid, None]
         self._corners = np.ascontiguousarray(corners)
         self.samples, self.sample_triangles = _samples(self._corners, self.areas)
-        self._tree = cKDTree(self.samples)
+        self.grid = Grid(self.samples, self.sample_triangles)
+        self._walk = Walk(self._corners)
         self._rim = rim
         border = _border_points(self.vertices, self.triangles)
         self._border = cKDTree(border) if len(border) else None
@@ -92,15 +87,13 @@ class NominalSurface:
 
     def feet(self, points: ArrayLike, within: float = np.inf) -> tuple[Indices, Feet]:
         """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""
-        p = np.ascontiguousarray(points, dtype=np.float64)
-        found = self._tree.query(p, k=CANDIDATES, distance_upper_bound=within + SPACING)
-        distances, nearest = np.asarray(found[0]), np.asarray(found[1])
-        chosen = np.flatnonzero(np.isfinite(distances[:, 0]))
-        nearest = np.where(np.isfinite(distances[chosen]), nearest[chosen], nearest[chosen, :1])
-        near = np.ascontiguousarray(p[chosen])
-        feet, hit = _closest(near, self._corners, self.sample_triangles[nearest])
+        p = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        grid, walk = self.grid, self._walk
+        feet, hit = closest(p, grid.low, grid.cell, grid.owner, self._corners, walk.corner_of, walk.start, walk.fan)
+        way = p - feet
+        chosen = np.flatnonzero(np.einsum("ni,ni->n", way, way) <= within * within)
+        feet, hit, way = feet[chosen], hit[chosen], way[chosen]
         normals = self.normals[hit]
-        way = near - feet
         heights = np.einsum("ni,ni->n", way, normals)
         aside = np.linalg.norm(way - heights[:, None] * normals, axis=1)
         inner = aside <= 2e-5 + 0.3 * np.abs(heights)
@@ -169,60 +162,3 @@ def _border_points(vertices: Array, triangles: NDArray[np.int64]) -> Array:
     first = np.cumsum(steps + 1) - (steps + 1)
     share = (np.arange(len(owner)) - first[owner]) / steps[owner]
     return np.asarray(a[owner] + share[:, None] * (b - a)[owner])
-
-
-@numba.njit(cache=True, nogil=True)
-def _closest(points: Array, corners: Array, candidates: Indices) -> tuple[Array, Indices]:
-    """For each point (n, 3) the closest point on its candidate triangles (n, k), and which triangle that is."""
-    feet = np.empty_like(points)
-    hit = np.empty(len(points), dtype=np.intp)
-    foot = np.empty(3)
-    for n in range(len(points)):
-        best = np.inf
-        for k in range(candidates.shape[1]):
-            triangle = candidates[n, k]
-            if k > 0 and triangle == candidates[n, k - 1]:
-                continue
-            distance = _to_triangle(points[n], corners, triangle, foot)
-            if distance < best:
-                best = distance
-                hit[n] = triangle
-                feet[n, 0], feet[n, 1], feet[n, 2] = foot[0], foot[1], foot[2]
-    return feet, hit
-
-
-@numba.njit(cache=True, nogil=True)
-def _to_triangle(p: Array, corners: Array, t: int, foot: Array) -> float:
-    """Squared distance of p from triangle t, whose closest point goes into `foot` (Ericson, 2005, section 5.1.5)."""
-    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
-    for i in range(3):
-        ab, ac = corners[t, 1, i] - corners[t, 0, i], corners[t, 2, i] - corners[t, 0, i]
-        d1 += ab * (p[i] - corners[t, 0, i])
-        d2 += ac * (p[i] - corners[t, 0, i])
-        d3 += ab * (p[i] - corners[t, 1, i])
-        d4 += ac * (p[i] - corners[t, 1, i])
-        d5 += ab * (p[i] - corners[t, 2, i])
-        d6 += ac * (p[i] - corners[t, 2, i])
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    v = w = 0.0
-    if d1 <= 0.0 and d2 <= 0.0:
-        v = w = 0.0
-    elif d3 >= 0.0 and d4 <= d3:
-        v = 1.0
-    elif d6 >= 0.0 and d5 <= d6:
-        w = 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v = d1 / (d1 - d3)
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
-    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        v = 1.0 - w
-    else:
-        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    squared = 0.0
-    for i in range(3):
-        a = corners[t, 0, i]
-        foot[i] = a + v * (corners[t, 1, i] - a) + w * (corners[t, 2, i] - a)
-        squared += (p[i] - foot[i]) ** 2
-    return squared

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.inversion.nominal import Array
+from cell.inversion.closest import Array
+from cell.inversion.motions import name, sorted_out
 from drivers.errors import NotObservable
 
 FREE = 1e-3
@@ -82,15 +83,37 @@ def judge(
     """
     unit = np.array([tolerance.translation] * 3 + [tolerance.rotation] * 3)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    motions = []
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        excess = 3.0 * float(np.sqrt(max(value, 0.0)))
-        motions.append(_motion(excess * vector * unit, excess, tolerance, radius))
+    sizes = 3.0 * np.sqrt(np.maximum(values, 0.0))
+    worst = _motion(sizes[-1] * vectors[:, -1] * unit, float(sizes[-1]), tolerance, radius)
+    beyond = sizes > 1.0
+    weak = [
+        _motion(size * way * unit, float(size), tolerance, radius)
+        for size, way in zip(sizes[beyond], vectors.T[beyond], strict=True)
+    ]
+    if beyond.sum() > 1:
+        plain = [
+            _sized(way, covariance, tolerance, radius) for way in sorted_out(unit[:, None] * vectors[:, beyond], radius)
+        ]
+        # Correlated motions can each stay within the tolerance while their mixture does not: then the mixture is named.
+        weak = plain if all(motion.excess > 1.0 for motion in plain) else weak
+    weak.sort(key=lambda motion: -motion.excess)
     length = np.array([1.0] * 3 + [radius] * 3)
     spectrum, ways = np.linalg.eigh(scan_information / np.outer(length, length) * (mean_variance / max(1, points)))
-    unseen = tuple(_name(way / length, radius) for value, way in zip(spectrum, ways.T, strict=True) if value < FREE)
-    weak = tuple(motion for motion in motions if motion.excess > 1.0)
-    return Verdict(motions[0], weak, unseen, np.asarray(spectrum))
+    free = ways[:, spectrum < FREE] / length[:, None]
+    unseen = tuple(name(way, radius) for way in sorted_out(free, radius)) if free.size else ()
+    return Verdict(worst, tuple(weak), unseen, np.asarray(spectrum))
+
+
+def _sized(way: Array, covariance: Array, tolerance: Tolerance, radius: float) -> Motion:
+    """The motion along `way` (6,), a unit shift or a unit turn, at three of its standard deviations."""
+    turn = float(np.linalg.norm(way[3:]))
+    pure = turn * radius <= 0.2 * float(np.linalg.norm(way[:3]))
+    block, unit = (slice(0, 3), way[:3] / np.linalg.norm(way[:3])) if pure else (slice(3, 6), way[3:] / turn)
+    size = 3.0 * float(np.sqrt(unit @ covariance[block, block] @ unit))
+    allowed, shown = (tolerance.translation, "mm") if pure else (tolerance.rotation, "mrad")
+    motion = way * (size / (float(np.linalg.norm(way[:3])) if pure else turn))
+    words = f"{name(motion, radius)} is not determined: 3σ {_against(1e3 * size, 1e3 * allowed, shown)}"
+    return Motion(motion[:3], motion[3:], size / allowed, words)
 
 
 def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -> Motion:
@@ -102,34 +125,8 @@ def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -
     if size > 0.2 * angle * radius:
         parts.append(_against(1e3 * size, 1e3 * tolerance.translation, "mm"))
     state = "is not determined" if excess > 1.0 else "is known"
-    return Motion(shift, turn, excess, f"{_name(motion, radius)} {state}: 3σ {' and '.join(parts)}")
+    return Motion(shift, turn, excess, f"{name(motion, radius)} {state}: 3σ {' and '.join(parts)}")
 
 
 def _against(value: float, allowed: float, unit: str) -> str:
     return f"{value:.3g} {unit} {'>' if value > allowed else '≤'} {allowed:.3g} {unit}"
-
-
-def _name(motion: Array, radius: float) -> str:
-    """A motion (shift, turn) of the surface frame in words: a shift along an axis, or a turn about a line."""
-    shift, turn = motion[:3], motion[3:]
-    angle = float(np.linalg.norm(turn))
-    if angle * radius <= 0.2 * float(np.linalg.norm(shift)):
-        return f"translation along {_axis(shift)}"
-    axis = turn / angle
-    along = float(shift @ axis)
-    # The line that stays where it is: shift = −turn × point for the point nearest to the origin.
-    point = np.cross(axis, shift - along * axis) / angle
-    where = ""
-    if np.linalg.norm(point) > 0.05 * radius:
-        x, y, z = 1e3 * point
-        where = f" through ({x:.1f}, {y:.1f}, {z:.1f}) mm"
-    return f"rotation about {_axis(axis)}{where}"
-
-
-def _axis(vector: Array) -> str:
-    direction = vector / np.linalg.norm(vector)
-    largest = int(np.argmax(np.abs(direction)))
-    if abs(direction[largest]) > 0.97:
-        return f"the {'xyz'[largest]} axis of the surface frame"
-    x, y, z = direction * np.sign(direction[largest])
-    return f"({x:.2f}, {y:.2f}, {z:.2f}) in the surface frame"

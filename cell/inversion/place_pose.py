@@ -10,7 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.poses import difference
-from cell.inversion.nominal import Array, NominalSurface
+from cell.inversion.closest import Array
+from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, judge
 from cell.inversion.registration import Prior, Registration, Scan, register
 from cell.reconstruction.cloud import Cloud

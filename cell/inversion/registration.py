@@ -7,7 +7,6 @@ gated from coarse to fine. What the uncertainty means for the job is judged in `
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.poses import difference, perturbed
-from cell.inversion.nominal import Array, NominalSurface
+from cell.inversion.closest import Array
+from cell.inversion.nominal import NominalSurface
+from cell.inversion.search import across, candidates
 from cell.reconstruction.cloud import Cloud
 from drivers.errors import RefusedError
 
@@ -28,8 +29,9 @@ FINE_GATE = 0.0005
 """Correspondences farther than this are not used once the pose is nearly found, m."""
 CHI_GATE = 3.5
 """A point is accepted within so many standard deviations of the surface."""
-GOOD_SHARE = 0.75
-"""Share of the points over the surface that fit it, from which on no other start is tried."""
+MOST_CANDIDATES = 6
+SEARCH_GATE = 0.003
+"""How far points may lie from the surface at a pose that the search proposes, m."""
 LEAST_POINTS = 100
 
 
@@ -54,9 +56,11 @@ class Scan:
         return cls(cloud.points[lines, rows], spread, cloud.rail_spread[lines], lines)
 
     def thinned(self, most: int) -> Scan:
-        """Every k-th point, at most `most`."""
-        k = max(1, -(-len(self.points) // most))
-        return Scan(self.points[::k], self.stripe_spread[::k], self.rail_spread[::k], self.lines[::k])
+        """At most `most` points, drawn evenly: a regular stride would fall into step with the rows of the cloud."""
+        if len(self.points) <= most:
+            return self
+        k = np.sort(np.random.default_rng(0).permutation(len(self.points))[:most])
+        return Scan(self.points[k], self.stripe_spread[k], self.rail_spread[k], self.lines[k])
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,43 +125,63 @@ def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 |
 
     Raises `RefusedError` when too few points lie over the surface.
     """
-    thin = scan.thinned(COARSE_POINTS)
+    thin, sparse = scan.thinned(COARSE_POINTS), scan.thinned(OTHER_POINTS)
     begin = prior.base_from_surface if start is None else start
     first = _first_gate(nominal, prior, begin)
-    best, best_score = begin, -1.0
-    sparse = scan.thinned(OTHER_POINTS)
-    for count, attempt in enumerate(_starts(begin, nominal, first)):
-        pose = _coarse(attempt, sparse if count else thin, nominal, prior, first)
-        score, share = _fit(pose, thin, nominal)
-        if score > best_score:
-            best, best_score = pose, score
-        if share > GOOD_SHARE:
-            break
-    return _fine(best, scan, nominal, prior)
+    tried = [_tried(_coarse(begin, sparse, nominal, prior, first), thin, nominal)]
+    spread = _prior_spread(nominal, prior, begin)
+    level = _levelled(begin, sparse, nominal, first)
+    for attempt in candidates(level, sparse.points, nominal, *spread, MOST_CANDIDATES):
+        tried.append(_tried(_coarse(attempt, sparse, nominal, prior, SEARCH_GATE), thin, nominal))
+    tried.sort(key=lambda each: -each[1])
+    return _fine(tried[0][0], scan, nominal, prior)
+
+
+def _tried(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> tuple[pin.SE3, float]:
+    return pose, _fit(pose, scan, nominal)
+
+
+def _prior_spread(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> tuple[float, float]:
+    """How far across the surface (m) and about its normal (rad) it may lie from the start: three σ of the prior."""
+    sigma = np.sqrt(np.diag(prior.covariance))
+    off = difference(start, prior.base_from_surface)
+    shift = 3 * float(sigma[:3].max()) + float(np.linalg.norm(off[:3]))
+    return shift, 3 * float(sigma[3:].max()) + float(np.linalg.norm(off[3:]))
 
 
 def _first_gate(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> float:
-    """How far points may lie from the surface at the start: three standard deviations of the prior, at the rim."""
-    sigma = np.sqrt(np.diag(prior.covariance))
-    off = difference(start, prior.base_from_surface)
-    reach = 3 * sigma[:3].max() + 3 * nominal.radius * sigma[3:].max()
-    gap = float(np.linalg.norm(off[:3])) + nominal.radius * float(np.linalg.norm(off[3:]))
-    return float(np.clip(reach + gap, 0.002, 0.5 * nominal.radius))
+    """How far points may lie from the surface at the start."""
+    shift, turn = _prior_spread(nominal, prior, start)
+    return float(np.clip(shift + nominal.radius * turn, 0.002, 0.5 * nominal.radius))
 
 
-def _starts(begin: pin.SE3, nominal: NominalSurface, gate: float) -> Iterator[pin.SE3]:
-    """The start itself, then turns about the surface's mean normal and shifts across it, by what the gate allows."""
-    yield begin
-    normal = np.average(nominal.normals, axis=0, weights=nominal.areas)
-    normal /= np.linalg.norm(normal)
-    side = np.linalg.svd(normal[None])[2][1:]
-    turn, shift = 0.7 * gate / nominal.radius, 0.5 * gate
-    pivot = pin.SE3(np.eye(3), nominal.centre)
-    for angle in (0.0, 0.5 * turn, -0.5 * turn, turn, -turn):
-        for u, v in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-            if angle or u or v:
-                moved = pin.SE3(pin.exp3(angle * normal), shift * (u * side[0] + v * side[1]))
-                yield begin * pivot * moved * pivot.inverse()
+def _levelled(pose: pin.SE3, scan: Scan, nominal: NominalSurface, first: float) -> pin.SE3:
+    """The pose with its height and its two tilts, but not its place across the surface, brought to the scan."""
+    normal, sides = across(nominal)
+    gate = first
+    while gate > 0.001:
+        for _ in range(4):
+            rows = _correspondences(pose, scan, nominal, gate)
+            if len(rows.index) < LEAST_POINTS / 2:
+                break
+            turn = pose.rotation
+            about = turn @ nominal.centre
+            ways = np.zeros((6, 3))
+            ways[:3, 0] = turn @ normal
+            ways[3:, 1:] = (turn @ sides.T) / nominal.radius
+            # Tilts about the middle of the surface: they move its origin.
+            ways[:3, 1:] = -np.cross(ways[3:, 1:].T, about).T
+            jacobian = rows.jacobian @ ways
+            scale = gate / 2.5
+            weights = (scale**2 / (scale**2 + rows.heights**2)) ** 2
+            weighted = jacobian * weights[:, None]
+            hessian = weighted.T @ jacobian + 1e-6 * len(rows.index) * np.eye(3)
+            step = -np.linalg.solve(hessian, weighted.T @ rows.heights)
+            pose = perturbed(pose, ways @ step)
+            if np.abs(step).max() < 0.03 * gate:
+                break
+        gate *= 0.5
+    return pose
 
 
 def _coarse(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, first: float) -> pin.SE3:
@@ -177,13 +201,13 @@ def _coarse(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, fi
     return pose
 
 
-def _fit(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> tuple[float, float]:
-    """How well a pose explains the scan: share of all points that fit, and share of those over the surface."""
+def _fit(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> float:
+    """How well a pose explains the scan: share of all points that lie on the surface to within their noise."""
     rows = _correspondences(pose, scan, nominal, 0.003)
     if len(rows.index) < LEAST_POINTS / 2:
-        return 0.0, 0.0
+        return 0.0
     fitting = np.abs(rows.heights) < np.maximum(4 * _sigmas(scan, rows), 1e-4)
-    return float(fitting.sum() / len(scan.points)), float(fitting.mean())
+    return float(fitting.sum() / len(scan.points))
 
 
 def _fine(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:

@@ -93,8 +93,10 @@ class Cloud:
         lines, rows = np.nonzero(self.valid)
         if len(lines) <= most:
             return lines, rows
-        # An irrational stride over the line-by-line order hits every line and row about equally often.
-        keep = np.unique(np.floor(np.arange(most) * (len(lines) / most)).astype(np.intp))
+        # One point at random of each stretch: a regular stride falls into step with the rows and leaves most unused.
+        within = np.random.default_rng(0).random(most)
+        keep = np.floor((np.arange(most) + within) * (len(lines) / most)).astype(np.intp)
+        keep = np.unique(np.minimum(keep, len(lines) - 1))
         return lines[keep], rows[keep]
 
     def covariances(self, lines: Indices, rows: Indices) -> Array:
