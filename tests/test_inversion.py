@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,8 +12,14 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from cell.bench.inversion_parts import PARTS
+from cell.bench.inversion_parts import nominal as part_surface
+from cell.bench.inversion_refusals import judge_case
+from cell.bench.inversion_scenes import Setting, scan
 from cell.geometry.poses import difference, perturbed
 from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.inversion.motions import name as motion_name
+from cell.inversion.motions import sorted_out
 from cell.inversion.registration import Scan, register
 from cell.reconstruction import Cloud
 from drivers.errors import ConfigError, NotObservable, RefusedError
@@ -329,3 +336,80 @@ def test_a_scan_that_contradicts_the_board_is_refused() -> None:
 def test_tolerances_must_be_sensible() -> None:
     with pytest.raises(ValueError, match="tolerances"):
         Tolerance(0.0, 0.006)
+
+
+# --- the campaigns of `cell bench inversion`, small ---
+
+
+@pytest.mark.parametrize("part", list(PARTS))
+def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_percent_missing(part: str) -> None:
+    rng = np.random.default_rng(17)
+    for setting in (Setting(), Setting(clutter=0.2), Setting(clutter=0.1, missing=0.4)):
+        cloud = Scan.of(scan(PARTS[part], rng, setting), 4000)
+        found = register(cloud, part_surface(part), Prior(start_away(rng, 0.008, 20.0), LOOSE))
+        off, turn = PARTS[part].error(found.base_from_surface, TRUE)
+        assert off < 1e-4
+        assert turn < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("part", "motions"),
+    [
+        ("turned", ["rotation about the z axis of the surface frame is not determined"]),
+        (
+            "cap",
+            [
+                "rotation about the z axis of the surface frame is not determined",
+                r"rotation about the x axis of the surface frame through \(-?0.0, -?0.0, -32.0\) mm is not determined",
+                r"rotation about the y axis of the surface frame through \(-?0.0, -?0.0, -32.0\) mm is not determined",
+            ],
+        ),
+    ],
+)
+def test_the_motions_that_a_part_leaves_open_are_named_one_by_one(part: str, motions: list[str]) -> None:
+    with pytest.raises(NotObservable) as caught:
+        invert_pose(scan(PARTS[part], np.random.default_rng(4)), part_surface(part), Prior(TRUE, BOARD), JOB)
+    assert str(caught.value).count("is not determined: 3σ") == len(motions)
+    for motion in motions:
+        assert re.search(motion, str(caught.value)), motion
+
+
+def test_a_plane_slides_along_two_axes_and_turns_about_its_normal() -> None:
+    with pytest.raises(NotObservable) as caught:
+        inverted(flat, scanned(flat, 1, outliers=0.0), Prior(TRUE, BOARD))
+    for motion in ("translation along the x axis", "translation along the y axis", "rotation about the z axis"):
+        assert motion in str(caught.value)
+
+
+def test_a_screw_is_named_with_its_pitch() -> None:
+    words = motion_name(np.array([0.0, 0.0, 0.02, 0.0, 0.0, 1.0]), 0.02)
+    assert words == "rotation about the z axis of the surface frame with +20.0 mm/rad along it"
+
+
+def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
+    plain = np.zeros((6, 3))
+    plain[0, 0] = plain[1, 1] = plain[5, 2] = 1.0
+    mixed = plain @ np.array([[0.6, 0.3, 0.02], [-0.5, 0.8, 0.01], [20.0, 7.0, 30.0]])
+    found = sorted_out(mixed, 0.02)
+    expected = {0: 1.0, 1: 1.0, 5: 1.0}
+    assert len(found) == 3
+    for motion in found:
+        axis = int(np.argmax(np.abs(motion)))
+        assert abs(motion[axis]) == pytest.approx(expected.pop(axis), abs=1e-9)
+        assert np.abs(np.delete(motion, axis)).max() < 1e-9
+
+
+@pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "worn 0.3 to 2 mm on one side", "turned by 180°", "mirrored"])
+def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str) -> None:
+    ended = [judge_case(case, seed).ended for seed in range(3)]
+    assert "outside" not in ended
+    assert "refused" in ended
+
+
+def test_points_are_thinned_out_of_step_with_the_rows() -> None:
+    cloud = scanned(freeform, 1)
+    few = Scan.of(cloud, 400)
+    local = (few.points - TRUE.translation) @ TRUE.rotation
+    occupied = np.histogram(local[:, 1], bins=20, range=(-0.021, 0.019))[0]
+    assert occupied.min() >= 5
+    assert np.histogram(few.thinned(100).points[:, 1], bins=5)[0].min() >= 5

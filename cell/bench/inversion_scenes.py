@@ -5,12 +5,12 @@ missing data, at a known pose. The noise is drawn here, from the closed form of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from cell.bench.inversion_parts import PARTS, Part
+from cell.bench.inversion_parts import Part
 from cell.geometry.poses import perturbed
 from cell.inversion.closest import Array
 from cell.reconstruction import Cloud

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import typer
 
-from cell.cli import bench_acceptance, bench_reconstruction, calibrate, devices, export, paper, run, setup, sim
+from cell.cli import (
+    bench_acceptance,
+    bench_inversion,
+    bench_reconstruction,
+    calibrate,
+    devices,
+    export,
+    paper,
+    run,
+    setup,
+    sim,
+)
 
 app = typer.Typer(
     name="cell",
@@ -23,6 +34,10 @@ app.add_typer(sim.app, name="sim")
 bench = typer.Typer(
     help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
 )
-for register in (bench_acceptance.register, bench_reconstruction.register):
+for register in (
+    bench_acceptance.register,
+    bench_inversion.register,
+    bench_reconstruction.register,
+):
     register(bench)
 app.add_typer(bench, name="bench")

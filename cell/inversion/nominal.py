@@ -1,6 +1,7 @@
 """The nominal surface of a job: a triangle mesh, the closest point on it, and its own normals.
 
-Closest points are found on the triangles themselves, so that the distance is exact to the tessellation. Points whose foot lies on the rim say nothing about the surface.
+Closest points are found on the triangles themselves, so that the distance is exact to the tessellation. Points whose
+foot lies on the rim say nothing about the surface.
 """
 
 from __future__ import annotations

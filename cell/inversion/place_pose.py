@@ -14,6 +14,7 @@ from cell.inversion.closest import Array
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, judge
 from cell.inversion.registration import Prior, Registration, Scan, register
+from cell.inversion.search import across
 from cell.reconstruction.cloud import Cloud
 from drivers.errors import RefusedError
 
@@ -21,17 +22,22 @@ BOARD_DISAGREES = 40.0
 """Squared Mahalanobis distance between scan and board from which on they contradict each other (6 degrees of freedom:
 five in ten million by chance)."""
 
+SQUARE, SQUARE_POINTS = 0.004, 8
+"""Edge of the squares over which distances are taken together, m, and the points that one needs to count."""
+
 
 @dataclass(frozen=True)
 class Demands:
     """What a scan has to be like to be believed.
 
-    coverage: share of the surface that has points; share: points over the surface that fit it; rms: of those, m.
+    coverage: share of the surface that has points; share: points over the surface that fit it; rms: of those, m;
+    departed: share of the scanned area that may lie off the surface by more than `departure` allows.
     """
 
     coverage: float = 0.35
     share: float = 0.6
     rms: float = 0.0003
+    departed: float = 0.22
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +122,7 @@ def invert_pose(
     local = (scan.points[found.used] - pose.translation) @ pose.rotation
     coverage = nominal.coverage(local, 0.0025)
     _demand(found, coverage, demands)
+    _demand_whole(scan, pose, nominal, tolerance, demands)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     if calibration is not None:
         lines, rows = cloud.subsample(most_points)
@@ -176,6 +183,43 @@ def _demand(found: Registration, coverage: float, demands: Demands) -> None:
             f"the points lie {1e3 * found.rms:.3f} mm (rms) off the nominal surface, at most "
             f"{1e3 * demands.rms:.3f} mm is allowed. Is the surface deformed, or the calibration disturbed?"
         )
+
+
+def _demand_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance: Tolerance, demands: Demands) -> None:
+    """Refuse a surface of which too much lies off the nominal one: points that fit elsewhere do not excuse it.
+
+    A robust fit finds the part of a bent or broken surface that agrees with the model, and a pose with it. Medians over
+    squares bring to light what the noise of single points hides.
+    """
+    allowed = departure(tolerance, nominal)
+    medians = squares(scan, pose, nominal)
+    departed = float(np.mean(np.abs(medians) > allowed)) if len(medians) else 1.0
+    if departed > demands.departed:
+        raise RefusedError(
+            f"{100 * departed:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
+            f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
+            "or covered, is it another one, or is the calibration disturbed?"
+        )
+
+
+def departure(tolerance: Tolerance, nominal: NominalSurface) -> float:
+    """How far a square of the surface may lie off it, m: no farther than what the tolerances move it by."""
+    return min(tolerance.translation / 3, tolerance.rotation * nominal.radius)
+
+
+def squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
+    """Median distances (k,) in m from the surface over squares of `SQUARE` m that hold enough points."""
+    local = (scan.points - pose.translation) @ pose.rotation
+    index, feet = nominal.feet(local, 0.006)
+    index, heights = index[feet.inner], feet.heights[feet.inner]
+    if len(index) == 0:
+        return np.empty(0)
+    sides = across(nominal)[1]
+    cells = np.floor(local[index] @ sides.T / SQUARE).astype(np.intp)
+    _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(owner, kind="stable")
+    groups = np.split(heights[order], np.cumsum(count)[:-1])
+    return np.array([np.median(group) for group in groups if len(group) >= SQUARE_POINTS])
 
 
 def _disagreement(shared: Array, prior: Prior, correction: Array) -> float:
