@@ -7,6 +7,7 @@ correspondence distances; all run in one thread from the same start on the same 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,7 @@ def _target(nominal: NominalSurface) -> tuple[Array, Array]:
 
 def _gicp(kind: str) -> Callable[[NominalSurface], Method]:
     def build(nominal: NominalSurface) -> Method:
-        import small_gicp  # type: ignore[import-not-found,unused-ignore]
-
-        gicp: Any = small_gicp
+        gicp: Any = import_module("small_gicp")
         target = gicp.PointCloud(_target(nominal)[0])
         tree = gicp.KdTree(target)
         gicp.estimate_normals_covariances(target, tree)
@@ -73,9 +72,7 @@ def _gicp(kind: str) -> Callable[[NominalSurface], Method]:
 
 
 def _open3d(nominal: NominalSurface) -> Method:
-    import open3d  # type: ignore[import-not-found,unused-ignore]
-
-    o3d: Any = open3d
+    o3d: Any = import_module("open3d")
     icp = o3d.pipelines.registration
     points, normals = _target(nominal)
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from cell.geometry.poses import difference
@@ -48,7 +49,7 @@ class Part:
     round: bool = False
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def inside(self, x: Array, y: Array) -> Array:
+    def inside(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """True where (x, y) lies on the footprint."""
         if self.round:
             return np.asarray(np.hypot(x, y) < DISC)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -15,6 +16,7 @@ from cell.bench import inversion_refusals as refusals
 from cell.bench.inversion import Outcome, ready, table, task
 from cell.bench.inversion_parts import PARTS
 from cell.bench.inversion_scenes import RAIL_SIGMA, STRIPE_SIGMA
+from cell.inversion.closest import Array
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -26,10 +28,10 @@ def campaign(starts: int, cases: int, peers: bool, progress: Callable[[int, int]
     os.environ.update(dict.fromkeys(THREADS, "1"))
     outcomes: list[Outcome] = []
     judged: list[refusals.Judged] = []
-    scores: list[tuple[np.ndarray, float]] = []
+    scores: list[tuple[Array, float]] = []
     try:
         with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-            running: list[Future[object]] = []
+            running: list[Future[Any]] = []
             for part in PARTS:
                 running += [pool.submit(task, part, seed, peers) for seed in range(starts)]
             for case in refusals.CASES:
@@ -74,7 +76,7 @@ def _case_row(case: str, judged: list[refusals.Judged]) -> dict[str, object]:
     }
 
 
-def _coverage(scores: list[tuple[np.ndarray, float]]) -> dict[str, object]:
+def _coverage(scores: list[tuple[Array, float]]) -> dict[str, object]:
     z = np.array([score for score, _ in scores])
     held = np.mean([distance < chi2.ppf(0.95, 6) for _, distance in scores])
     return {

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.bench.inversion_parts import Part
 from cell.geometry.poses import perturbed
 from cell.inversion.closest import Array
 from cell.reconstruction import Cloud
+
+Mask = NDArray[np.bool_]
 
 STRIPE_SIGMA, RAIL_SIGMA = 40e-6, 8e-6
 """Standard deviations of the drawn noise, m: of a point by its stripe centre, and of a line by the rail."""
@@ -78,7 +81,7 @@ def scan(
     )
 
 
-def _cluttered(x: Array, y: Array, z: Array, inside: Array, share: float, rng: np.random.Generator) -> Array:
+def _cluttered(x: Array, y: Array, z: Array, inside: Mask, share: float, rng: np.random.Generator) -> Array:
     """Foreign objects on the part, chips and washers 0.15 to 6 mm high, until they hide `share` of its points."""
     places = np.argwhere(inside)
     hidden = np.zeros_like(inside)
@@ -95,7 +98,7 @@ def _cluttered(x: Array, y: Array, z: Array, inside: Array, share: float, rng: n
     return z
 
 
-def _hidden(x: Array, y: Array, inside: Array, share: float, rng: np.random.Generator) -> Array:
+def _hidden(x: Array, y: Array, inside: Mask, share: float, rng: np.random.Generator) -> Mask:
     """Where nothing was seen: one side of the part, then patches, until `share` of its points are missing."""
     direction = rng.uniform(0, 2 * np.pi)
     along = np.cos(direction) * x / np.ptp(x) + np.sin(direction) * y / np.ptp(y)
