@@ -42,8 +42,8 @@ def candidates(
     shift, turn = min(shift, MOST_SHIFT), min(turn, MOST_TURN)
     n_shift = int(np.ceil(shift / STEP))
     n_turn = int(np.ceil(turn * nominal.radius / (1.5 * STEP)))
-    steps = STEP * np.arange(-n_shift, n_shift + 1)
-    angles = (turn / max(1, n_turn)) * np.arange(-n_turn, n_turn + 1)
+    steps: Array = STEP * np.arange(-n_shift, n_shift + 1, dtype=np.float64)
+    angles: Array = (turn / max(1, n_turn)) * np.arange(-n_turn, n_turn + 1, dtype=np.float64)
     local = (points - level.translation) @ level.rotation - nominal.centre
     turns = np.stack([pin.exp3(-angle * normal) for angle in angles])
     grid = nominal.grid
