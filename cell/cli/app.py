@@ -8,6 +8,7 @@ from cell.cli import (
     bench_acceptance,
     bench_inversion,
     bench_reconstruction,
+    bench_stripe,
     calibrate,
     devices,
     export,
@@ -38,6 +39,7 @@ for register in (
     bench_acceptance.register,
     bench_inversion.register,
     bench_reconstruction.register,
+    bench_stripe.register,
 ):
     register(bench)
 app.add_typer(bench, name="bench")

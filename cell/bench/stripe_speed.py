@@ -1,0 +1,123 @@
+"""How fast stripes are extracted, on pictures that stream by, beside what others take in the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.bench.stripe_truth import Cell, draw
+from cell.vision.stripe import Method, StripeSettings, extract
+from cell.vision.stripe_methods import gaussian_derivatives
+
+SHAPE = (1024, 1280)
+FRAMES = 24
+CONDITION = Cell(2.0, 150.0)
+SPECKLED = Cell(2.0, 120.0, 0.2)
+
+Image = NDArray[np.uint8]
+
+
+def compare(progress: Callable[[float, str], None], repeats: int = 5) -> dict[str, Any]:
+    """Milliseconds per frame and points per second of ours and of the others, best of `repeats` rounds.
+
+    Each round runs through `FRAMES` different pictures, together larger than the processor's second-level cache; the
+    others, which take longer, through fewer. A point is one centre in one image row or column.
+    """
+    plain = [draw(CONDITION, SHAPE, seed)[0] for seed in range(FRAMES)]
+    speckled = [draw(SPECKLED, SHAPE, seed)[0] for seed in range(FRAMES)]
+    turned = [np.ascontiguousarray(image.T) for image in plain]
+    known = StripeSettings(speckle_contrast=0.0)
+    candidates: list[tuple[str, Callable[[Image], Any], list[Image], int]] = [
+        ("reading each pixel once", lambda image: np.max(image), plain, 1),
+        ("ours, one core", extract, plain, 1),
+        ("ours, one core, speckle declared absent", lambda i: extract(i, settings=known), plain, 1),
+        ("ours, one core, speckle contrast 0.2", extract, speckled, 1),
+        ("ours, one core, along columns", lambda i: extract(i, axis="columns"), turned, 1),
+        ("ours, two cores", extract, plain, 2),
+        ("ours, two cores, speckle contrast 0.2", extract, speckled, 2),
+        ("ours, numpy engine", lambda i: extract(i, engine="numpy"), plain[:3], 1),
+        ("numpy centre of gravity", centre_of_gravity, plain[:8], 1),
+        ("OpenCV separable Steger", opencv_steger, plain[:3], 1),
+        ("our Steger, with peaks and sigmas", lambda i: extract(i, method=Method.STEGER), plain[:3], 1),
+    ]
+    ridge = ridge_detector()
+    if ridge is not None:
+        candidates.append(("ridge-detector", ridge, plain[:1], 1))
+    rows = []
+    cv2_threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        for k, (name, run, images, threads) in enumerate(candidates):
+            progress(k / len(candidates), name)
+            slow = len(images) < 4
+            seconds = _best(run, images, threads, 1 if slow else repeats)
+            lines = images[0].shape[1] if "columns" in name else images[0].shape[0]
+            rows.append({"name": name, "ms_per_frame": 1e3 * seconds, "points_per_s": lines / seconds})
+    finally:
+        cv2.setNumThreads(cv2_threads)
+    if ridge is None:
+        rows.append({"name": "ridge-detector", "ms_per_frame": None, "points_per_s": None})
+    own = rows[1]["ms_per_frame"]
+    for row in rows:
+        row["times_ours"] = None if row["ms_per_frame"] is None else row["ms_per_frame"] / own
+    progress(1.0, "speed done")
+    return {"shape": list(SHAPE), "frames": FRAMES, "rows": rows}
+
+
+def _best(run: Callable[[Image], Any], images: list[Image], threads: int, repeats: int) -> float:
+    """Seconds a frame, best of some rounds after one to warm up."""
+    run(images[0])
+    best = np.inf
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in range(repeats):
+            begin = time.perf_counter()
+            if threads == 1:
+                for image in images:
+                    run(image)
+            else:
+                shares = [images[k::threads] for k in range(threads)]
+                list(pool.map(lambda share: [run(image) for image in share] and None, shares))
+            best = min(best, (time.perf_counter() - begin) / len(images))
+    return float(best)
+
+
+def centre_of_gravity(image: Image) -> Any:
+    """Centres (h,) as most write it: brightest pixel of each row, first moment over ±8 px above the window's least."""
+    place = image.argmax(axis=1)
+    column = np.clip(place[:, None] + np.arange(-8, 9), 0, image.shape[1] - 1)
+    value = np.take_along_axis(image, column, axis=1).astype(np.float32)
+    value -= value.min(axis=1, keepdims=True)
+    return (value * column).sum(axis=1) / np.maximum(value.sum(axis=1), 1e-6)
+
+
+def opencv_steger(image: Image) -> Any:
+    """Ridge points (m, 2) after Steger with OpenCV's separable filters over the whole picture."""
+    gx, gy, gxx, gxy, gyy = gaussian_derivatives(image.astype(np.float32), CONDITION.width)
+    half_trace, half_difference = 0.5 * (gxx + gyy), 0.5 * (gxx - gyy)
+    eigenvalue = half_trace - np.sqrt(half_difference**2 + gxy**2)
+    rows, columns = np.nonzero(eigenvalue < -2.0)
+    a, b, e = gxx[rows, columns], gxy[rows, columns], eigenvalue[rows, columns]
+    nx, ny = b, e - a
+    swap = np.abs(nx) + np.abs(ny) < 1e-6
+    nx, ny = np.where(swap, 1.0, nx), np.where(swap, 0.0, ny)
+    length = np.hypot(nx, ny)
+    nx, ny = nx / length, ny / length
+    shift = -(nx * gx[rows, columns] + ny * gy[rows, columns]) / e
+    inside = (np.abs(shift * nx) <= 0.5) & (np.abs(shift * ny) <= 0.5)
+    return np.column_stack([columns + shift * nx, rows + shift * ny])[inside]
+
+
+def ridge_detector() -> Callable[[Image], Any] | None:
+    """The peer from PyPI, set to this stripe's width; None when it is not installed."""
+    try:
+        from ridge_detector import RidgeDetector
+    except ImportError:
+        return None
+    detector = RidgeDetector(line_widths=[4], low_contrast=20, high_contrast=80, min_len=20, max_len=0)
+    return lambda image: detector.detect_lines(image)

@@ -1,0 +1,105 @@
+"""Promises of the stripe's centres beside the Cramér–Rao bound, of their stated deviations, and of both engines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.bench.stripe_accuracy import measure
+from cell.bench.stripe_truth import Cell, bound, draw
+from cell.vision.pictures import PictureRefused
+from cell.vision.stripe import Method, StripeSettings, extract, extract_all
+
+LIKELIHOOD = (Method.MAXIMUM_LIKELIHOOD,)
+SMALL = (256, 384)
+
+
+@pytest.mark.parametrize(
+    ("cell", "published"),
+    [(Cell(1.2, 40), 0.0304), (Cell(2, 100), 0.0199), (Cell(2, 200), 0.0126), (Cell(3, 200), 0.0156)],
+)
+def test_the_bound_is_the_published_one(cell, published):
+    assert bound(cell, (480, 640)) == pytest.approx(published, rel=0.04)
+
+
+@pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 100), Cell(3, 220), Cell(2, 100, slope=0.15)])
+def test_without_speckle_the_bound_is_attained_and_the_deviation_true(cell):
+    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    # 3072 rows: the RMS itself is known to 1.3 %, the mean error to 2 % of the bound.
+    assert row["efficiency"] > 0.95 * (1 - 0.026)
+    assert abs(row["bias_px"]) < 0.005
+    assert row["stated_over_true"] == pytest.approx(1.0, abs=0.1)
+    assert row["found"] == 1.0
+
+
+@pytest.mark.parametrize("cell", [Cell(2, 100, 0.2), Cell(3, 60, 0.5)])
+def test_the_stated_deviation_is_not_too_small_under_speckle(cell):
+    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    assert row["stated_over_true"] > 0.95
+    assert row["found"] > 0.98
+    if cell.contrast < 0.3:
+        assert row["efficiency"] > 0.85
+
+
+@pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 150, 0.2), Cell(3, 600)])
+def test_both_engines_agree(cell):
+    image, _ = draw(cell, SMALL, 5)
+    compiled, plain = extract(image, engine="compiled"), extract(image, engine="numpy")
+    np.testing.assert_array_equal(compiled.valid, plain.valid)
+    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
+    assert np.nanmax(np.abs(compiled.sigma / plain.sigma - 1)) < 1e-2
+
+
+def test_both_engines_agree_with_a_dark_frame():
+    image, _ = draw(Cell(2, 100), SMALL, 6)
+    dark, _ = draw(Cell(2, 0.001), SMALL, 7)
+    compiled, plain = (extract(image, dark, engine=engine) for engine in ("compiled", "numpy"))
+    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
+
+
+def test_a_dark_frame_makes_the_deviation_larger_and_true():
+    settings = StripeSettings(speckle_contrast=0.0)
+    z = []
+    for seed in range(6):
+        image, centres = draw(Cell(2, 40, ambient=60), SMALL, seed)
+        dark, _ = draw(Cell(2, 0.001, ambient=60), SMALL, 100 + seed)
+        profile = extract(image, dark, settings=settings)
+        assert np.nanmedian(profile.sigma) > 1.1 * np.nanmedian(extract(image, settings=settings).sigma)
+        z.append((profile.centres - centres) / profile.sigma)
+    assert np.sqrt(np.nanmean(np.square(z))) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_every_method_finds_the_stripe_with_a_deviation(method):
+    image, centres = draw(Cell(2, 150), SMALL, 1)
+    profile = extract(image, method=method)
+    assert profile.valid.mean() > 0.99
+    error = profile.centres - centres
+    assert np.sqrt(np.nanmean(error**2)) < (0.4 if method is Method.EXTREME_VALUE else 0.12)
+    assert np.nanmin(profile.sigma) > 0
+
+
+def test_where_a_reflection_is_brighter_the_neighbours_say_which_is_the_stripe():
+    image, centres = draw(Cell(2, 80), SMALL, 2)
+    other, _ = draw(Cell(2, 160), SMALL, 3)
+    for row in range(20, 240, 12):
+        image[row, 40:90] = np.roll(other[row], 65 - int(other[row].argmax()))[40:90]
+    profile = extract(image)
+    assert np.nanmax(np.abs(profile.centres - centres)) < 0.5
+    assert profile.double[20:240:12].all()
+
+
+def test_a_blinded_picture_is_refused():
+    with pytest.raises(PictureRefused, match="saturated"):
+        extract(np.full((480, 640), 255, np.uint8))
+
+
+def test_an_unknown_method_is_named():
+    with pytest.raises(ValueError, match="parabola"):
+        extract(np.zeros((64, 64), np.uint8), method="parabola")
+
+
+def test_a_stream_gives_the_same_profiles_in_order():
+    images = [draw(Cell(2, 100), SMALL, seed)[0] for seed in range(5)]
+    for profile, image in zip(extract_all(images), images, strict=True):
+        np.testing.assert_array_equal(profile.centres, extract(image).centres)
