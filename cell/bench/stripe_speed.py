@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -116,8 +117,8 @@ def opencv_steger(image: Image) -> Any:
 def ridge_detector() -> Callable[[Image], Any] | None:
     """The peer from PyPI, set to this stripe's width; None when it is not installed."""
     try:
-        from ridge_detector import RidgeDetector
+        peer = importlib.import_module("ridge_detector")
     except ImportError:
         return None
-    detector = RidgeDetector(line_widths=[4], low_contrast=20, high_contrast=80, min_len=20, max_len=0)
+    detector = peer.RidgeDetector(line_widths=[4], low_contrast=20, high_contrast=80, min_len=20, max_len=0)
     return lambda image: detector.detect_lines(image)

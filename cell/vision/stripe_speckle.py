@@ -7,9 +7,11 @@ weights and correlation in the deviation, a stated σ is 1.4 to 2.2 times too sm
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.vision.compiled import compiled
 from cell.vision.stripe_fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
@@ -56,13 +58,13 @@ def residual_moments(
     return out
 
 
-@compiled
+@lru_cache(maxsize=256)
 def expected_moments(
-    width: float, amplitude: float, level: float, noise2: float, gain: float, contrast2: float, grains: Any
-) -> Any:
+    width: float, amplitude: float, level: float, noise2: float, gain: float, contrast2: float
+) -> NDArray[np.float64]:
     """What `residual_moments` gives on average, (1 + grains, 3): of photon noise, then of speckle of contrast 1."""
     half = int(4.0 * width + 3.0)
-    out = np.zeros((1 + len(grains), 3))
+    out = np.zeros((1 + len(GRAINS), 3))
     # Of a narrow stripe it matters how many pixels the core holds.
     phases = 5 if width < 2.0 else 2
     for phase in range(phases):
@@ -70,36 +72,24 @@ def expected_moments(
         z = x / width
         stripe = amplitude * np.exp(-0.5 * z * z)
         photon = noise2 + gain * (stripe + max(level, 0.0))
-        weight = 1.0 / (photon + contrast2 * stripe * stripe)
-        root = np.sqrt(weight)
-        jacobian = np.empty((len(x), 5))
-        jacobian[:, 0] = root * stripe * z / width
-        jacobian[:, 1] = root * stripe / amplitude
-        jacobian[:, 2] = root * stripe * z * z
-        jacobian[:, 3] = root
-        jacobian[:, 4] = root * x / 8.0
+        root = 1.0 / np.sqrt(photon + contrast2 * stripe * stripe)
+        basis = (stripe * z / width, stripe / amplitude, stripe * z * z, np.ones_like(x), x / 8.0)
+        jacobian = root[:, None] * np.stack(basis, axis=1)
         normal = jacobian.T @ jacobian
-        normal[2, 2] += 1.0 / (WIDTH_PRIOR * WIDTH_PRIOR)
-        hat = jacobian @ np.linalg.solve(normal, np.ascontiguousarray(jacobian.T))
-        core = np.flatnonzero(np.abs(z) <= CORE)
-        left = -hat[core[0] : core[-1] + 1]
-        for k in range(len(core)):
-            left[k, core[k]] += 1.0
-        rows = left * root
-        distance = x.reshape(-1, 1) - x
-        for g in range(1 + len(grains)):
-            if g == 0:
-                covariance = (rows * photon) @ np.ascontiguousarray(rows.T)
-            else:
-                pulled = rows * stripe
-                rho = np.exp(-distance * distance / (4.0 * grains[g - 1] * grains[g - 1]))
-                covariance = pulled @ rho @ np.ascontiguousarray(pulled.T)
-            for lag in range(3):
-                total = 0.0
-                for k in range(len(core) - lag):
-                    total += covariance[k, k + lag]
-                out[g, lag] += total / phases
+        normal[2, 2] += WIDTH_PRIOR**-2
+        left = np.eye(len(x)) - jacobian @ np.linalg.solve(normal, jacobian.T)
+        rows = left[np.abs(z) <= CORE] * root
+        pulled = rows * stripe
+        distance2 = (x[:, None] - x) ** 2
+        covariances = [(rows * photon) @ rows.T]
+        covariances += [pulled @ np.exp(-distance2 / (4 * grain**2)) @ pulled.T for grain in GRAINS]
+        out += np.array([[np.trace(c, offset=lag) for lag in range(3)] for c in covariances]) / phases
     return out
+
+
+def _rounded(value: float, step: float) -> float:
+    """To a geometric grid, so that a stream of like pictures asks for the same moments."""
+    return float(np.exp(step * np.round(np.log(max(value, 0.1)) / step)))
 
 
 def measure_speckle(
@@ -128,7 +118,8 @@ def measure_speckle(
     width, amplitude, level = float(middle[WIDTH]), float(middle[AMPLITUDE]), float(middle[LEVEL])
     if with_dark:
         level += float(np.median(dark[lines]))
-    expected = expected_moments(width, amplitude, level, noise2, gain, contrast**2, GRAINS)
+    typical = _rounded(width, 0.03), _rounded(amplitude, 0.04), _rounded(level, 0.1), _rounded(noise2, 0.1)
+    expected = expected_moments(*typical, gain, contrast**2)
     excess = seen - expected[0]
     peak_noise = noise2 + gain * (amplitude + max(level, 0.0))
     ratios = (expected[1:, 1] + expected[1:, 2]) / expected[1:, 0]
