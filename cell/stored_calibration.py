@@ -17,10 +17,10 @@ from cell.calibration import (
     ScanObservation,
     TargetCalibration,
     TargetObservation,
-    calibrate_scan,
-    calibrate_target,
 )
-from cell.calibration.results import Quality, sigmas
+from cell.calibration.archive import SUFFIX, Observations, write_archive
+from cell.calibration.joint import Joint, solve_joint, solve_staged
+from cell.calibration.results import Quality, adjust_target, sigmas
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.runs import write_json
@@ -51,19 +51,7 @@ class CellCalibration:
         config: CellConfig,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        priors = Priors(
-            arm_translation=config.arm.repeatability,
-            arm_rotation=config.arm.repeatability_angle,
-            rail=config.calibration.rail_sigma,
-        )
-        along = np.array([1.0, 0.0, 0.0])
-        return cls(
-            calibrate_scan(scan, nominal_camera(config.scan_camera), along, priors),
-            calibrate_target(target, nominal_camera(config.target_camera), priors),
-            identities,
-            config.calibration_hash(),
-            time.time(),
-        )
+        return solve_observations(gathered(scan, target, identities, config)).calibration
 
     @property
     def date(self) -> str:
@@ -126,6 +114,37 @@ class CellCalibration:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A calibration and the two adjustments that it came from, with their residuals."""
+
+    calibration: CellCalibration
+    scan: Joint
+    target: Joint
+
+
+def gathered(
+    scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str], config: CellConfig
+) -> Observations:
+    """The observations with all else that their solution depends on, as of now."""
+    priors = Priors(
+        arm_translation=config.arm.repeatability,
+        arm_rotation=config.arm.repeatability_angle,
+        rail=config.calibration.rail_sigma,
+    )
+    cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
+    return Observations(scan, target, *cameras, priors, identities, config.calibration_hash(), time.time())
+
+
+def solve_observations(observations: Observations) -> Solved:
+    """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
+    o = observations
+    scan = solve_joint(o.scan, solve_staged(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0])), o.priors)
+    target = adjust_target(o.target, o.target_camera, o.priors)
+    found = ScanCalibration.of(scan), TargetCalibration.of(target)
+    return Solved(CellCalibration(*found, o.identities, o.configuration, o.made), scan, target)
+
+
 def nominal_camera(config: CameraConfig) -> CameraModel:
     """The camera as the configuration draws it: no distortion, principal point in the middle."""
     focal = config.focal_length / config.pixel
@@ -138,6 +157,17 @@ def save_calibration(calibration: CellCalibration, path: Path) -> None:
     """Write it; a reader finds the old file or the new one, never half of one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, calibration.as_dict())
+
+
+def archive_of(folder: Path, calibration: CellCalibration) -> Path:
+    """Where the observations of a stored calibration are kept."""
+    return folder / f"{calibration.name}{SUFFIX}"
+
+
+def save_with_observations(calibration: CellCalibration, observations: Observations, folder: Path) -> None:
+    """Write the calibration and, beside it, what it can be solved from again."""
+    write_archive(archive_of(folder, calibration), observations)
+    save_calibration(calibration, folder / f"{calibration.name}.json")
 
 
 def read_calibration(path: Path) -> CellCalibration:

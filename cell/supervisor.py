@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from cell.assembly import Devices, connect
+from cell.calibration.archive import Observations
 from cell.config import CellConfig, load_config
 from cell.guard import guarded
 from cell.injection import Injection, Injector
@@ -25,7 +26,13 @@ from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
-from cell.stored_calibration import CellCalibration, find_calibration, save_calibration
+from cell.stored_calibration import (
+    CellCalibration,
+    find_calibration,
+    gathered,
+    save_with_observations,
+    solve_observations,
+)
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import Event
 from statemachine.watch import SignalWatch
@@ -213,7 +220,7 @@ class Cell:
         }
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
-        """Move through the calibration poses over the deck boards, solve, and store the result.
+        """Move through the calibration poses over the deck boards, solve, and store the result and what it came from.
 
         `job` names the part that may be in the claw, so that it does not touch anything on the way.
         """
@@ -223,16 +230,17 @@ class Cell:
             if observer is not None:
                 observer(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
 
-        def work(check: Callable[[], None]) -> CellCalibration:
+        def work(check: Callable[[], None]) -> tuple[Observations, CellCalibration]:
             mover = self.mover(part_of)
             self.devices.vehicle.brake()
             scan = collect_scan(self.config, self.devices, mover, check, lambda f, t: tell(0.65 * f, t))
             target = collect_target(self.config, self.devices, mover, check, lambda f, t: tell(0.65 + 0.3 * f, t))
             tell(0.96, "solving")
-            return CellCalibration.solve(scan, target, self._identities(), self.config)
+            observations = gathered(scan, target, self._identities(), self.config)
+            return observations, solve_observations(observations).calibration
 
-        calibration = self.guarded("calibration", work)
-        save_calibration(calibration, self.calibrations_folder / f"{calibration.name}.json")
+        observations, calibration = self.guarded("calibration", work)
+        save_with_observations(calibration, observations, self.calibrations_folder)
         tell(1.0, "stored")
         return calibration
 

@@ -6,6 +6,7 @@ noise is not known get it from their own residuals (variance components). Theory
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,12 +26,18 @@ from cell.calibration.blocks import (
     dots_block,
     stripe_block,
 )
-from cell.calibration.normal import Normal
+from cell.calibration.normal import Block, Inverse, Normal
 from cell.geometry.camera import Array
 from cell.geometry.poses import difference
 
 DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01)
 HUBER = 2.5
+# Mean robust cost of a Gaussian residual, per component, for the dots' two components together and the stripe's one.
+_OVER, _DENSITY = math.erfc(HUBER / math.sqrt(2)), math.exp(-(HUBER**2) / 2)
+HUBER_COST = {
+    "dots": 1 - _DENSITY + HUBER * math.sqrt(math.pi / 2) * _OVER,
+    "stripe": 1 - _OVER + HUBER * _DENSITY * math.sqrt(2 / math.pi) - HUBER**2 * _OVER,
+}
 STEPS = 25
 VARIANCE_ROUNDS = 4
 # Measurements without any noise would leave the priors no digits.
@@ -93,10 +100,12 @@ class Adjustment:
             if turn < variance_rounds:
                 self._update_noise(normal)
                 normal = self._normal(state)
+        inverse = normal.inverse()
+        expected = sum(expected_cost(name, block, inverse) for name, block in normal.groups.items())
         return Adjusted(
             state,
-            normal.inverse().shared,
-            normal.total / max(1, normal.measured - normal.parameters),
+            inverse.shared,
+            normal.total / expected,
             *self.residual_rms(state),
             self.priors,
             iterations,
@@ -168,8 +177,7 @@ class Adjustment:
             block = normal.groups[name]
             if block.count == 0:
                 continue
-            redundancy = max(block.count - inverse.taken(block), 0.02 * block.count)
-            factors[name] = float(np.clip(np.sqrt(block.squares / redundancy), 0.1, 10.0))
+            factors[name] = float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
         p = self.priors
         self.priors = replace(
             p,
@@ -190,6 +198,12 @@ def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = 
     free[RAIL] = rail
     free[HAND] = True
     return free
+
+
+def expected_cost(name: str, block: Block, inverse: Inverse) -> float:
+    """What a group's robust cost is on average, when its noise is Gaussian and as large as assumed."""
+    redundancy = max(block.count - inverse.taken(block), 0.02 * block.count)
+    return redundancy * HUBER_COST.get(name, 1.0)
 
 
 def _huber(size: Array) -> tuple[Array, float]:

@@ -13,10 +13,11 @@ from cell.calibration.adjustment import Adjusted, Adjustment, Priors, shared_mas
 from cell.calibration.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, stripe_block
 from cell.calibration.hand_eye import HandEye, solve_hand_eye
 from cell.calibration.observations import ScanObservation
-from cell.calibration.starts import PlaneStart, cross_ratio_check, plane_from_board, stripe_pixels, zhang
+from cell.calibration.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
+from cell.calibration.starts import PlaneStart, plane_from_board, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts
-from cell.vision.board import board_pose
+from drivers.errors import RefusedError
 
 # Neighbouring rows share their speckle: this many points of a stripe are enough, and independent.
 STRIPE_POINTS = 120
@@ -25,14 +26,17 @@ FOLDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Staged:
-    """The closed-form solution: camera and its RMS per view, hand-eye, light plane (None without a stripe)."""
+    """The closed-form solution: camera and its RMS per view, hand-eye, light plane (None without a stripe).
+
+    `plane` holds the stripe's usable rows; its plane is that of the paper's steps (`paper`) where they give one.
+    """
 
     camera: CameraModel
     view_rms: Array
     camera_from_board: list[pin.SE3]
     hand_eye: HandEye
     plane: PlaneStart | None
-    cross_ratio_m: float
+    paper: PaperPlane | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +59,12 @@ def solve_staged(
 ) -> Staged:
     """Camera, then hand-eye, then light plane, each from the result before. All observations need a view."""
     views = [o.view for o in observations if o.view is not None]
-    camera, view_rms = zhang(views, nominal, lens)
-    poses = [board_pose(view, camera).camera_from_board for view in views]
+    camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
     with_view = [o for o in observations if o.view is not None]
     hand_eye = solve_hand_eye(
         [o.base_from_flange for o in with_view], poses, [o.rail_position for o in with_view], rail_direction
     )
-    plane, check = None, float("nan")
+    plane, paper = None, None
     if stripe and any(o.profile is not None for o in observations):
         everywhere = [
             (
@@ -74,14 +77,28 @@ def solve_staged(
             everywhere[k] = pose
         stand_in = [o.view if o.view is not None else views[0] for o in observations]
         plane = plane_from_board(camera, everywhere, stand_in, [o.profile for o in observations])
-        checks = [
-            cross_ratio_check(camera, pose, o.view, o.profile, rows)
-            for o, pose, rows in zip(observations, everywhere, plane.rows, strict=True)
-            if o.view is not None and o.profile is not None and len(rows)
-        ]
-        finite = [c for c in checks if np.isfinite(c)]
-        check = float(np.sqrt(np.mean(np.square(finite)))) if finite else float("nan")
-    return Staged(camera, view_rms, poses, hand_eye, plane, check)
+        paper = paper_plane_of(camera, everywhere, observations, plane.rows)
+        if paper is not None:
+            plane = replace(plane, plane=paper.plane, rms=paper.rms)
+    return Staged(camera, view_rms, poses, hand_eye, plane, paper)
+
+
+def paper_plane_of(
+    camera: CameraModel,
+    camera_from_board: Sequence[pin.SE3],
+    observations: Sequence[ScanObservation],
+    rows: Sequence[NDArray[np.intp]],
+) -> PaperPlane | None:
+    """The paper's plane over the observations that show dots and stripe; None when it crosses too few rows."""
+    used = [
+        (pose, o.view, stripe_pixels(o.profile, r))
+        for o, pose, r in zip(observations, camera_from_board, rows, strict=True)
+        if o.view is not None and o.profile is not None and len(r)
+    ]
+    try:
+        return paper_plane(camera, [p for p, _, _ in used], [v for _, v, _ in used], [s for _, _, s in used])
+    except RefusedError:
+        return None
 
 
 def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:

@@ -261,7 +261,7 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
         "staged": {
             **_plane_dict(chain.staged.plane.plane),
             "rms_mm": 1e3 * chain.staged.plane.rms,
-            "cross_ratio_check_mm": _mm(chain.staged.cross_ratio_m),
+            "cross_ratio_check_mm": None if chain.staged.paper is None else _mm(chain.staged.paper.cross_ratio_m),
         },
     }
     names = [f.path.name for f in frames]

@@ -70,6 +70,20 @@ class ScanCalibration:
     covariance: Array
     quality: Quality
 
+    @classmethod
+    def of(cls, joint: Joint) -> ScanCalibration:
+        """What a joint adjustment with a stripe found."""
+        state = joint.adjusted.state
+        assert state.plane is not None
+        return cls(
+            state.camera,
+            state.plane,
+            state.rail_direction,
+            state.flange_from_camera,
+            joint.adjusted.covariance[:KEPT, :KEPT],
+            Quality.of(joint),
+        )
+
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
         """The camera's pose in the flange frame at a rail position in m."""
         return self.flange_from_camera * from_parts(rail_position * self.rail_direction)
@@ -131,6 +145,12 @@ class TargetCalibration:
     hand_eye_covariance: Array
     quality: Quality
 
+    @classmethod
+    def of(cls, joint: Joint) -> TargetCalibration:
+        """What a joint adjustment found."""
+        state = joint.adjusted.state
+        return cls(state.camera, state.flange_from_camera, effective_hand_eye_covariance(joint), Quality.of(joint))
+
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
         return {
@@ -155,29 +175,20 @@ def calibrate_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> ScanCalibration:
     """Closed form, then the joint adjustment. Raises `RefusedError` when the observations do not determine it."""
-    joint = solve_joint(observations, solve_staged(observations, nominal, rail_direction), priors)
-    state = joint.adjusted.state
-    assert state.plane is not None
-    return ScanCalibration(
-        state.camera,
-        state.plane,
-        state.rail_direction,
-        state.flange_from_camera,
-        joint.adjusted.covariance[:KEPT, :KEPT],
-        Quality.of(joint),
-    )
+    return ScanCalibration.of(solve_joint(observations, solve_staged(observations, nominal, rail_direction), priors))
 
 
 def calibrate_target(
     observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors
 ) -> TargetCalibration:
     """The same for a camera without laser and rail."""
+    return TargetCalibration.of(adjust_target(observations, nominal, priors))
+
+
+def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
+    """The joint adjustment of a camera without laser and rail."""
     same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
-    joint = solve_joint(same, solve_staged(same, nominal, stripe=False), priors)
-    state = joint.adjusted.state
-    return TargetCalibration(
-        state.camera, state.flange_from_camera, effective_hand_eye_covariance(joint), Quality.of(joint)
-    )
+    return solve_joint(same, solve_staged(same, nominal, stripe=False), priors)
 
 
 def sigmas(covariance: Array) -> dict[str, float]:

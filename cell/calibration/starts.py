@@ -1,7 +1,7 @@
-"""Closed-form starts of the joint adjustment: Zhang's camera and the paper's light plane, with its cross-ratio check.
+"""Closed-form starts: Zhang's camera, and a light plane through all clean stripe points on the boards.
 
-The paper's six steps (section 4.1) give the light plane by themselves; the joint adjustment starts from them and keeps
-them as a cross-check.
+The stripe points that are chosen here are those that the joint adjustment uses. The paper's own way to the plane is in
+`paper_steps`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def zhang(
 
 @dataclass(frozen=True, eq=False)
 class PlaneStart:
-    """The light plane of the paper's steps, the RMS distance in m of its points, and the rows used per view."""
+    """A light plane, the RMS distance in m of its points, and the rows of each view's stripe that lie on the board."""
 
     plane: LightPlane
     rms: float
@@ -82,7 +82,7 @@ def plane_from_board(
     views: Sequence[BoardView],
     profiles: Sequence[StripeProfile | None],
 ) -> PlaneStart:
-    """Steps 1 and 4 to 6 of the paper: stripe points on the board's plane in the camera frame, and their plane.
+    """All stripe points on the boards' planes in the camera frame, and their plane.
 
     Frames whose stripe misses the board give no rows. Raises RefusedError when all points lie on one line.
     """
@@ -120,53 +120,3 @@ def stripe_pixels(profile: StripeProfile, rows: NDArray[np.intp]) -> Array:
     """Pixels (n, 2) of some rows of a profile."""
     pair = (profile.centres[rows], rows.astype(np.float64))
     return np.column_stack(pair if profile.axis == "rows" else pair[::-1])
-
-
-def cross_ratio_check(
-    camera: CameraModel, camera_from_board: pin.SE3, view: BoardView, profile: StripeProfile, rows: NDArray[np.intp]
-) -> float:
-    """Step 3 of the paper as a check: RMS in m between two ways to say where the stripe meets each row of the board.
-
-    The cross ratio of three points of a board row and the stripe's crossing is the same in the picture (lens distortion
-    removed) as on the board; that place is compared with the one on the board's plane. NaN when no row is crossed.
-    """
-    stripe = camera.normalised(stripe_pixels(profile, rows))
-    if len(stripe) < 2:
-        return float("nan")
-    line = _line(stripe)
-    ideal = camera.normalised(view.pixels)
-    local = view.object_points
-    apart = []
-    for y in np.unique(local[:, 1]):
-        row = np.flatnonzero(local[:, 1] == y)
-        if len(row) < 3:
-            continue
-        chosen = row[np.argsort(local[row, 0])][[0, len(row) // 2, -1]]
-        crossing = np.cross(_line(ideal[row]), line)
-        if abs(crossing[2]) < 1e-12:
-            continue
-        place = crossing[:2] / crossing[2]
-        along = ideal[chosen[2]] - ideal[chosen[0]]
-        t = [float((p - ideal[chosen[0]]) @ along / (along @ along)) for p in (*ideal[chosen], place)]
-        x = _fourth(local[chosen, 0], t)
-        pixel = camera.project([[*place, 1.0]])
-        seen = (
-            on_plane(camera, camera_from_board, pixel)[0] - camera_from_board.translation
-        ) @ camera_from_board.rotation
-        apart.append(seen[0] - x)
-    return float(np.sqrt(np.mean(np.square(apart)))) if apart else float("nan")
-
-
-def _line(points: Array) -> Array:
-    """Homogeneous line (3,) that fits points (n, 2) best."""
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][1]
-    return np.array([normal[0], normal[1], -float(normal @ centre)])
-
-
-def _fourth(x: Array, t: Sequence[float]) -> float:
-    """The x whose cross ratio with three places x equals that of the parameters t (four, the last belongs to it)."""
-    ratio = ((t[2] - t[0]) * (t[3] - t[1])) / ((t[2] - t[1]) * (t[3] - t[0]))
-    a, b, c = (float(v) for v in x)
-    # (c − a)(d − b) = ratio (c − b)(d − a), solved for d.
-    return ((c - a) * b - ratio * (c - b) * a) / ((c - a) - ratio * (c - b))

@@ -1,0 +1,277 @@
+"""The campaign behind `cell bench calibration`: many heads calibrated from drawn observations, errors beside the bound.
+
+Each seed draws a head and its noise (`calibration_world`), the product's own calibration solves it, and points are
+measured with both. Frames are kept apart: the camera's alone is partly gauge, the arm's base is what placing feels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from cell.bench.calibration_bound import STEPS, cramer_rao, differentiated
+from cell.bench.calibration_world import (
+    HEIGHT,
+    STRIPE_WIDTH_PX,
+    WIDTH,
+    Array,
+    HeadWorld,
+    Noise,
+    draw_head,
+    seen_dots,
+    seen_rows,
+)
+
+FRAMES = ("camera", "scan", "scan_radial_lens", "scan_aligned", "base")
+TANGENTIAL = (6, 7)
+SCAN_POINTS, BASE_POINTS = 1000, 45
+STAND_OFF, RELIEF = 0.130, 0.015
+THEORY_MM = {
+    "scan_radial_lens": {"mean": 0.047, "max": 0.112, "p85": 0.063},
+    "base": {"mean": 0.067, "max": 0.108, "p85": 0.082},
+}
+"""What the theory sheet's prototype reached (part 4), for the same noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One seed: χ² per degree of freedom (with the noise found, and with the noise drawn), z-scores of the parameters,
+    and for each frame mean, max and 85 % of the errors in mm, and their mean at the bound."""
+
+    seed: int
+    chi2_per_dof: float
+    chi2_drawn_noise: float
+    noise_found: dict[str, float]
+    z: dict[str, float]
+    errors: dict[str, dict[str, float]]
+    bound: dict[str, float]
+
+
+def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
+    """Run the seeds on all cores and sum them up; `tell` hears how many are done."""
+    trials: list[Trial] = []
+    for trial in _trials(seeds, noise):
+        trials.append(trial)
+        tell(len(trials))
+    return summed_up(trials, noise)
+
+
+def _trials(seeds: Sequence[int], noise: Noise) -> Iterator[Trial]:
+    workers = min(os.cpu_count() or 1, len(seeds))
+    if workers < 2:
+        yield from (one_trial(seed, noise) for seed in seeds)
+        return
+    # There are as many processes as cores: a thread each is enough, and is set before their libraries load.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        yield from pool.map(one_trial, seeds, [noise] * len(seeds))
+
+
+def one_trial(seed: int, noise: Noise) -> Trial:
+    """Draw, calibrate, measure."""
+    from cell.calibration.adjustment import Adjustment, Priors, shared_mask
+    from cell.calibration.joint import solve_joint, solve_staged, start_state
+    from cell.config import load_config
+    from cell.stored_calibration import nominal_camera
+
+    rng = np.random.default_rng(seed)
+    world = draw_head(rng)
+    observations = observe(world, noise, rng)
+    nominal = nominal_camera(load_config(None).scan_camera)
+    priors = Priors(noise.arm / np.sqrt(3), noise.arm_angle, noise.rail)
+    joint = solve_joint(observations, solve_staged(observations, nominal), priors, held_out=False)
+    found = joint.adjusted
+    exact = Adjustment(joint.views, shared_mask(plane=True, rail=True), Priors(*_as_drawn(priors)))
+    fixed = exact.solve(start_state(joint.staged), variance_rounds=0)
+    radial = solve_joint(observations, joint.staged, priors, tangential=False, held_out=False).adjusted
+    estimates = {frame: _as_world(world, found.state) for frame in FRAMES}
+    estimates["scan_radial_lens"] = _as_world(world, radial.state)
+    error = _parameter_errors(found.state, world)
+    sigma = np.sqrt(np.diag(found.covariance))[: len(error)]
+    names = _names()
+    best = cramer_rao(world, noise)
+    errors, bound = {}, {}
+    for frame in FRAMES:
+        known = best.with_known(TANGENTIAL) if frame == "scan_radial_lens" else best
+        errors[frame], bound[frame] = _measured(world, estimates[frame], known.draws(rng), frame, noise, rng)
+    return Trial(
+        seed,
+        found.chi2_per_dof,
+        fixed.chi2_per_dof,
+        {"dots": found.priors.dots_scale, "stripe": found.priors.stripe_scale},
+        {n: float(e / s) for n, e, s in zip(names, error, sigma, strict=True) if s > 0},
+        errors,
+        bound,
+    )
+
+
+def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[Any]:
+    """What the head sees and its devices report, as `ScanObservation`s with noise; the flange is said to be as sent."""
+    from cell.calibration import ScanObservation
+    from cell.geometry.poses import from_matrix
+    from cell.vision.board_view import BoardView
+    from cell.vision.stripe import StripeProfile
+
+    made = []
+    for view in range(len(world.rails)):
+        own = noise.own * rng.normal(size=7)
+        own[6] = 0.0
+        pixels = world.dots(view, own)
+        pixels += noise.dots * rng.normal(size=pixels.shape)
+        ids = seen_dots(pixels)
+        columns, _ = seen_rows(world, view, own)
+        columns += noise.stripe * rng.normal(size=HEIGHT)
+        flat, none = np.ones(HEIGHT), np.zeros(HEIGHT, dtype=np.bool_)
+        board = BoardView(
+            world.spec, (WIDTH, HEIGHT), ids, pixels[ids], np.full(len(ids), noise.dots), False, world.spec.dot_radius
+        )
+        stripe = StripeProfile("rows", columns, noise.stripe * flat, 150 * flat, STRIPE_WIDTH_PX * flat, none, none)
+        reading = float(world.rails[view] + noise.rail * rng.normal())
+        made.append(ScanObservation(board, stripe, from_matrix(world.flanges[view]), reading, f"view {view + 1}"))
+    return made
+
+
+def _measured(
+    world: HeadWorld, estimate: HeadWorld, draws: Array, frame: str, noise: Noise, rng: np.random.Generator
+) -> tuple[dict[str, float], float]:
+    """Errors in mm in one frame, and their mean at the bound: `draws` (m, 26) are errors that a best calibration makes.
+
+    Stripe and rail (and the arm, in its base) have fresh noise, as when a surface is scanned.
+    """
+    count = BASE_POINTS if frame == "base" else SCAN_POINTS
+    rail_noise = 0.0 if frame == "camera" else noise.rail
+    pixels, rails = sweep_points(world, count, rng)
+    if frame == "camera":
+        rails = np.zeros(count)
+    truth = _in_frame(world, pixels, rails, frame)
+    noisy = pixels + np.column_stack([noise.stripe * rng.normal(size=count), np.zeros(count)])
+    off = _in_frame(estimate, noisy, rails + rail_noise * rng.normal(size=count), frame) - truth
+    jacobian = differentiated(lambda d: _in_frame(world.moved(d), pixels, rails, frame).ravel(), STEPS)
+    aside = pixels + np.array([1e-3, 0.0])
+    by_pixel = (_in_frame(world, aside, rails, frame) - truth) / 1e-3
+    by_rail = (_in_frame(world, pixels, rails + 1e-6, frame) - truth) / 1e-6
+    best = (draws @ jacobian.T).reshape(len(draws), count, 3)
+    best += by_pixel * noise.stripe * rng.normal(size=(len(draws), count, 1))
+    best += by_rail * rail_noise * rng.normal(size=(len(draws), count, 1))
+    if frame == "base":
+        # The arm stands at one pose for the sweep, where it does not quite stand as it says.
+        arm = noise.own[:6] * rng.normal(size=(len(draws) + 1, 6))
+        swing = np.cross(arm[:, None, 3:], truth) + arm[:, None, :3]
+        off, best = off - swing[0], best - swing[1:]
+    if frame == "scan_aligned":
+        off, best = _aligned(off, truth), _aligned(best, truth)
+    size = 1e3 * np.linalg.norm(off, axis=1)
+    errors = {"mean": float(size.mean()), "max": float(size.max()), "p85": float(np.percentile(size, 85))}
+    return errors, float(1e3 * np.linalg.norm(best, axis=2).mean())
+
+
+def sweep_points(world: HeadWorld, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Stripe pixels (n, 2) and rail positions (n,) in m of points spread over a 70 × 36 × 15 mm place under a sweep."""
+    from sim_backends.optics.camera import project_points
+
+    middle = 0.05
+    points = np.column_stack(
+        [rng.uniform(-0.035, 0.035, count), rng.uniform(-0.0165, 0.0165, count), STAND_OFF - RELIEF * rng.random(count)]
+    )
+    points += middle * world.rail + np.array([(1 - world.plane[2] * STAND_OFF) / world.plane[0], 0.0, 0.0])
+    # The carriage stands where the light plane goes through the point.
+    rails = (points @ world.plane - 1) / (world.rail @ world.plane)
+    return project_points(points - rails[:, None] * world.rail, world.lens), rails
+
+
+def _in_frame(world: HeadWorld, pixels: Array, rails: Array, frame: str) -> Array:
+    points = world.measured(pixels, rails)
+    if frame != "base":
+        return points
+    return np.asarray(points @ world.hand[:3, :3].T + world.hand[:3, 3])
+
+
+def _aligned(errors: Array, points: Array) -> Array:
+    """Errors (…, n, 3) without the small rigid motion that explains most of them."""
+    centred = points - points.mean(axis=0)
+    motion = np.zeros((len(points), 3, 6))
+    motion[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        motion[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
+    basis = np.linalg.qr(motion.reshape(-1, 6))[0]
+    flat = errors.reshape(*errors.shape[:-2], -1)
+    return np.asarray((flat - flat @ basis @ basis.T).reshape(errors.shape))
+
+
+def _as_drawn(priors: Any) -> tuple[Any, ...]:
+    """The priors with the noise of dots and stripe taken as stated."""
+    return priors.arm_translation, priors.arm_rotation, priors.rail, False, 1.0, 1.0
+
+
+def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
+    """The estimate in the generator's terms, so that both measure with the same independent code."""
+    parameters = np.concatenate(
+        [state.camera.parameters[:8], state.plane.n / state.plane.distance, state.rail_direction]
+    )
+    return HeadWorld(
+        parameters,
+        state.flange_from_camera.homogeneous,
+        state.base_from_board.homogeneous,
+        world.flanges,
+        world.rails,
+        world.spec,
+    )
+
+
+def _names() -> tuple[str, ...]:
+    from cell.calibration.results import PARAMETERS
+
+    return PARAMETERS
+
+
+def _parameter_errors(state: Any, world: HeadWorld) -> Array:
+    """Errors (21,) of the estimate in the order and the terms of the calibration's covariance."""
+    from cell.calibration.blocks import tangents
+    from cell.geometry.poses import difference, from_matrix
+
+    length = np.linalg.norm(world.plane)
+    normal, distance = world.plane / length, 1 / length
+    if state.plane.distance < 0:
+        normal, distance = -normal, -distance
+    across = tangents(state.plane.n)
+    return np.concatenate(
+        [
+            state.camera.parameters - world.lens,
+            [(state.plane.n - normal) @ a for a in across],
+            [state.plane.distance - distance],
+            state.rail_direction - world.rail,
+            difference(state.flange_from_camera, from_matrix(world.hand)),
+        ]
+    )
+
+
+def summed_up(trials: Sequence[Trial], noise: Noise) -> dict[str, Any]:
+    """Means over the seeds; `z` the RMS of all z-scores and by parameter; lengths in mm, sigmas in px, m and rad."""
+    z = {name: np.array([t.z[name] for t in trials]) for name in trials[0].z}
+    frames = {}
+    for frame in FRAMES:
+        mean = {key: float(np.mean([t.errors[frame][key] for t in trials])) for key in ("mean", "max", "p85")}
+        bound = float(np.mean([t.bound[frame] for t in trials]))
+        frames[frame] = {**mean, "bound_mean": bound, "ratio": mean["mean"] / bound, "theory": THEORY_MM.get(frame)}
+    chi2 = [t.chi2_per_dof for t in trials]
+    drawn = [t.chi2_drawn_noise for t in trials]
+    return {
+        "seeds": len(trials),
+        "assumed_noise": {
+            "dots_px": noise.dots, "stripe_px": noise.stripe, "rail_mm": 1e3 * noise.rail,
+            "arm_radial_mm": 1e3 * noise.arm, "arm_rotation_mrad": 1e3 * noise.arm_angle,
+        },
+        "chi2_per_dof": {"mean": float(np.mean(chi2)), "least": min(chi2), "most": max(chi2)},
+        "chi2_per_dof_drawn_noise": {"mean": float(np.mean(drawn)), "least": min(drawn), "most": max(drawn)},
+        "noise_found": {key: float(np.mean([t.noise_found[key] for t in trials])) for key in ("dots", "stripe")},
+        "z_rms": float(np.sqrt(np.mean([v**2 for v in z.values()]))),
+        "z_rms_by_parameter": {name: float(np.sqrt(np.mean(v**2))) for name, v in z.items()},
+        "frames_mm": frames,
+        "trials": [asdict(t) for t in trials],
+    }  # fmt: skip

@@ -1,0 +1,230 @@
+"""The observations of a calibration in one file, so that it can be solved again later without any device.
+
+A NumPy archive of plain arrays (nothing in it is executed when it is read) and one JSON text with everything else that
+the solution depends on. What is read is checked as if a stranger had written it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.adjustment import Priors
+from cell.calibration.observations import ScanObservation, TargetObservation
+from cell.geometry.camera import Array, CameraModel
+from cell.vision.board_spec import parse_board
+from cell.vision.board_view import BoardView
+from cell.vision.stripe import StripeProfile
+from drivers.errors import ConfigError
+
+FORMAT = 1
+SUFFIX = ".observations.npz"
+PRIORS = ("arm_translation", "arm_rotation", "rail")
+PROFILE = ("centres", "sigma", "amplitude", "width", "saturated", "double")
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """All that a cell's calibration is solved from.
+
+    The cameras as drawn, the noise assumed beforehand, and whose they are: serial numbers by device name, the hash of
+    the configuration, the time in seconds since the epoch.
+    """
+
+    scan: list[ScanObservation]
+    target: list[TargetObservation]
+    scan_camera: CameraModel
+    target_camera: CameraModel
+    priors: Priors
+    identities: dict[str, str]
+    configuration: str
+    made: float
+
+
+def write_archive(path: Path, observations: Observations) -> None:
+    """Write it; a reader finds the old file or the new one, never half of one."""
+    o = observations
+    about = {
+        "format": FORMAT,
+        "made": o.made,
+        "identities": o.identities,
+        "configuration": o.configuration,
+        "priors": {name: getattr(o.priors, name) for name in PRIORS},
+        "scan_camera": _camera_dict(o.scan_camera),
+        "target_camera": _camera_dict(o.target_camera),
+    }
+    arrays = _views("scan", [(s.view, s.base_from_flange, s.name) for s in o.scan])
+    arrays |= _views("target", [(t.view, t.base_from_flange, t.name) for t in o.target])
+    arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
+    arrays |= _profiles([s.profile for s in o.scan])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_archive(path: Path) -> Observations:
+    """Read and check it; raises `ConfigError` that says what is missing, of another version or no number."""
+    advice = f"give a {SUFFIX} file that `cell calibrate` wrote beside a calibration"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} does not exist; {advice}") from error
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zlib.error, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
+    try:
+        about = json.loads(str(data["about"]))
+        if about["format"] != FORMAT:
+            raise ValueError(f"it has format {about['format']}, this program reads {FORMAT}")
+        scan = _read_views(data, "scan")
+        profiles = _read_profiles(data, len(scan))
+        rails = _finite(data, "scan_rail", (len(scan),))
+        priors = Priors(*(_positive(about["priors"], name) for name in PRIORS))
+        return Observations(
+            [
+                ScanObservation(view, profile, flange, float(rail), name)
+                for (view, flange, name), profile, rail in zip(scan, profiles, rails, strict=True)
+            ],
+            [
+                TargetObservation(view, flange, name)
+                for view, flange, name in _read_views(data, "target")
+                if view is not None
+            ],
+            _camera(about["scan_camera"]),
+            _camera(about["target_camera"]),
+            priors,
+            {str(name): str(serial) for name, serial in about["identities"].items()},
+            str(about["configuration"]),
+            float(about["made"]),
+        )
+    except KeyError as error:
+        raise ConfigError(f"{path} lacks {error}; {advice}") from error
+    except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
+        raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
+
+
+def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:
+    """Views one after the other in long arrays; `…_points` says how many belong to each, −1 where no board was seen."""
+    seen = [view for view, _, _ in views if view is not None]
+    made = {
+        "flange": np.array([flange.homogeneous for _, flange, _ in views]).reshape(-1, 4, 4),
+        "name": np.array([name for _, _, name in views], dtype=np.str_),
+        "points": np.array([-1 if view is None else len(view.ids) for view, _, _ in views], dtype=np.int64),
+        "board": np.array([view.spec.name for view in seen], dtype=np.str_),
+        "size": np.array([view.size for view in seen], dtype=np.int64).reshape(-1, 2),
+        "order_assumed": np.array([view.order_assumed for view in seen], dtype=np.bool_),
+        "dot_radius": np.array([view.dot_radius for view in seen]),
+        "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(view.ids for view in seen)]),
+        "pixels": np.concatenate([np.zeros((0, 2)), *(view.pixels for view in seen)]),
+        "sigma": np.concatenate([np.zeros(0), *(view.sigma for view in seen)]),
+    }
+    return {f"{camera}_{name}": array for name, array in made.items()}
+
+
+def _read_views(data: Mapping[str, Any], camera: str) -> list[tuple[BoardView | None, pin.SE3, str]]:
+    counts = np.asarray(data[f"{camera}_points"])
+    if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer) or len(counts) == 0:
+        raise ValueError(f"{camera}_points must count the points of at least one view")
+    total, seen = int(counts[counts > 0].sum()), int((counts >= 0).sum())
+    flanges = _finite(data, f"{camera}_flange", (len(counts), 4, 4))
+    pixels = _finite(data, f"{camera}_pixels", (total, 2))
+    sigma = _finite(data, f"{camera}_sigma", (total,))
+    if not (sigma > 0).all():
+        raise ValueError(f"{camera}_sigma must be positive; its least is {sigma.min():g} px")
+    ids, radii = data[f"{camera}_ids"], _finite(data, f"{camera}_dot_radius", (seen,))
+    sizes, boards, assumed = (data[f"{camera}_{name}"] for name in ("size", "board", "order_assumed"))
+    if ids.shape != (total,) or not np.issubdtype(ids.dtype, np.integer):
+        raise ValueError(f"{camera}_ids must hold {total} whole numbers, not {ids.dtype} of shape {ids.shape}")
+    made: list[tuple[BoardView | None, pin.SE3, str]] = []
+    start, k = 0, 0
+    for count, flange, name in zip(counts.tolist(), flanges, data[f"{camera}_name"], strict=True):
+        view = None
+        if count >= 0:
+            part = slice(start, start + count)
+            spec = parse_board(str(boards[k]))
+            if count and not 0 <= int(ids[part].min()) <= int(ids[part].max()) < len(spec.points()):
+                raise ValueError(f"{camera}_ids of {name} lie outside 0 to {len(spec.points()) - 1} of {spec.name}")
+            size = (int(sizes[k, 0]), int(sizes[k, 1]))
+            view = BoardView(spec, size, ids[part], pixels[part], sigma[part], bool(assumed[k]), float(radii[k]))
+            start, k = start + count, k + 1
+        made.append((view, _pose(flange, str(name)), str(name)))
+    return made
+
+
+def _profiles(profiles: Sequence[StripeProfile | None]) -> dict[str, Any]:
+    """The stripes of all lit views as arrays (lit, rows); `stripe_axis` is empty where a view has none."""
+    lit = [profile for profile in profiles if profile is not None]
+    made: dict[str, Any] = {
+        "stripe_axis": np.array(["" if profile is None else profile.axis for profile in profiles], dtype=np.str_)
+    }
+    for name in PROFILE:
+        made[f"stripe_{name}"] = np.array([getattr(profile, name) for profile in lit])
+    return made
+
+
+def _read_profiles(data: Mapping[str, Any], views: int) -> list[StripeProfile | None]:
+    axes = [str(axis) for axis in data["stripe_axis"]]
+    if len(axes) != views or not set(axes) <= {"", "rows", "columns"}:
+        raise ValueError(f"stripe_axis must say rows, columns or nothing for each of {views} views")
+    lit = sum(axis != "" for axis in axes)
+    arrays = [data[f"stripe_{name}"] for name in PROFILE]
+    if any(array.shape[:1] != (lit,) or array.shape != arrays[0].shape for array in arrays):
+        raise ValueError(f"the stripes' arrays must all hold {lit} profiles of one length")
+    centres, sigma = arrays[0], arrays[1]
+    if not (sigma[np.isfinite(centres)] > 0).all():
+        raise ValueError("stripe_sigma must be positive wherever stripe_centres has a number")
+    rest = iter(zip(*arrays, strict=True))
+    return [None if axis == "" else StripeProfile(_axis(axis), *next(rest)) for axis in axes]
+
+
+def _axis(text: str) -> Any:
+    return text
+
+
+def _finite(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+    array = np.asarray(data[name], dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds {int((~np.isfinite(array)).sum())} values that are no numbers")
+    return array
+
+
+def _positive(about: Mapping[str, Any], name: str) -> float:
+    value = float(about[name])
+    if not 0 < value < 1:
+        raise ValueError(f"the deviation {name} is {value:g}, allowed is more than 0 and less than 1 (m, rad)")
+    return value
+
+
+def _pose(matrix: Array, name: str) -> pin.SE3:
+    """Kept bit by bit, where `from_matrix` would bring it to the nearest rotation."""
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+        raise ValueError(f"the flange pose of {name} is no rotation and translation")
+    return pin.SE3(rotation, matrix[:3, 3].copy())
+
+
+def _camera_dict(camera: CameraModel) -> dict[str, Any]:
+    return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
+
+
+def _camera(data: Mapping[str, Any]) -> CameraModel:
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    made = model.with_parameters(data["parameters"])
+    if not np.isfinite(made.parameters).all() or made.fx <= 0 or made.fy <= 0:
+        raise ValueError("a nominal camera needs finite parameters and focal lengths above 0 px")
+    return made
