@@ -91,7 +91,7 @@ class Adjustment:
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
         )
         iterations = 0
-        normal = self._normal(state)
+        normal = self.normal_at(state)
         for turn in range(variance_rounds + 1):
             # Until the noise is settled there is no point in the last digits.
             settled = 1e-3 if turn < variance_rounds else 1e-7
@@ -99,7 +99,7 @@ class Adjustment:
             iterations += used
             if turn < variance_rounds:
                 self._update_noise(normal)
-                normal = self._normal(state)
+                normal = self.normal_at(state)
         inverse = normal.inverse()
         expected = sum(expected_cost(name, block, inverse) for name, block in normal.groups.items())
         return Adjusted(
@@ -127,7 +127,7 @@ class Adjustment:
         for _ in range(STEPS):
             used += 1
             candidate = state.moved(normal.step(damping))
-            new = self._normal(candidate)
+            new = self.normal_at(candidate)
             if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
                 gain = normal.total - new.total
                 state, normal = candidate, new
@@ -140,7 +140,8 @@ class Adjustment:
                     break
         return state, normal, used
 
-    def _normal(self, state: State) -> Normal:
+    def normal_at(self, state: State) -> Normal:
+        """The normal equations at a state whose flanges and rails are those of the views, with the present priors."""
         normal = Normal(len(self.views), self.free, self.own_free)
         for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
             if len(view.points):

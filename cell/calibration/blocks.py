@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.geometry.camera import Array, CameraModel
-from cell.geometry.circles import seen_centres
+from cell.geometry.circles import seen_centres_with_jacobians
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_parts, perturbed
 
@@ -102,10 +102,10 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
     from_camera = in_flange - hand.translation
     seen = from_camera @ hand.rotation - rail * state.rail_direction
     to_camera = (flange.rotation @ hand.rotation).T
-    if view.dot_radius > 0:
-        # The centre of the ellipse moves with the circle; the little that it moves besides has no weight here.
-        seen = seen_centres(seen, to_camera @ board.rotation[:, 2], view.dot_radius)
-    pixels, by_point, by_camera = state.camera.project_with_jacobians(seen)
+    normal = board.rotation[:, 2]
+    middle, by_centre, by_normal = seen_centres_with_jacobians(seen, to_camera @ normal, view.dot_radius)
+    pixels, by_middle, by_camera = state.camera.project_with_jacobians(middle)
+    by_point = by_middle @ by_centre
     jacobian = np.zeros((len(seen), 2, COLUMNS))
     jacobian[:, :, CAMERA] = by_camera
     by_base = by_point @ to_camera
@@ -118,6 +118,13 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
     jacobian[:, :, 27:30] = -by_base
     jacobian[:, :, 30:33] = cross(by_base, from_flange[:, None, :])
     jacobian[:, :, 33] = -by_point @ state.rail_direction
+    if view.dot_radius > 0:
+        # An ellipse's centre moves with the circle's tilt too. It is little, but a turn of the camera and a shift of
+        # its principal point are told apart by as little.
+        tilted = by_middle @ by_normal @ to_camera
+        jacobian[:, :, 18:21] += cross(tilted @ flange.rotation, flange.rotation.T @ normal)
+        jacobian[:, :, 24:27] += cross(normal, tilted)
+        jacobian[:, :, 30:33] += cross(tilted, normal)
     return view.pixels - pixels, jacobian
 
 

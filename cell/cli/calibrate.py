@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from cell.cli import calibrate_solve
 from cell.cli.options import (
     ConfigOption,
     JobOption,
@@ -21,10 +22,14 @@ from cell.cli.options import (
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command()(calibrate)
+    group = typer.Typer(invoke_without_command=True)
+    group.callback()(calibrate)
+    calibrate_solve.register(group)
+    app.add_typer(group, name="calibrate")
 
 
 def calibrate(
+    context: typer.Context,
     config: ConfigOption = None,
     sim: SimOption = None,
     seed: SeedOption = 1,
@@ -44,12 +49,18 @@ def calibrate(
     """
     from drivers.errors import ConfigError
 
+    if context.invoked_subcommand is not None:
+        return
     if source is None and board is not None:
         raise ConfigError("--board belongs to --from; the boards on the deck are named in the configuration")
     if source is not None:
         _from_folder(source, board, json)
         return
+    from cell.calibration.archive import read_archive
+    from cell.calibration_report import examine
+    from cell.cli.calibration_tables import print_examination
     from cell.cli.display import ProgressDisplay, print_calibration
+    from cell.stored_calibration import archive_of, solve_observations
     from cell.supervisor import Cell
 
     if config is None and sim is None:
@@ -58,11 +69,16 @@ def calibrate(
         )
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
         calibration = cell.calibrate(display, job)
-        where = cell.calibrations_folder
+        where, loaded = cell.calibrations_folder, cell.config
+    # The devices are free again; what follows takes the observations as they were stored.
+    observations = read_archive(archive_of(where, calibration))
+    examination = examine(solve_observations(observations), observations, loaded, job)
+    pictures = examination.draw(where / calibration.name)
     if json:
-        print_json(calibration.summary())
+        print_json({**calibration.summary(), **examination.summary, "pictures": [str(path) for path in pictures]})
     else:
         print_calibration(calibration.summary(), str(where))
+        print_examination(examination.summary, pictures)
 
 
 def _from_folder(folder: Path, board: str | None, json: bool) -> None:

@@ -122,7 +122,7 @@ def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
     console.print(table)
 
 
-def print_calibration(summary: Mapping[str, Any], where: str) -> None:
+def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
     """A calibration for people: values with their standard deviations, then how well the observations fit."""
     console = Console()
     lens, plane, rail, hand = (summary[key] for key in ("scan_camera", "light_plane", "rail", "hand_eye"))
@@ -149,4 +149,5 @@ def print_calibration(summary: Mapping[str, Any], where: str) -> None:
         shown = ["" if q.get(key) is None else f"{q[key]:.4f}" for key in keys]
         fit.add_row(camera, str(q["views"]), f"{q['chi2_per_dof']:.3f}", *shown)
     console.print(fit)
-    console.print(f"stored in {where}", markup=False, soft_wrap=True)
+    if where is not None:
+        console.print(f"stored in {where}", markup=False, soft_wrap=True)

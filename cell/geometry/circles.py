@@ -22,3 +22,16 @@ def seen_centres(centres: ArrayLike, normal: ArrayLike, radius: float) -> Array:
     seen = c * c[:, 2:3] + radius**2 * n * n[2]
     seen[:, 2] -= radius**2
     return np.asarray(seen / c[:, 2:3], dtype=np.float64)
+
+
+def seen_centres_with_jacobians(centres: ArrayLike, normal: ArrayLike, radius: float) -> tuple[Array, Array, Array]:
+    """`seen_centres` (n, 3) with their derivatives by the centres and by the normal, both (n, 3, 3)."""
+    c = np.atleast_2d(np.asarray(centres, dtype=np.float64))
+    n = np.asarray(normal, dtype=np.float64)
+    share = radius**2 / c[:, 2]
+    aside = n * n[2] - np.array([0.0, 0.0, 1.0])
+    by_centre = np.tile(np.eye(3), (len(c), 1, 1))
+    by_centre[:, :, 2] -= (share / c[:, 2])[:, None] * aside
+    by_normal = n[2] * np.eye(3)
+    by_normal[:, 2] += n
+    return c + share[:, None] * aside, by_centre, share[:, None, None] * by_normal

@@ -1,0 +1,66 @@
+"""What limits a calibration and what would better it, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> None:
+    """Coverage, the paper's steps beside the adjustment, the parameters' influence, advice, and where pictures are."""
+    console = Console()
+    _coverage(console, figures)
+    influence = figures["influence"]
+    table = Table(title=f"place error left by the calibration: {influence['total_mm']:.4f} mm RMS at the job's points")
+    for name, left in (
+        ("of", True),
+        ("sigma", False),
+        ("unit", True),
+        ("alone mm", False),
+        ("total if known mm", False),
+    ):
+        table.add_column(name, justify="left" if left else "right")
+    for row in influence["groups"]:
+        table.add_row(f"[bold]{row['name']}[/]", "", "", f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}")
+    table.add_section()
+    for row in influence["parameters"]:
+        table.add_row(
+            row["name"], f"{row['sigma']:.3g}", row["unit"], f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}"
+        )
+    console.print(table)
+    console.print("Parameters are known together better than apart: what they do alone does not add up to the total.")
+    table = Table(title="what to add, by the predicted covariance")
+    for name, left in (("what", True), ("kind", True), ("then mm", False), ("less", False)):
+        table.add_column(name, justify="left" if left else "right")
+    for row in figures["advice"]:
+        table.add_row(row["what"], row["kind"], f"{row['then_mm']:.4f}", f"{100 * row['gain']:.1f} %")
+    console.print(table)
+    for path in pictures:
+        console.print(f"picture: {path}", markup=False, soft_wrap=True)
+
+
+def _coverage(console: Console, figures: Mapping[str, Any]) -> None:
+    table = Table(title="what the views cover")
+    names = ("camera", "field", "depth mm", "tilt x deg", "tilt y deg", "rail mm", "stripe depth mm", "worst cell px")
+    for name in names:
+        table.add_column(name, justify="left" if name == "camera" else "right")
+    for camera in ("scan", "target"):
+        c = figures[f"{camera}_coverage"]
+        ranges = ("depth_mm", "tilt_about_x_deg", "tilt_about_y_deg", "rail_mm", "stripe_depth_mm")
+        shown = ["" if c[key] is None else f"{c[key][0]:.0f} to {c[key][1]:.0f}" for key in ranges]
+        worst = "" if c["largest_cell_mean_px"] is None else f"{c['largest_cell_mean_px']:.3f}"
+        table.add_row(camera, f"{100 * c['field_covered']:.0f} %", *shown, worst)
+    console.print(table)
+    paper = figures["paper_steps"]
+    if paper is None:
+        console.print("The paper's six steps: the stripe crosses too few rows of the board.")
+        return
+    console.print(
+        f"The paper's six steps give a light plane {paper['apart_mm']:.4f} mm and {paper['apart_mrad']:.3f} mrad from "
+        f"the adjusted one ({paper['features']} features in {paper['views']} views, {paper['rms_mm']:.4f} mm RMS; "
+        f"cross-ratio check {paper['cross_ratio_check_mm']:.4f} mm)."
+    )
