@@ -92,7 +92,8 @@ def read_archive(path: Path) -> Observations:
         scan = _read_views(data, "scan")
         profiles = _read_profiles(data, len(scan))
         rails = _finite(data, "scan_rail", (len(scan),))
-        priors = Priors(*(_positive(about["priors"], name) for name in PRIORS))
+        shift, turn, along = (_positive(about["priors"], name) for name in PRIORS)
+        priors = Priors(shift, turn, along)
         return Observations(
             [
                 ScanObservation(view, profile, flange, float(rail), name)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.calibration.blocks import dots_block, stripe_block
 from cell.calibration.joint import Joint
@@ -66,10 +67,10 @@ class Coverage:
             np.asarray(state.rails),
         )
 
-    def cells(self, pixels: Array) -> tuple[Array, Array]:
+    def cells(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Column and row (n,) of the cell of `GRID` in which pixels (n, 2) lie."""
         at = (pixels + 0.5) / np.array(self.size) * np.array(GRID)
-        return np.clip(at[:, 0], 0, GRID[0] - 1).astype(int), np.clip(at[:, 1], 0, GRID[1] - 1).astype(int)
+        return np.clip(at[:, 0], 0, GRID[0] - 1).astype(np.intp), np.clip(at[:, 1], 0, GRID[1] - 1).astype(np.intp)
 
     def counts(self, pixels: Array) -> Array:
         """Number of points (rows, columns) in each cell."""

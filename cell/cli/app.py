@@ -6,6 +6,7 @@ import typer
 
 from cell.cli import (
     bench_acceptance,
+    bench_calibration,
     bench_inversion,
     bench_reconstruction,
     bench_stripe,
@@ -37,6 +38,7 @@ bench = typer.Typer(
 )
 for register in (
     bench_acceptance.register,
+    bench_calibration.register,
     bench_inversion.register,
     bench_reconstruction.register,
     bench_stripe.register,

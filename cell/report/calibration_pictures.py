@@ -48,12 +48,12 @@ def influence_picture(path: Path, influence: Mapping[str, Any], advice: list[dic
     left.set_xlabel("mm RMS over the points (log)")
     left.set_title("parameters; known together better than apart, so the blue bars do not add up")
     left.invert_yaxis()
-    left.legend(fontsize=8, loc="lower right")
+    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3)
     places = np.arange(len(advice))
     colours = ["tab:green" if row["kind"] == "views" else "tab:orange" for row in advice]
     right.barh(places, [row["then_mm"] for row in advice], 0.6, color=colours)
     for place, row in zip(places, advice, strict=True):
-        right.text(row["then_mm"], place, f" {100 * row['gain']:.0f} % less", va="center", fontsize=8)
+        right.text(1.01 * total, place, f" {100 * row['gain']:.0f} % less", va="center", fontsize=8)
     right.axvline(total, color="black", linestyle="--", linewidth=1)
     right.set_yticks(places, [row["what"] for row in advice], fontsize=8)
     right.set_xlim(0, 1.2 * total)
@@ -72,12 +72,11 @@ def _dots(figure: Figure, axes: Axes, seen: Coverage) -> None:
     means = seen.cell_means()
     width, height = seen.size
     x, y = np.meshgrid((np.arange(GRID[0]) + 0.5) * width / GRID[0], (np.arange(GRID[1]) + 0.5) * height / GRID[1])
-    arrows = axes.quiver(
+    axes.quiver(
         x, y, means[..., 0], means[..., 1], angles="xy", scale_units="xy", scale=rms / (width / GRID[0]), color="red",
         width=0.004,
     )  # fmt: skip
-    axes.quiverkey(arrows, 0.86, 1.03, rms, f"{rms:.3f} px", labelpos="E", fontproperties={"size": 8})
-    _frame(axes, seen, f"dots: residuals, {rms:.4f} px RMS; arrows: means of the cells")
+    _frame(axes, seen, f"dots: {rms:.4f} px RMS; arrows: mean of a cell, as long as a cell is wide for {rms:.4f} px")
     figure.colorbar(shown, ax=axes, label="length of a residual in px", shrink=0.85)
 
 
@@ -118,7 +117,7 @@ def _histogram(axes: Axes, seen: Coverage) -> None:
     rms = float(np.sqrt(np.mean(seen.dots_off**2)))
     edges = np.linspace(-4 * rms, 4 * rms, 61)
     for k, axis in enumerate("xy"):
-        axes.hist(seen.dots_off[:, k], edges, histtype="step", label=f"{axis}, {len(seen.dots)} dots")
+        axes.hist(seen.dots_off[:, k], edges.tolist(), histtype="step", label=f"{axis}, {len(seen.dots)} dots")
     middle = 0.5 * (edges[1:] + edges[:-1])
     bell = len(seen.dots) * (edges[1] - edges[0]) / (rms * np.sqrt(2 * np.pi)) * np.exp(-0.5 * (middle / rms) ** 2)
     axes.plot(middle, bell, color="black", linewidth=1, linestyle="--", label=f"Gaussian, {rms:.4f} px")
@@ -147,7 +146,7 @@ def _views(figure: Figure, axes: Axes, seen: Coverage) -> None:
 
 
 def _frame(axes: Axes, seen: Coverage, title: str) -> None:
-    axes.set_title(title)
+    axes.set_title(title, fontsize=10)
     axes.set_xlim(0, seen.size[0])
     axes.set_ylim(seen.size[1], 0)
     axes.set_aspect("equal")
