@@ -34,3 +34,27 @@ class WorldClock:
     def wall(self, seconds: float) -> float:
         """The wall seconds that `seconds` of world time take, for time-outs of blocking system calls."""
         return seconds / self.speed
+
+
+class SteppedClock(WorldClock):
+    """World time that stands still until it is told to go on: for worlds that one program steps by itself."""
+
+    def __init__(self) -> None:
+        """Start at zero."""
+        super().__init__()
+        self._time = 0.0
+
+    def now(self) -> float:
+        """World seconds as far as they were stepped."""
+        return self._time
+
+    def step_to(self, t: float) -> None:
+        """Let it be world time `t`. Raises ValueError when that is in the past."""
+        if t < self._time:
+            raise ValueError(f"world time {t} s lies before {self._time} s: time does not run backwards")
+        self._time = t
+
+    def sleep(self, seconds: float) -> None:
+        """Step `seconds` on; a value that is not positive changes nothing."""
+        if seconds > 0:
+            self._time += seconds

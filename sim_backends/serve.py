@@ -26,13 +26,12 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.peers.agilex import AgilexPeer
-from sim_backends.peers.frames import CameraSpec, FramePeer
+from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.rtde import RtdePeer
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
-from sim_backends.world import nominal
+from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
-from sim_backends.world.scene import CameraClock
 from sim_backends.world.surfaces import SURFACES
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
@@ -62,7 +61,7 @@ class ServedCell:
             self._rail = _bound(bound, TmclPeer(world.rail, clock))
             self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
             self._cameras = {
-                name: _bound(bound, FramePeer(f"{name}_camera", clock, partial(world.render, name), _spec(world, name)))
+                name: _bound(bound, FramePeer(f"{name}_camera", clock, partial(world.render, name), camera_spec(world.scene, name)))
                 for name in ("scan", "target")
             }
             self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset))
@@ -133,23 +132,6 @@ class ServedCell:
 def _bound(stack: contextlib.ExitStack, peer: P) -> P:
     stack.callback(peer.stop)
     return peer
-
-
-def _spec(world: World, camera: str) -> CameraSpec:
-    """The identity carries the seed, so that another cell's calibration is recognised as foreign."""
-    scan = camera == "scan"
-    size, rate = (nominal.SCAN_SIZE, nominal.SCAN_RATE) if scan else (nominal.TARGET_SIZE, nominal.TARGET_RATE)
-    timing: CameraClock = world.scene.scan_clock if scan else world.scene.target_clock
-    return CameraSpec(
-        model=f"SIM-{camera.upper()}",
-        serial=f"SIM{world.scene.serial}-{camera.upper()}",
-        width=size[0],
-        height=size[1],
-        frame_rate_max=rate,
-        epoch=timing.epoch,
-        drift_ppm=1e6 * timing.drift,
-        latency=timing.latency,
-    )
 
 
 def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], None] | None = None) -> int:

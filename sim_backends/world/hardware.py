@@ -8,6 +8,7 @@ import numpy as np
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.models.camera import CameraSpec
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.models.screw import Screw
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
@@ -58,3 +59,20 @@ def make_vehicle(scene: Scene) -> VehicleModel:
         yaw_walk=0.1 * scene.deviations.odometry_yaw,
     )
     return VehicleModel(params, stream(scene.seed, "vehicle"))
+
+
+def camera_spec(scene: Scene, camera: str) -> CameraSpec:
+    """The camera "scan" or "target"; its serial carries the seed, so that another cell's calibration is recognised."""
+    scan = camera == "scan"
+    size, rate = (nominal.SCAN_SIZE, nominal.SCAN_RATE) if scan else (nominal.TARGET_SIZE, nominal.TARGET_RATE)
+    timing = scene.scan_clock if scan else scene.target_clock
+    return CameraSpec(
+        model=f"SIM-{camera.upper()}",
+        serial=f"SIM{scene.serial}-{camera.upper()}",
+        width=size[0],
+        height=size[1],
+        frame_rate_max=rate,
+        epoch=timing.epoch,
+        drift_ppm=1e6 * timing.drift,
+        latency=timing.latency,
+    )

@@ -23,12 +23,22 @@ Pose = NDArray[np.float64]
 class World:
     """One seeded world. `scene` holds what was drawn, `arm`, `rail` and `vehicle` the models that the peers drive."""
 
-    def __init__(self, seed: int = 1, level: str = "nominal", speed: float = 1.0, surface: str = "pot") -> None:
-        """Draw the world and let its clock run. Raises ValueError for an unknown level or surface, or a bad number."""
+    def __init__(
+        self,
+        seed: int = 1,
+        level: str = "nominal",
+        speed: float = 1.0,
+        surface: str = "pot",
+        clock: WorldClock | None = None,
+    ) -> None:
+        """Draw the world and let its clock run, at `speed` unless it is given one.
+
+        Raises ValueError for an unknown level or surface, or a bad number.
+        """
         shape = named_surface(surface)
         self.surface = surface
         self.scene = draw(seed, level)
-        self.clock = WorldClock(speed)
+        self.clock = WorldClock(speed) if clock is None else clock
         self.arm = hardware.make_arm(self.scene, self.clock)
         self.rail = hardware.make_rail(self.scene, self.clock)
         self.vehicle = hardware.make_vehicle(self.scene)

@@ -1,0 +1,260 @@
+"""The simulated arm in lock step: trajectories are streamed into the model as the driver streams them.
+
+Servo lag, arrival, contact and stops follow `drivers.arm.ur_control`; what an arm may be asked is checked by the
+driver's own limits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cell.config import CellConfig
+from cell.geometry.poses import from_matrix, to_ur
+from drivers.arm.limits import ArmLimits
+from drivers.arm.messages import AT_REST
+from drivers.arm.motion import fault
+from drivers.clock import Clock
+from drivers.errors import Aborted, CellError, DeadlineError, InterlockError
+from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
+from sim_backends.models.arm import ArmModel, Safety
+from sim_backends.models.arm_motion import JointMove, LinearMove, Motion, Stop
+from sim_backends.models.arm_streams import Servo
+
+TICK_S, GUARDED_TICK_S, STILL_TICK_S = 0.008, 0.004, 0.05
+_SERVO_LAG_S = 0.03
+"""Of the driver's look-ahead of 0.05 s and gain of 500."""
+_SERVO_BRAKING, _BRAKING = 10.0, 4.0
+_ARRIVED, _FIRST_POINT = 2e-3, 0.02
+_PATIENCE_S = 3.0
+_FORCE_SAMPLES, _FORCE_SAMPLE_S = 10, 0.006
+_SAFETY = {
+    Safety.NORMAL: ArmSafety.NORMAL,
+    Safety.PROTECTIVE_STOP: ArmSafety.PROTECTIVE_STOP,
+    Safety.EMERGENCY_STOP: ArmSafety.EMERGENCY_STOP,
+}
+
+
+class LockstepArm:
+    """The arm `model`; see `drivers.interfaces.Arm` for the promises."""
+
+    def __init__(self, name: str, model: ArmModel, clock: Clock, config: CellConfig) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self.model = model
+        self._clock = clock
+        self._motion: ArmMove | None = None
+        self._limits = ArmLimits(
+            joint_speeds=(config.arm.max_joint_speed,) * 6,
+            joint_acceleration=config.arm.max_joint_acceleration,
+            linear_speed=config.arm.max_tool_speed,
+        )
+
+    def identity(self) -> Identity:
+        """The model's own plate."""
+        return Identity(self.model.params.model, self.model.params.serial, "lock step", "in this process")
+
+    def ping(self) -> float:
+        """No wire: 0 s."""
+        return 0.0
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        """What the encoders, the force sensor and the inputs show now."""
+        model = self.model
+        speeds = model.drive.qd.copy()
+        return ArmState(
+            stamp=self._clock.now(),
+            joints=model.drive.q.copy(),
+            joint_speeds=speeds,
+            flange=to_ur(from_matrix(model.reported_flange())),
+            wrench=model.felt.copy(),
+            safety=_SAFETY[model.safety],
+            moving=bool(np.abs(speeds).max() >= AT_REST),
+            digital_inputs=model.digital_inputs,
+            digital_outputs=model.digital_outputs,
+        )
+
+    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
+        """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
+        joints = self._limits.check_joints(self.name, joints)
+        self._limits.check_joint_move(self.name, speed, acceleration)
+        return self._begin(ArmMove(self, self._clock, JointMove(joints, speed, acceleration)))
+
+    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMove:
+        """Straight in space to the flange pose (x, y, z, rx, ry, rz) at `speed` m/s."""
+        from cell.geometry.poses import from_ur
+
+        target = from_ur(self._limits.check_pose(self.name, flange)).homogeneous
+        self._limits.check_linear_move(self.name, speed, acceleration)
+        return self._begin(ArmMove(self, self._clock, LinearMove(target, speed, acceleration)))
+
+    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMove:
+        """Stream a joint trajectory; see `drivers.interfaces.Arm`."""
+        times, joints = self._limits.check_trajectory(self.name, times, joints)
+        gap = float(np.abs(joints[0] - self.model.drive.q).max())
+        if gap > _FIRST_POINT:
+            raise InterlockError(self.name, f"the trajectory begins {gap:.3f} rad from where the arm stands")
+        before = self._mean_force() if force_limit is not None else np.zeros(3)
+        return self._begin(Streamed(self, self._clock, times, joints, force_limit, before))
+
+    def zero_force(self) -> None:
+        """Take the present wrench as zero."""
+        self.model.zero_force()
+
+    def set_payload(self, mass: float, centre: Vector) -> None:
+        """Tell the model what it carries."""
+        self.model.payload = (mass, np.asarray(centre, dtype=np.float64))
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """Set an output and let a tick pass, in which the world follows it."""
+        self.model.write_digital_outputs(1 << index, int(value) << index)
+        self._clock.sleep(TICK_S)
+
+    def digital_input(self, index: int) -> bool:
+        """What is wired to input `index`."""
+        return bool(self.model.digital_inputs >> index & 1)
+
+    def recover(self) -> None:
+        """Unlock a protective stop, which takes its time."""
+        self._clock.sleep(self.model.params.unlock_delay)
+        if not self.model.unlock() or not self.model.ready:
+            raise fault(self.name, f"arm.{self.model.safety.name.lower()}", self.model.fault_text)
+        self._motion = None
+
+    def stop(self) -> None:
+        """Brake now."""
+        if self._motion is not None and not self._motion.done:
+            self._motion.fail(Aborted(f"{self.name}: stopped before the end of its motion"))
+        self.model.start(Stop(_BRAKING))
+        while self.model.moving:
+            self._clock.sleep(TICK_S)
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    # --- ticking ---
+
+    @property
+    def tick_s(self) -> float:
+        """Fine while it moves, finest while it feels for contact."""
+        if self._motion is None or self._motion.done:
+            return STILL_TICK_S if self.model.idle and not self.model.moving else TICK_S
+        return self._motion.tick_s
+
+    def before_tick(self, t: float) -> None:
+        """Stream the target of time `t`."""
+        if self._motion is not None and not self._motion.done:
+            self._motion.before_tick(t)
+
+    def after_tick(self, t: float) -> None:
+        """See whether the motion has ended."""
+        if self._motion is not None and not self._motion.done:
+            self._motion.after_tick(t)
+
+    def _begin(self, motion: ArmMove) -> ArmMove:
+        if not self.model.ready:
+            raise fault(self.name, f"arm.{self.model.safety.name.lower()}", self.model.fault_text)
+        if self._motion is not None and not self._motion.done:
+            raise InterlockError(self.name, "a motion is still under way. Wait for it or stop it")
+        self.model.start(motion.motion)
+        self._motion = motion
+        return motion
+
+    def _mean_force(self) -> Vector:
+        samples = []
+        for _ in range(_FORCE_SAMPLES):
+            self._clock.sleep(_FORCE_SAMPLE_S)
+            samples.append(self.model.felt[:3])
+        return np.asarray(np.mean(samples, axis=0))
+
+
+class ArmMove:
+    """A motion that the controller ends by itself; `motion` is the model's."""
+
+    tick_s = TICK_S
+
+    def __init__(self, arm: LockstepArm, clock: Clock, motion: Motion) -> None:
+        self.contact = False
+        self.motion = motion
+        self._arm = arm
+        self._clock = clock
+        self._error: CellError | None = None
+        self._done = False
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+        return self._done
+
+    def wait(self, timeout: float) -> None:
+        """Let time pass until the motion has ended; see `drivers.interfaces.Motion`."""
+        deadline = self._clock.now() + timeout
+        while not self._done:
+            if self._clock.now() > deadline:
+                self._arm.stop()
+                self._error = DeadlineError(self._arm.name, f"the motion did not end within {timeout:g} s")
+            self._clock.sleep(self.tick_s)
+        if self._error is not None:
+            raise self._error
+
+    def fail(self, error: CellError) -> None:
+        """End it with an error."""
+        self._error, self._done = error, True
+
+    def before_tick(self, t: float) -> None:
+        """The model goes on by itself."""
+
+    def after_tick(self, t: float) -> None:
+        """Ended, once the model is idle and the joints stand."""
+        model = self._arm.model
+        if model.safety is not Safety.NORMAL:
+            self.fail(fault(self._arm.name, f"arm.{model.safety.name.lower()}", model.fault_text))
+        elif model.idle and not model.moving:
+            self._done = True
+
+
+class Streamed(ArmMove):
+    """A joint trajectory that is streamed into a servo, with a force limit or without."""
+
+    def __init__(
+        self,
+        arm: LockstepArm,
+        clock: Clock,
+        times: Vector,
+        joints: Vector,
+        force_limit: float | None,
+        force_before: Vector,
+    ) -> None:
+        self._servo = Servo(joints[0], _SERVO_LAG_S)
+        super().__init__(arm, clock, self._servo)
+        self._times, self._joints = times, joints
+        self._force_limit, self._force_before = force_limit, force_before
+        self._begun = clock.now()
+        self._ending = False
+        self.tick_s = TICK_S if force_limit is None else GUARDED_TICK_S
+
+    def before_tick(self, t: float) -> None:
+        """Stream where the trajectory is at `t`."""
+        if not self._ending:
+            elapsed = t - self._begun
+            after = min(int(np.searchsorted(self._times, elapsed, side="right")), len(self._times) - 1)
+            begin, end = self._times[after - 1], self._times[after]
+            part = min(1.0, (elapsed - begin) / (end - begin))
+            self._servo.target = self._joints[after - 1] + part * (self._joints[after] - self._joints[after - 1])
+
+    def after_tick(self, t: float) -> None:
+        """Contact, arrival, or the end of the patience with it."""
+        model = self._arm.model
+        if self._ending or model.safety is not Safety.NORMAL:
+            super().after_tick(t)
+            return
+        late = t - self._begun - self._times[-1]
+        if self._force_limit is not None:
+            change = model.felt[:3] - self._force_before
+            self.contact = bool(np.linalg.norm(change) > self._force_limit)
+        off = float(np.abs(model.drive.q - self._joints[-1]).max())
+        arrived = late >= 0 and off < _ARRIVED and float(np.abs(model.drive.qd).max()) < AT_REST
+        if late > _PATIENCE_S:
+            self.fail(fault(self._arm.name, "arm.not_arrived", f"a joint is {off:.4f} rad off"))
+        elif arrived or self.contact:
+            self._ending = True
+            model.start(Stop(_SERVO_BRAKING, linear=True))
