@@ -22,7 +22,7 @@ from cell.config import CellConfig
 from cell.geometry.poses import transform
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.planning import base_from_place_at_target, scan_plan
+from cell.planning import base_from_place_at_target, scan_plans
 from cell.report.calibration_pictures import camera_picture, influence_picture
 from cell.report.truth import part_points
 from cell.stored_calibration import Solved
@@ -71,7 +71,7 @@ def examine(solved: Solved, observations: Observations, config: CellConfig, job:
 def places_of_job(config: CellConfig, job: Job, nominal: NominalSurface, scan: ScanCalibration) -> Places:
     """The job's 45 points as the sweep sees them when vehicle, board and surface are where they should be."""
     base_from_surface = base_from_place_at_target(config, job) * job.surface.place_from_surface.se3()
-    plan = scan_plan(config, job, base_from_surface, scan)
+    plan = scan_plans(config, job, base_from_surface, scan)[0]
     in_base = transform(base_from_surface, transform(job.place.surface_from_part.se3(), part_points(nominal)))
     in_flange = transform(plan.base_from_flange.inverse(), in_base)
     at_home = transform(scan.flange_from_camera.inverse(), in_flange)

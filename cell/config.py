@@ -84,6 +84,8 @@ class ArmConfig(Table):
     settle_time: Annotated[float, quantity("s", 0, 5)]
     repeatability: Sigma
     repeatability_angle: Annotated[float, quantity("mrad", 0, 10)]
+    kinematic_sigma: Sigma
+    kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
 
 
 class VehicleConfig(Table):

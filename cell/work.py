@@ -164,7 +164,7 @@ class JobWork:
         """See `cell.steps.invert_pose`."""
         fix = cast(BoardFix, context.results["board_photo"])
         scan = cast(Reconstruction, context.results["reconstruct"])
-        return invert_pose(scan, fix, self._job, self._nominal)
+        return invert_pose(scan, fix, self._job, self._nominal, self.kinematic)
 
     def place(self, context: StepContext) -> PlaceResult:
         """See `cell.steps.place`."""
@@ -184,6 +184,12 @@ class JobWork:
         """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""
         arm = self._config.arm
         return np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+
+    @property
+    def kinematic(self) -> Vector:
+        """Covariance (6, 6) of a measured place in the base that the arm realises when it goes there, m² and rad²."""
+        arm = self._config.arm
+        return np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
 
     def _photograph(self, count: int = 1) -> BoardFix:
         fix = photograph(

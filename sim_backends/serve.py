@@ -61,7 +61,10 @@ class ServedCell:
             self._rail = _bound(bound, TmclPeer(world.rail, clock))
             self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
             self._cameras = {
-                name: _bound(bound, FramePeer(f"{name}_camera", clock, partial(world.render, name), camera_spec(world.scene, name)))
+                name: _bound(
+                    bound,
+                    FramePeer(f"{name}_camera", clock, partial(world.render, name), camera_spec(world.scene, name)),
+                )
                 for name in ("scan", "target")
             }
             self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset))

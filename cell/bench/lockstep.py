@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from typing import Protocol
 
-
 from cell.assembly import Devices
 from cell.bench.lockstep_arm import LockstepArm
 from cell.bench.lockstep_camera import LockstepCamera

@@ -6,13 +6,16 @@ driver's own limits.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from cell.config import CellConfig
-from cell.geometry.poses import from_matrix, to_ur
+from cell.geometry.poses import from_matrix, from_ur, to_ur
+from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import AT_REST
-from drivers.arm.motion import fault
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
@@ -20,7 +23,7 @@ from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.models.arm_motion import JointMove, LinearMove, Motion, Stop
 from sim_backends.models.arm_streams import Servo
 
-TICK_S, GUARDED_TICK_S, STILL_TICK_S = 0.008, 0.004, 0.05
+TICK_S, GUARDED_TICK_S, STILL_TICK_S = 0.02, 0.004, 0.05
 _SERVO_LAG_S = 0.03
 """Of the driver's look-ahead of 0.05 s and gain of 500."""
 _SERVO_BRAKING, _BRAKING = 10.0, 4.0
@@ -42,7 +45,10 @@ class LockstepArm:
         self.statistics = LinkStatistics()
         self.model = model
         self._clock = clock
+        self.rests: list[Vector] = []
+        """Joint angles (6,), rad, at the end of each motion so far."""
         self._motion: ArmMove | None = None
+        self._recorded: list[ArmState] | None = None
         self._limits = ArmLimits(
             joint_speeds=(config.arm.max_joint_speed,) * 6,
             joint_acceleration=config.arm.max_joint_acceleration,
@@ -71,7 +77,17 @@ class LockstepArm:
             moving=bool(np.abs(speeds).max() >= AT_REST),
             digital_inputs=model.digital_inputs,
             digital_outputs=model.digital_outputs,
+            device_time=self._clock.now(),
         )
+
+    @contextmanager
+    def record(self) -> Iterator[list[ArmState]]:
+        """The states at each tick while the context is open; the device's clock is the world's."""
+        self._recorded = []
+        try:
+            yield self._recorded
+        finally:
+            self._recorded = None
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
@@ -81,8 +97,6 @@ class LockstepArm:
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in space to the flange pose (x, y, z, rx, ry, rz) at `speed` m/s."""
-        from cell.geometry.poses import from_ur
-
         target = from_ur(self._limits.check_pose(self.name, flange)).homogeneous
         self._limits.check_linear_move(self.name, speed, acceleration)
         return self._begin(ArmMove(self, self._clock, LinearMove(target, speed, acceleration)))
@@ -147,6 +161,8 @@ class LockstepArm:
 
     def after_tick(self, t: float) -> None:
         """See whether the motion has ended."""
+        if self._recorded is not None:
+            self._recorded.append(self.state())
         if self._motion is not None and not self._motion.done:
             self._motion.after_tick(t)
 
@@ -210,6 +226,7 @@ class ArmMove:
             self.fail(fault(self._arm.name, f"arm.{model.safety.name.lower()}", model.fault_text))
         elif model.idle and not model.moving:
             self._done = True
+            self._arm.rests.append(model.drive.q.copy())
 
 
 class Streamed(ArmMove):

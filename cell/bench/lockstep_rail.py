@@ -25,7 +25,9 @@ _HOME_SWITCH_MODE = 5
 class LockstepRail:
     """The rail `model` as a controller in microsteps shows it; see `drivers.interfaces.Rail` for the promises."""
 
-    def __init__(self, name: str, model: RailModel, clock: Clock, config: RailConfig, wire: np.random.Generator) -> None:
+    def __init__(
+        self, name: str, model: RailModel, clock: Clock, config: RailConfig, wire: np.random.Generator
+    ) -> None:
         """`wire` draws when within a round trip the module answers."""
         self.name = name
         self.statistics = LinkStatistics()
@@ -36,12 +38,16 @@ class LockstepRail:
         self._wire = wire
         self._counts = config.steps_per_turn * config.microsteps / config.lead
         self._homed = False
-        self._configure(
-            microsteps=config.microsteps.bit_length() - 1,
-            max_acceleration=self._pulses(config.acceleration),
-            search_mode=_HOME_SWITCH_MODE,
-            search_speed=self._pulses(0.5 * config.max_speed),
-            switch_speed=self._pulses(0.1 * config.max_speed),
+        self.model.configure(
+            clock.now(),
+            dataclasses.replace(
+                model.settings,
+                microsteps=config.microsteps.bit_length() - 1,
+                max_acceleration=self._pulses(config.acceleration),
+                search_mode=_HOME_SWITCH_MODE,
+                search_speed=self._pulses(0.5 * config.max_speed),
+                switch_speed=self._pulses(0.1 * config.max_speed),
+            ),
         )
 
     def identity(self) -> Identity:
@@ -52,10 +58,14 @@ class LockstepRail:
         """No wire: 0 s."""
         return 0.0
 
+    def counted(self, t: float) -> float:
+        """Position in m as the step counter has it at world time `t`."""
+        return self.model.position(t) / self._counts
+
     def read(self, t: float) -> tuple[float, float]:
         """Host time in s and position in m of a reading that is asked for at `t`."""
         answered = t + float(self._wire.uniform(0.0, ROUND_TRIP_S))
-        return t + 0.5 * ROUND_TRIP_S, self.model.position(answered) / self._counts
+        return t + 0.5 * ROUND_TRIP_S, self.counted(answered)
 
     def state(self) -> RailState:
         """Read position, velocity and switches now."""
@@ -90,7 +100,7 @@ class LockstepRail:
     def sweep(self, start: float, stop: float, speed: float) -> LockstepSweep:
         """Move so that the velocity is constant from `start` to `stop`; see `drivers.interfaces.Rail`."""
         begin, end = self._ends(start, stop, speed)
-        here = self.model.position(self._clock.now()) / self._counts
+        here = self.counted(self._clock.now())
         if abs(here - begin) > _AT_START_M:
             raise InterlockError(
                 self.name, f"stands at {1e3 * here:.3f} mm, the sweep starts at {1e3 * begin:.3f} mm. Move there first"
@@ -113,11 +123,9 @@ class LockstepRail:
     def _start(self, position: float, speed: float) -> None:
         if not self._homed:
             raise InterlockError(self.name, "is not homed, so positions mean nothing yet. Call home() first")
-        self._configure(max_velocity=self._pulses(speed))
-        self.model.move_to(self._clock.now(), round(position * self._counts))
-
-    def _configure(self, **settings: int) -> None:
-        self.model.configure(self._clock.now(), dataclasses.replace(self.model.settings, **settings))
+        now = self._clock.now()
+        self.model.configure(now, dataclasses.replace(self.model.settings, max_velocity=self._pulses(speed)))
+        self.model.move_to(now, round(position * self._counts))
 
     def _pulses(self, value: float) -> int:
         return max(1, round(value * self._counts))

@@ -1,4 +1,4 @@
-"""One simulated cell from its calibration to the placed part, in lock step: the product's own steps, one after another."""
+"""One simulated cell from its calibration to the placed part, in lock step, by the product's own steps."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cell.bench.lockstep import LockstepCell
+from cell.bench.lockstep_arm import LockstepArm
+from cell.bench.lockstep_rail import LockstepRail
 from cell.calibration import ScanObservation, TargetObservation
 from cell.config import CellConfig
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.job_run import classify
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import Mover
 from cell.stored_calibration import CellCalibration
-from cell.supervisor import classify
 from cell.work import JobWork
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
@@ -27,6 +31,8 @@ from sim_backends.world.truth import truth
 from statemachine.policy import Policy
 from statemachine.runner import StepContext
 from statemachine.sequence import State
+
+SWEEP_MEMORY_S = 20.0
 
 Progress = Callable[[float, str], None]
 
@@ -45,8 +51,10 @@ class NoFrames(FrameStore):
 class JobRecord:
     """How one simulated cell did: `outcome` is placed, refused, faulted or aborted, `stage` what it came to.
 
-    `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `repeatability` is
-    the configured (6, 6) covariance of the arm. `wall_s` are seconds on the wall by stage.
+    `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `repeatability`
+    and `kinematic` are the configured (6, 6) covariances of the arm; `rests` (n, 6) the joint angles at the end of
+    each motion, rad; `carriage` (n,) the carriage's true displacement in m at the sweep's rail positions. `wall_s` are
+    seconds on the wall by stage.
     """
 
     seed: int
@@ -60,6 +68,9 @@ class JobRecord:
     at_sweep: dict[str, Any] | None = None
     at_end: dict[str, Any] | None = None
     repeatability: Vector | None = None
+    kinematic: Vector | None = None
+    rests: Vector | None = None
+    carriage: Vector | None = None
     wall_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -74,7 +85,7 @@ def run_whole_job(
     record = JobRecord(seed, level)
     cell = LockstepCell(config, seed, level, job.job.name)
     try:
-        with _timed(record, "calibrate"):
+        with _Timed(record, "calibrate"):
             record.calibration = _calibrate(cell, config, job, record, lambda f, t: tell(0.6 * f, f"calibrate: {t}"))
         with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
             _steps(cell, config, job, nominal, record, Path(folder), tell)
@@ -82,6 +93,9 @@ def run_whole_job(
         failure = classify(error)
         record.outcome, record.reason = failure.outcome.value, failure.reason
     record.at_end = truth(cell.world)
+    arm = cell.devices.arm
+    assert isinstance(arm, LockstepArm)
+    record.rests = np.array(arm.rests)
     return record
 
 
@@ -106,19 +120,32 @@ def _steps(
 ) -> None:
     assert record.calibration is not None
     work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder)
-    record.repeatability = work.repeatability
+    record.repeatability, record.kinematic = work.repeatability, work.kinematic
     policy = Policy()
     for k, (name, step) in enumerate(work.steps().items()):
         record.stage = name
         tell(0.6 + 0.4 * k / 6, name)
         context = StepContext(policy.of(State(name)), 1, math.inf, dict(record.results), cell.clock, _ignore)
-        with _timed(record, name):
+        with _Timed(record, name):
             record.results[name] = step(context)
         if name == "laser_sweep":
             record.at_sweep = truth(cell.world)
+            record.carriage = _carriage(cell, record.results[name].swaths[0].rail)
 
 
-class _timed:  # noqa: N801 (reads as a function)
+def _carriage(cell: LockstepCell, positions: Vector) -> Vector:
+    """True displacement (n,) in m of the carriage when the sweep that has just ended was at `positions` (n,) in m."""
+    rail, now = cell.devices.rail, cell.clock.now()
+    assert isinstance(rail, LockstepRail)
+    times = np.arange(max(0.0, now - SWEEP_MEMORY_S), now, 0.002)
+    read = np.array([rail.counted(t) for t in times])
+    # The last rise of the counter is the sweep; before it the rail ran back to where the sweep begins.
+    start = int(np.flatnonzero(np.diff(read) < 0)[-1]) + 1 if (np.diff(read) < 0).any() else 0
+    moments = np.interp(positions, read[start:], times[start:])
+    return np.array([cell.world.rail.carriage(float(t)) for t in moments])
+
+
+class _Timed:
     """Notes how long its block took on the wall."""
 
     def __init__(self, record: JobRecord, stage: str) -> None:

@@ -6,6 +6,7 @@ import typer
 
 from cell.cli import (
     bench_acceptance,
+    bench_accuracy,
     bench_calibration,
     bench_inversion,
     bench_reconstruction,
@@ -36,12 +37,13 @@ app.add_typer(sim.app, name="sim")
 bench = typer.Typer(
     help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
 )
-for register in (
+for register_bench in (
     bench_acceptance.register,
+    bench_accuracy.register,
     bench_calibration.register,
     bench_inversion.register,
     bench_reconstruction.register,
     bench_stripe.register,
 ):
-    register(bench)
+    register_bench(bench)
 app.add_typer(bench, name="bench")

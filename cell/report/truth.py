@@ -113,7 +113,7 @@ def expected_error(
 
     Stripe, rail and calibration as the pose's covariance states them; the arm's repeatability, once for the sweep and
     once for placing, as the world assumes it instead of the `configured` (6, 6) that the covariance was stated with.
-    The arm's kinematic error is not in it.
+    The arm's kinematic error is in it as configured, which is part of the pose's covariance.
     """
     sigma = {
         name: truth["assumed_noise"][name]["sigma"] for name in ("arm_repeatability", "arm_repeatability_rotation")

@@ -10,13 +10,16 @@ from cell.inversion import invert_pose as register
 from cell.job import Job
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction
+from drivers.interfaces import Vector
 
 
-def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface) -> PlacePose:
+def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface, kinematic: Vector) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
-    The prior is the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board do not
-    fit together and `NotObservable` when a direction is not known to the job's tolerance.
+    The base is the arm's own, as it realises it where it places; `kinematic` (6, 6) is the covariance of the surface's
+    place from what the arm's geometry leaves between calibration, sweep and placing. The prior is the board's pose
+    carried on to the surface. Raises `RefusedError` when scan, surface and board do not fit together and
+    `NotObservable` when a direction is not known to the job's tolerance.
     """
     board_from_surface = job.place_from_board.inverse() * job.surface.place_from_surface.se3()
     expected = fix.base_from_board * board_from_surface
@@ -28,5 +31,6 @@ def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalS
         nominal,
         Prior(expected, spread),
         Tolerance(job.place.tolerance, job.place.tolerance_angle),
+        systematic=kinematic,
         calibration=scan.motions,
     )
