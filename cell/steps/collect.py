@@ -11,7 +11,9 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.config import CellConfig
 from cell.geometry.poses import from_ur
 from cell.planning import View, scan_calibration_views, target_calibration_views
+from cell.steps.aiming import Aim
 from cell.steps.moves import HOME, Mover
+from cell.stored_calibration import nominal_camera
 from cell.vision import BoardView, extract, find_board, parse_board
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Camera
@@ -30,8 +32,8 @@ def collect_scan(
 ) -> list[ScanObservation]:
     """Dots and stripe on the fine board, at several depths, tilts and rail positions.
 
-    At each view the laser is off for the photograph and on for the stripe. Raises `RefusedError` when too few
-    views show the board; a view that does not is left out.
+    At each view the laser is off for the photograph and on for the stripe. A view that does not show the board is
+    aimed anew by what the others showed. Raises `RefusedError` when too few views show it even then.
     """
     board = parse_board(config.calibration.fine.board)
     views = scan_calibration_views(config, board)
@@ -40,6 +42,7 @@ def collect_scan(
         progress(0.0, "homing the rail")
         rail.home().wait(60.0)
     mover.to_joints(HOME)
+    aim = Aim(config, nominal_camera(config.scan_camera))
     made: list[ScanObservation] = []
     refusals = Counter[str]()
     for k, view in enumerate(views):
@@ -50,8 +53,16 @@ def collect_scan(
         travel.wait(30.0)
         camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
         seen = _look(camera, lambda image: find_board(image, board), refusals)
+        for other in aim.instead_of(view) if seen is None else ():
+            check()
+            progress(k / len(views), f"fine board, view {k + 1} of {len(views)}, aimed anew")
+            if _can_move(devices, mover, other, k):
+                seen = _look(camera, lambda image: find_board(image, board), refusals)
+            if seen is not None:
+                break
         if seen is None:
             continue
+        aim.learn(seen, from_ur(devices.arm.state().flange), rail.state().position)
         camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
         with devices.laser.lit():
             stripe = extract(camera.grab().image)
@@ -88,6 +99,15 @@ def _move(devices: Devices, mover: Mover, view: View, k: int) -> None:
             raise
         devices.arm.recover()
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
+
+
+def _can_move(devices: Devices, mover: Mover, view: View, k: int) -> bool:
+    """To a view that was not planned; False when it cannot be reached, or not without touching something."""
+    try:
+        _move(devices, mover, view, k)
+    except RefusedError:
+        return False
+    return True
 
 
 def _look(camera: Camera, find: Callable[..., BoardView], refusals: Counter[str]) -> BoardView | None:

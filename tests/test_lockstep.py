@@ -1,0 +1,155 @@
+"""The cell in lock step keeps the devices' promises, its time is the world's, and the whole job on it is as good as
+its declared noise allows."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from cell.bench.accuracy import LIMITS, figures, summed_up
+from cell.bench.expected import mean_distance
+from cell.bench.lockstep import LockstepCell
+from cell.bench.whole_job import run_whole_job
+from cell.config import load_config
+from cell.inversion import NominalSurface
+from cell.job import load_job
+from drivers.errors import InterlockError
+from sim_backends.clock import SteppedClock
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+
+CONFIG = load_config(None)
+
+
+@pytest.fixture(scope="module")
+def cell() -> LockstepCell:
+    made = LockstepCell(CONFIG, seed=4, level="ideal")
+    made.devices.rail.home().wait(60.0)
+    return made
+
+
+def test_stepped_time_never_runs_back():
+    clock = SteppedClock()
+    clock.step_to(2.0)
+    assert clock.now() == 2.0
+    with pytest.raises(ValueError, match="backwards"):
+        clock.step_to(1.0)
+
+
+def test_waiting_lets_just_that_much_time_pass(cell):
+    before = cell.clock.now()
+    cell.clock.sleep(0.123)
+    assert cell.clock.now() == pytest.approx(before + 0.123, abs=1e-12)
+    assert cell.world.arm.time == pytest.approx(before + 0.123, abs=1e-12)
+
+
+def test_a_rail_move_takes_the_time_of_its_trapezoid(cell):
+    rail = cell.devices.rail
+    rail.move_to(0.010).wait(30.0)
+    begun = cell.clock.now()
+    rail.move_to(0.090).wait(30.0)
+    speed, acceleration = CONFIG.rail.max_speed, CONFIG.rail.acceleration
+    assert cell.clock.now() - begun == pytest.approx(0.080 / speed + speed / acceleration, abs=0.02)
+    assert rail.state().position == pytest.approx(0.090, abs=1e-7)
+
+
+def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):
+    rail = cell.devices.rail
+    with pytest.raises(InterlockError):
+        rail.sweep(0.02, 0.03, 0.015)
+    rail.move_to(rail.sweep_start(0.02, 0.03, 0.015)).wait(30.0)
+    sweep = rail.sweep(0.02, 0.03, 0.015)
+    sweep.wait(30.0)
+    begin, end = sweep.window
+    assert end - begin == pytest.approx(0.010 / 0.015, rel=1e-3)
+    for time in np.linspace(begin, end, 7)[1:-1]:
+        # Answers fall anywhere in half a millisecond: 15 mm/s make 7 µm of it, and the line averages them.
+        assert sweep.position_at(time) == pytest.approx(cell.world.rail.carriage(time), abs=4e-6)
+
+
+def test_the_arm_arrives_where_it_was_sent(cell):
+    arm = cell.devices.arm
+    start = arm.state().joints
+    end = start + np.array([0.1, -0.05, 0.05, 0.0, 0.1, 0.2])
+    times = np.linspace(0.0, 2.0, 101)
+    smooth = 3 * (times / 2) ** 2 - 2 * (times / 2) ** 3
+    arm.follow(times, start + smooth[:, None] * (end - start)).wait(10.0)
+    state = arm.state()
+    assert not state.moving
+    np.testing.assert_allclose(state.joints, end, atol=2e-3)
+    expected = Kinematics(UR10E_DH).forward(state.joints)
+    np.testing.assert_allclose(state.flange[:3], expected[:3, 3], atol=1e-9)
+
+
+def test_the_vehicle_counts_the_way_that_it_drove(cell):
+    vehicle = cell.devices.vehicle
+    vehicle.enable()
+    before, there = vehicle.state(), cell.world.vehicle.planar(cell.clock.now())
+    for _ in range(25):
+        vehicle.drive(0.2, 0.0)
+        cell.clock.sleep(0.04)
+    vehicle.brake()
+    after, here = vehicle.state(), cell.world.vehicle.planar(cell.clock.now())
+    assert np.hypot(after.x - before.x, after.y - before.y) == pytest.approx(
+        np.hypot(here[0] - there[0], here[1] - there[1]), abs=2e-3
+    )
+    assert after.braked
+    assert after.speed == 0.0
+    with pytest.raises(InterlockError):
+        vehicle.drive(0.1, 0.0)
+
+
+def test_frames_follow_each_other_in_world_time(cell):
+    camera = cell.devices.scan_camera
+    camera.configure(0.002, 50.0)
+    with camera.stream() as frames:
+        begun = cell.clock.now()
+        made = [frames.next(1.0) for _ in range(3)]
+    assert [b.frame_id - a.frame_id for a, b in pairwise(made)] == [1, 1]
+    times = [frame.host_time for frame in made]
+    np.testing.assert_allclose(np.diff(times), 0.02, atol=1e-6)
+    # Clocks are compared to half a round trip.
+    assert times[0] == pytest.approx(begun, abs=2.5e-4)
+    assert made[0].image.shape == camera.shape == (480, 640)
+
+
+def test_the_laser_is_seen_only_while_it_is_lit(cell):
+    lit_before = cell.world.laser.at(cell.clock.now())
+    with cell.devices.laser.lit():
+        lit = cell.world.laser.at(cell.clock.now())
+    assert (lit_before, lit, cell.world.laser.at(cell.clock.now())) == (False, True, False)
+
+
+def test_the_mean_length_of_a_round_gaussian_error_is_the_closed_form():
+    # Maxwell's distribution: 2 σ √(2/π).
+    assert mean_distance(np.eye(3)[None] * 4e-10) == pytest.approx(2 * 2e-5 * np.sqrt(2 / np.pi), rel=0.03)
+
+
+def test_the_whole_job_at_nominal_is_as_good_as_its_declared_noise():
+    job, mesh = load_job("pot")
+    quick = job.model_copy(update={"scan": job.scan.model_copy(update={"speed": 0.030})})
+    nominal = NominalSurface.load(mesh)
+    record = run_whole_job(CONFIG, quick, nominal, 2, "nominal")
+    assert (record.outcome, record.reason) == ("placed", "")
+    run = figures(record, CONFIG, quick, nominal)
+    result = summed_up([run], "nominal")
+    # One run is one draw of the calibration: three times what is expected on average is out of reach of chance.
+    for key in ("sensor_scan_mm", "arm_base_mm", "placement_mm"):
+        assert 0.0 < result[key]["mean"] < 3.0 * result[key]["bound"]
+        assert result[key]["bound"] < LIMITS[key]["mean"]
+    assert result["sensor_scan_mm"]["aligned_mean"] < result["sensor_scan_mm"]["mean"]
+    assert result["outcomes"]["placed_within_tolerance"] == 1
+    assert result["tilt_mrad"]["max"] < LIMITS["tilt_mrad"]["max"]
+    assert result["chi2_per_dof"]["calibration"] == pytest.approx(1.0, abs=0.05)
+    assert set(result["assumed_noise"]) >= {"arm_repeatability", "arm_dh_length", "speckle_contrast"}
+
+
+def test_runs_that_end_early_are_counted_with_their_reasons():
+    refused = {"seed": 3, "level": "harsh", "outcome": "refused", "reason": "no board", "stage": "calibrate"}
+    result = summed_up([refused], "harsh")
+    assert result["outcomes"]["refused"] == 1
+    assert result["outcomes"]["placed_outside_tolerance"] == 0
+    assert result["outcomes"]["reasons"] == {"calibrate: no board": 1}
+    assert result["placement_mm"]["mean"] is None
+    assert "limits" not in result
