@@ -399,7 +399,7 @@ def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
         assert np.abs(np.delete(motion, axis)).max() < 1e-9
 
 
-@pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "worn 0.3 to 2 mm on one side", "turned by 180°", "mirrored"])
+@pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "turned by 180°", "mirrored"])
 def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str) -> None:
     ended = [judge_case(case, seed).ended for seed in range(3)]
     assert "outside" not in ended

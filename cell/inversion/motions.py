@@ -24,7 +24,7 @@ def sorted_out(ways: Array, radius: float) -> list[Array]:
     turning = basis @ mixes[sizes > PURE].T
     found = [np.append(axis, np.zeros(3)) for axis in _aligned(slides[:3])]
     for axis in _aligned(turning[3:]):
-        mix = np.linalg.pinv(turning[3:]) @ axis
+        mix = np.linalg.pinv(turning[3:] / radius) @ axis
         found.append(turning @ mix / np.array([1.0] * 3 + [radius] * 3))
     return found
 
