@@ -74,6 +74,7 @@ def _show(console: Console, report: dict[str, Any]) -> None:
             "points": "{points}",
             "ms per profile as it arrives": "{ms_per_profile:.2f}",
             "ms after the last frame": "{ms_after_last_frame:.0f}",
+            "of the processor, all threads": "{processor_ms_after_last_frame:.0f}",
         },
     )
 
