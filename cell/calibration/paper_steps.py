@@ -25,7 +25,7 @@ from drivers.errors import RefusedError
 
 LEAST_IN_ROW = 3
 # Crossings further out than this many pitches beyond a row's last dot are extrapolated too far.
-BEYOND_PITCHES = 4.0
+BEYOND_PITCHES = 1.0
 # Points on fewer than two views, or nearly on one line (second spread below this share of the first), make no plane.
 LEAST_VIEWS, LEAST_SPREAD = 2, 0.02
 
