@@ -103,7 +103,8 @@ def paper_check(joint: Joint, observations: Observations) -> dict[str, Any] | No
     poses = [
         state.camera_from_board(flange, rail) for flange, rail in zip(state.flanges, state.rails.tolist(), strict=True)
     ]
-    paper = paper_plane_of(state.camera, poses, observations.scan, staged.plane.rows)
+    rests = [o for o in observations.scan if not o.same_rest]
+    paper = paper_plane_of(state.camera, poses, rests, staged.plane.rows)
     if paper is None:
         return None
     seen = state.plane.intersect(state.camera.rays(np.concatenate([view.stripe for view in joint.views])))

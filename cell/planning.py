@@ -133,6 +133,45 @@ def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]
     return views
 
 
+def verification_views(config: CellConfig, fine: BoardSpec, large: BoardSpec) -> tuple[View, View]:
+    """One of the scan camera's calibration views and one of the target camera's.
+
+    The arm's kinematic error at these very poses is part of the calibration. The rail stands near its middle, so that
+    it can move both ways, and the boards are tilted.
+    """
+    return (
+        scan_calibration_views(config, fine)[SCAN_VERIFICATION],
+        target_calibration_views(config, large)[TARGET_VERIFICATION],
+    )
+
+
+def rail_ends(
+    scan: ScanCalibration, base_from_board: pin.SE3, view: View, board: BoardSpec, travel: tuple[float, float]
+) -> tuple[float, float]:
+    """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots."""
+    points, radius = board.points(), board.dot_radius
+    rings = [row * board.cols + column for column, row in board.rings]
+    size = np.array([scan.camera.width, scan.camera.height])
+
+    def shown(rail: float) -> bool:
+        if not travel[0] <= rail <= travel[1]:
+            return False
+        base_from_camera = view.base_from_flange * scan.flange_from_camera_at(rail)
+        seen = transform(base_from_camera.inverse() * base_from_board, points)
+        room = EDGE_PX + scan.camera.fx * radius / seen[:, 2:]
+        pixels = scan.camera.project(seen)
+        inside = np.logical_and(pixels > room, pixels < size - 1 - room).all(axis=1)
+        return bool(np.take(inside, rings).all() and np.mean(inside) >= LEAST_DOTS)
+
+    ends = []
+    for way in (-RAIL_STEP, RAIL_STEP):
+        rail = view.rail_position
+        while shown(rail + way):
+            rail += way
+        ends.append(rail)
+    return ends[0], ends[1]
+
+
 def _tilted(
     base_from_board: pin.SE3, board: BoardSpec, offset: np.ndarray, depth: float, rx: float, ry: float, rz: float
 ) -> pin.SE3:
@@ -140,6 +179,9 @@ def _tilted(
     centre = base_from_board * from_parts(centre_of(board))
     return centre * from_parts(np.zeros(3), rotation) * from_parts(offset - np.array([0.0, 0.0, depth]))
 
+
+SCAN_VERIFICATION, TARGET_VERIFICATION = 6, 5
+EDGE_PX, LEAST_DOTS, RAIL_STEP = 12.0, 0.5, 1e-3
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.
 _SCAN_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (

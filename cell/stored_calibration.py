@@ -19,8 +19,9 @@ from cell.calibration import (
     TargetObservation,
 )
 from cell.calibration.archive import SUFFIX, Observations, write_archive
-from cell.calibration.joint import Joint, solve_joint, solve_staged
-from cell.calibration.results import Quality, adjust_target, sigmas
+from cell.calibration.faults import refuse_wrong_lead
+from cell.calibration.joint import Joint
+from cell.calibration.results import Quality, adjust_scan, adjust_target, sigmas
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.runs import write_json
@@ -133,16 +134,20 @@ def gathered(
         rail=config.calibration.rail_sigma,
     )
     cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
-    return Observations(scan, target, *cameras, priors, identities, config.calibration_hash(), time.time())
+    return Observations(
+        scan, target, *cameras, priors, config.rail.lead, identities, config.calibration_hash(), time.time()
+    )
 
 
 def solve_observations(observations: Observations) -> Solved:
     """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
     o = observations
-    scan = solve_joint(o.scan, solve_staged(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0])), o.priors)
+    scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
+    head = ScanCalibration.of(scan, o.scan)
+    refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
-    found = ScanCalibration.of(scan), TargetCalibration.of(target)
-    return Solved(CellCalibration(*found, o.identities, o.configuration, o.made), scan, target)
+    made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made)
+    return Solved(made, scan, target)
 
 
 def nominal_camera(config: CameraConfig) -> CameraModel:

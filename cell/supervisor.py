@@ -26,6 +26,7 @@ from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
+from cell.steps.verify import Verification, collect_verification
 from cell.stored_calibration import (
     CellCalibration,
     find_calibration,
@@ -243,6 +244,29 @@ class Cell:
         save_with_observations(calibration, observations, self.calibrations_folder)
         tell(1.0, "stored")
         return calibration
+
+    def verify(self, observer: Observer | None = None, job: str | Path = "pot") -> Verification:
+        """Look at the deck boards again and say how good the stored calibration is today.
+
+        Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
+        seen. `job` names the part that may be in the claw and what the place error is reckoned for.
+        """
+        loaded, _ = load_job(job)
+        calibration = self.calibration()
+
+        def tell(fraction: float, text: str) -> None:
+            if observer is not None:
+                observer(Event("progress", "verify", {"fraction": fraction, "text": text}))
+
+        def work(check: Callable[[], None]) -> Verification:
+            self.devices.vehicle.brake()
+            mover = self.mover(loaded)
+            seen = collect_verification(self.config, self.devices, mover, calibration, check, tell)
+            return Verification.of(calibration, loaded, seen)
+
+        verification = self.guarded("verification", work)
+        tell(1.0, "done")
+        return verification
 
     def home(self) -> None:
         """Home the rail and fold the arm above the deck."""

@@ -179,7 +179,7 @@ def _calibration(
 ) -> tuple[Vector, Vector]:
     """Covariance (21, 21) of the scan head's parameters under the declared noise, and their shift (21, 18) by the
     arm's kinematic error: the flange is not where it is reported, view by view, and the adjustment follows."""
-    observations = record.observations[0]
+    observations = [o for o in record.observations[0] if not o.same_rest]
     staged = solve_staged(observations, nominal_camera(config.scan_camera), np.array([1.0, 0.0, 0.0]))
     priors = Priors(
         arm_translation=max(noise["arm_repeatability"] / np.sqrt(3.0), 1e-6),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,11 @@ class Priors:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """Result: the state, the covariance (27, 27) of the shared parameters, χ² per degree of freedom, found noise."""
+    """Result: the state, the covariance (27, 27) of the shared parameters, χ² per degree of freedom, found noise.
+
+    `excess` says by how much the flange's shifts and turns and the rail's readings scatter more than the priors say
+    ("shift", "turn", "rail": found over stated standard deviation; 1 where nothing was found).
+    """
 
     state: State
     covariance: Array
@@ -72,6 +76,7 @@ class Adjusted:
     stripe_rms_m: float
     priors: Priors
     iterations: int
+    excess: dict[str, float] = field(default_factory=dict)
 
 
 class Adjustment:
@@ -109,6 +114,7 @@ class Adjustment:
             *self.residual_rms(state),
             self.priors,
             iterations,
+            {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
         )
 
     def information(self, state: State) -> Normal:
@@ -179,10 +185,8 @@ class Adjustment:
         factors = {}
         groups = ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else [])
         for name in groups:
-            block = normal.groups[name]
-            if block.count == 0:
-                continue
-            factors[name] = float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
+            if normal.groups[name].count:
+                factors[name] = _scatter(normal, inverse, name)
         p = self.priors
         self.priors = replace(
             p,
@@ -191,6 +195,14 @@ class Adjustment:
             arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
             arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
         )
+
+
+def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:
+    """Found over assumed standard deviation of a group: the root of its cost over the expected; 1 for an empty one."""
+    block = normal.groups[name]
+    if block.count == 0:
+        return 1.0
+    return float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
 
 
 def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:

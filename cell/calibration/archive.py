@@ -36,8 +36,8 @@ PROFILE = ("centres", "sigma", "amplitude", "width", "saturated", "double")
 class Observations:
     """All that a cell's calibration is solved from.
 
-    The cameras as drawn, the noise assumed beforehand, and whose they are: serial numbers by device name, the hash of
-    the configuration, the time in seconds since the epoch.
+    The cameras as drawn, the noise assumed beforehand, the rail's lead as configured in m per turn, and whose they are:
+    serial numbers by device name, the hash of the configuration, the time in seconds since the epoch.
     """
 
     scan: list[ScanObservation]
@@ -45,6 +45,7 @@ class Observations:
     scan_camera: CameraModel
     target_camera: CameraModel
     priors: Priors
+    rail_lead: float
     identities: dict[str, str]
     configuration: str
     made: float
@@ -58,6 +59,7 @@ def write_archive(path: Path, observations: Observations) -> None:
         "made": o.made,
         "identities": o.identities,
         "configuration": o.configuration,
+        "rail_lead": o.rail_lead,
         "priors": {name: getattr(o.priors, name) for name in PRIORS},
         "scan_camera": _camera_dict(o.scan_camera),
         "target_camera": _camera_dict(o.target_camera),
@@ -65,6 +67,7 @@ def write_archive(path: Path, observations: Observations) -> None:
     arrays = _views("scan", [(s.view, s.base_from_flange, s.name) for s in o.scan])
     arrays |= _views("target", [(t.view, t.base_from_flange, t.name) for t in o.target])
     arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
+    arrays["scan_same_rest"] = np.array([s.same_rest for s in o.scan], dtype=np.bool_)
     arrays |= _profiles([s.profile for s in o.scan])
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
@@ -92,12 +95,15 @@ def read_archive(path: Path) -> Observations:
         scan = _read_views(data, "scan")
         profiles = _read_profiles(data, len(scan))
         rails = _finite(data, "scan_rail", (len(scan),))
+        same_rest = np.asarray(data["scan_same_rest"])
+        if same_rest.shape != (len(scan),) or same_rest.dtype != np.bool_:
+            raise ValueError(f"scan_same_rest must say yes or no for each of {len(scan)} views")
         shift, turn, along = (_positive(about["priors"], name) for name in PRIORS)
         priors = Priors(shift, turn, along)
         return Observations(
             [
-                ScanObservation(view, profile, flange, float(rail), name)
-                for (view, flange, name), profile, rail in zip(scan, profiles, rails, strict=True)
+                ScanObservation(view, profile, flange, float(rail), name, bool(same))
+                for (view, flange, name), profile, rail, same in zip(scan, profiles, rails, same_rest, strict=True)
             ],
             [
                 TargetObservation(view, flange, name)
@@ -107,6 +113,7 @@ def read_archive(path: Path) -> Observations:
             _camera(about["scan_camera"]),
             _camera(about["target_camera"]),
             priors,
+            _positive(about, "rail_lead"),
             {str(name): str(serial) for name, serial in about["identities"].items()},
             str(about["configuration"]),
             float(about["made"]),

@@ -36,7 +36,7 @@ def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
         poses = [board_pose(view, camera).camera_from_board for view in options]
         if placed and len(options) > 1:
             flange = frame.base_from_flange
-            misfit = [np.median([_apart(flange, pose, f, p) for f, p in placed]) for pose in poses]
+            misfit = [np.median([angle_apart(flange, pose, f, p) for f, p in placed]) for pose in poses]
             best = int(np.argmin(misfit))
         else:
             best = 0
@@ -51,7 +51,7 @@ def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> lis
     apart: Array = np.zeros((len(kept), len(kept)))
     for (i, a), (j, b) in product(enumerate(kept), repeat=2):
         if i != j:
-            apart[i, j] = _apart(a.base_from_flange, poses[id(a)], b.base_from_flange, poses[id(b)])
+            apart[i, j] = angle_apart(a.base_from_flange, poses[id(a)], b.base_from_flange, poses[id(b)])
     index = list(range(len(kept)))
     while len(index) > 2:
         inner = apart[np.ix_(index, index)] + np.diag(np.full(len(index), np.nan))
@@ -125,7 +125,7 @@ def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
     return off
 
 
-def _apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
+def angle_apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
     """Difference in rad between the angles of the flange's and the board's turn."""
     hand = float(np.linalg.norm(pin.log3(a_flange.rotation.T @ b_flange.rotation)))
     eye = float(np.linalg.norm(pin.log3(a_board.rotation @ b_board.rotation.T)))

@@ -16,6 +16,7 @@ class ScanObservation:
 
     `view` is the board in a picture, `profile` the laser stripe on the same board at the same pose, in the same picture
     or another; either may be None, not both. `base_from_flange` as the arm reports it, `rail_position` in m.
+    `same_rest` says that only the rail has moved since the observation before: the arm's repeatability is the same.
     """
 
     view: BoardView | None
@@ -23,6 +24,7 @@ class ScanObservation:
     base_from_flange: pin.SE3
     rail_position: float = 0.0
     name: str = ""
+    same_rest: bool = False
 
 
 @dataclass(frozen=True, eq=False)

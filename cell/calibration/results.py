@@ -11,17 +11,22 @@ import pinocchio as pin
 
 from cell.calibration.adjustment import Priors
 from cell.calibration.blocks import HAND, SHARED, State
+from cell.calibration.faults import refuse_bent, refuse_exchanged, refuse_slipped
 from cell.calibration.joint import (
     Joint,
+    Staged,
     effective_hand_eye_covariance,
     solve_joint,
     solve_staged,
 )
 from cell.calibration.observations import ScanObservation, TargetObservation
+from cell.calibration.rail_moves import with_rail_moves
+from cell.calibration.reference import Reference
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, from_parts
 from cell.reconstruction.build import ScanGeometry
+from cell.vision.board import board_pose
 
 PARAMETERS = (
     "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
@@ -60,7 +65,7 @@ class ScanCalibration:
     `rail_direction` (3,): metres that the camera moves, in its own axes, per metre of rail reading (direction times
     scale). `flange_from_camera` holds at rail position 0. `covariance` (21, 21) in the order of `PARAMETERS`; the light
     plane's tilts are about the tangents of `cell.calibration.blocks.tangents`, the hand-eye's are (translation,
-    rotation) in flange axes.
+    rotation) in flange axes. `reference` is what a verification compares with; files of older programs have none.
     """
 
     camera: CameraModel
@@ -69,19 +74,21 @@ class ScanCalibration:
     flange_from_camera: pin.SE3
     covariance: Array
     quality: Quality
+    reference: Reference | None = None
 
     @classmethod
-    def of(cls, joint: Joint) -> ScanCalibration:
-        """What a joint adjustment with a stripe found."""
-        state = joint.adjusted.state
+    def of(cls, joint: Joint, observations: Sequence[ScanObservation]) -> ScanCalibration:
+        """What a joint adjustment with a stripe found, with the rail from observations of one rest each."""
+        state, reference = with_rail_moves(joint.adjusted, observations)
         assert state.plane is not None
         return cls(
             state.camera,
             state.plane,
             state.rail_direction,
             state.flange_from_camera,
-            joint.adjusted.covariance[:KEPT, :KEPT],
+            reference.covariance[:KEPT, :KEPT],
             Quality.of(joint),
+            reference,
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
@@ -121,6 +128,7 @@ class ScanCalibration:
             "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
             "covariance": self.covariance.tolist(),
             "quality": vars(self.quality),
+            "reference": None if self.reference is None else self.reference.as_dict(),
         }
 
     @classmethod
@@ -133,6 +141,7 @@ class ScanCalibration:
             from_matrix(data["flange_from_camera"]),
             np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
             Quality(**data["quality"]),
+            Reference.read(data.get("reference")),
         )
 
 
@@ -144,12 +153,19 @@ class TargetCalibration:
     flange_from_camera: pin.SE3
     hand_eye_covariance: Array
     quality: Quality
+    reference: Reference | None = None
 
     @classmethod
     def of(cls, joint: Joint) -> TargetCalibration:
         """What a joint adjustment found."""
         state = joint.adjusted.state
-        return cls(state.camera, state.flange_from_camera, effective_hand_eye_covariance(joint), Quality.of(joint))
+        return cls(
+            state.camera,
+            state.flange_from_camera,
+            effective_hand_eye_covariance(joint),
+            Quality.of(joint),
+            Reference.of(joint.adjusted),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
@@ -158,6 +174,7 @@ class TargetCalibration:
             "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
             "hand_eye_covariance": self.hand_eye_covariance.tolist(),
             "quality": vars(self.quality),
+            "reference": None if self.reference is None else self.reference.as_dict(),
         }
 
     @classmethod
@@ -168,14 +185,26 @@ class TargetCalibration:
             from_matrix(data["flange_from_camera"]),
             np.array(data["hand_eye_covariance"], dtype=np.float64).reshape(6, 6),
             Quality(**data["quality"]),
+            Reference.read(data.get("reference")),
         )
 
 
 def calibrate_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> ScanCalibration:
-    """Closed form, then the joint adjustment. Raises `RefusedError` when the observations do not determine it."""
-    return ScanCalibration.of(solve_joint(observations, solve_staged(observations, nominal, rail_direction), priors))
+    """Closed form, the joint adjustment, and the rail from observations of one rest each.
+
+    Raises `RefusedError` when the observations do not determine it.
+    """
+    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors), observations)
+
+
+def adjust_scan(
+    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
+) -> Joint:
+    """The joint adjustment of the scan head, from the observations with a rest of the arm of their own."""
+    rests = [o for o in observations if not o.same_rest]
+    return _solve(rests, solve_staged(rests, nominal, rail_direction), priors, "scan", "fine")
 
 
 def calibrate_target(
@@ -188,7 +217,21 @@ def calibrate_target(
 def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
     """The joint adjustment of a camera without laser and rail."""
     same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
-    return solve_joint(same, solve_staged(same, nominal, stripe=False), priors)
+    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large")
+
+
+def _solve(observations: Sequence[ScanObservation], staged: Staged, priors: Priors, camera: str, board: str) -> Joint:
+    """The joint adjustment, after and before the checks for faults that have a name."""
+    names = [o.name for o in observations]
+    if all(o.view is not None for o in observations):
+        refuse_exchanged(names, [o.base_from_flange for o in observations], staged.camera_from_board)
+    joint = solve_joint(observations, staged, priors)
+    refuse_bent(board, joint.adjusted, joint.views)
+    seen = [o.view for o in observations if o.view is not None]
+    if len(seen) == len(observations):
+        poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
+        refuse_slipped(camera, names, joint.adjusted, joint.views, poses)
+    return joint
 
 
 def sigmas(covariance: Array) -> dict[str, float]:

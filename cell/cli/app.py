@@ -11,6 +11,7 @@ from cell.cli import (
     bench_inversion,
     bench_reconstruction,
     bench_stripe,
+    bench_verify,
     calibrate,
     devices,
     export,
@@ -44,6 +45,7 @@ for register_bench in (
     bench_inversion.register,
     bench_reconstruction.register,
     bench_stripe.register,
+    bench_verify.register,
 ):
     register_bench(bench)
 app.add_typer(bench, name="bench")

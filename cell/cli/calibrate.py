@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import calibrate_solve
+from cell.cli import calibrate_solve, verify
 from cell.cli.options import (
     ConfigOption,
     JobOption,
@@ -21,10 +21,11 @@ from cell.cli.options import (
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
+    """Add the commands of this file, and those below `cell calibrate`."""
     group = typer.Typer(invoke_without_command=True)
     group.callback()(calibrate)
     calibrate_solve.register(group)
+    verify.register(group)
     app.add_typer(group, name="calibrate")
 
 
@@ -47,10 +48,10 @@ def calibrate(
 
     Moves the cell through its own calibration poses over the boards on its deck; with --from it moves nothing.
     """
-    from drivers.errors import ConfigError
-
     if context.invoked_subcommand is not None:
         return
+    from drivers.errors import ConfigError
+
     if source is None and board is not None:
         raise ConfigError("--board belongs to --from; the boards on the deck are named in the configuration")
     if source is not None:

@@ -69,6 +69,7 @@ class Collector:
     scan: ScanSection
     keep_frame: Callable[[Frame], None]
     progress: Callable[[float, str], None]
+    keep_profile: Callable[[StripeProfile], None] | None = None
     times: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     frame_ids: list[int] = field(default_factory=list)
@@ -94,6 +95,8 @@ class Collector:
     def see(self, frame: Frame) -> None:
         """Triangulate the stripe of one frame."""
         profile = extract(frame.image)
+        if self.keep_profile is not None:
+            self.keep_profile(profile)
         self.counts.append(self.builder.see(profile))
         self.times.append(frame.mid_exposure)
         self.frame_ids.append(frame.frame_id)

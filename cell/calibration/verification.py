@@ -1,0 +1,187 @@
+"""How good is a stored calibration today? One decision from a view of each deck board and a sweep over the fine one.
+
+Every part of the chain that may have changed is a hypothesis: a change of about `SHIFT` or `TURN` of its parameters
+against none. Their mean Bayes factor is the statistic; what it exceeds by chance is found by drawing scores from their
+own covariance, so that a good calibration is called disturbed in `FALSE_ALARMS` of all checks. The most probable part
+is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.calibration.blocks import BOARD, HAND, PLANE, RAIL, SHARED, State
+from cell.calibration.evidence import Evidence
+from cell.geometry.camera import Array
+
+SHIFT, TURN = 0.2e-3, float(np.deg2rad(0.05))
+"""The disturbance that has to be found, m and rad."""
+SCAN_DEPTH, TARGET_DEPTH = 0.13, 0.65
+"""Where a shift of a focal length counts, m in front of the camera."""
+FALSE_ALARMS = 0.03
+WORST_FIT = 1.6
+"""Residuals larger than this many times the calibration's own have another cause than a moved part."""
+DRAWS = 8_000
+LEAST_PROBABILITY = 0.1
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change of parameters `index` of one camera's chain, of about `size` each; `part` is what a person would fix."""
+
+    part: str
+    index: tuple[int, ...]
+    size: tuple[float, ...]
+    unit: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A part that may have changed: how probable among the parts, and the most probable change (27,) of the chain."""
+
+    chain: str
+    part: str
+    probability: float
+    change: Array
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One compared quantity with one standard deviation of what a good calibration gives."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """`statistic` is the logarithm of the mean Bayes factor for a change, `threshold` what chance reaches.
+
+    `fit` holds RMS residuals over the calibration's own by kind; `suspects` come most probable first.
+    """
+
+    statistic: float
+    threshold: float
+    fit: dict[str, float]
+    suspects: list[Suspect]
+    figures: list[Figure]
+
+    @property
+    def badly_fitting(self) -> list[str]:
+        """Kinds of measurement that fit no change of the calibrated parts."""
+        return [kind for kind, value in self.fit.items() if value > WORST_FIT]
+
+    @property
+    def good(self) -> bool:
+        """True when nothing speaks for a change."""
+        return self.statistic <= self.threshold and not self.badly_fitting
+
+
+def hypotheses(chain: str, focal: float) -> list[Hypothesis]:
+    """What may change in the chain of the "scan" or the "target" camera of `focal` length in px."""
+    hand = range(HAND.start, HAND.stop)
+    mount, lens = f"{chain} camera's mount on the flange", f"{chain} camera's lens"
+    depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
+    made = [
+        Hypothesis(mount, tuple(hand[:3]), (SHIFT,) * 3, ("m",) * 3),
+        Hypothesis(mount, tuple(hand[3:]), (TURN,) * 3, ("rad",) * 3),
+        Hypothesis(lens, (2, 3), (TURN * focal,) * 2, ("px",) * 2),
+        Hypothesis(lens, (0, 1), (SHIFT / depth * focal,) * 2, ("px",) * 2),
+    ]
+    if chain == "scan":
+        plane, rail = range(PLANE.start, PLANE.stop), range(RAIL.start, RAIL.stop)
+        made += [
+            Hypothesis("laser's light plane", tuple(plane), (TURN, TURN, SHIFT), ("rad", "rad", "m")),
+            Hypothesis("rail", tuple(rail), (TURN,) * 3, ("m/m",) * 3),
+        ]
+    return made
+
+
+def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> Verdict:
+    """Decide, by chain ("scan", "target"), from the evidence and the calibrated states that it was weighed against."""
+    tests = [(name, h) for name in evidences for h in hypotheses(name, states[name].camera.fx)]
+    found = np.array([_log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
+    rng = np.random.default_rng(0)
+    drawn = np.empty((DRAWS, len(tests)))
+    for name, weighed in evidences.items():
+        scores = rng.normal(size=(DRAWS, SHARED)) @ _root(weighed.information).T
+        for k, (chain, h) in enumerate(tests):
+            if chain == name:
+                drawn[:, k] = _log_factor(weighed, h, scores)
+    threshold = float(np.quantile(_log_mean(drawn), 1 - FALSE_ALARMS))
+    fit = {}
+    for name, weighed in evidences.items():
+        fit[f"{name} dots"] = weighed.dots
+        if np.isfinite(weighed.stripe):
+            fit["stripe"] = weighed.stripe
+    figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
+    return Verdict(float(_log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures)
+
+
+def _log_factor(weighed: Evidence, h: Hypothesis, scores: Array) -> Array:
+    """Logarithms (n,) of the Bayes factor for a Gaussian change of size `h.size` against none, for scores (n, 27)."""
+    index, size = list(h.index), np.array(h.size)
+    information = weighed.information[np.ix_(index, index)] * size[:, None] * size
+    posterior = np.eye(len(index)) + information
+    s = scores[:, index] * size
+    gain = 0.5 * np.einsum("ni,ni->n", s, np.linalg.solve(posterior, s.T).T)
+    return np.asarray(gain - 0.5 * np.linalg.slogdet(posterior)[1], dtype=np.float64)
+
+
+def _log_mean(factors: Array) -> Array:
+    """Logarithm (n,) of the mean of exp over the last axis of (n, k)."""
+    most = factors.max(axis=1)
+    return np.asarray(most + np.log(np.mean(np.exp(factors - most[:, None]), axis=1)), dtype=np.float64)
+
+
+def _root(information: Array) -> Array:
+    """A matrix (27, 27) whose product with its transpose is the information."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / scale[:, None] / scale)
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+
+
+def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothesis]], found: Array) -> list[Suspect]:
+    """Parts by probability, where each hypothesis is as probable as any other beforehand."""
+    weight = np.exp(found - found.max())
+    weight /= weight.sum()
+    parts: dict[tuple[str, str], list[int]] = {}
+    for k, (chain, h) in enumerate(tests):
+        parts.setdefault((chain, h.part), []).append(k)
+    made = []
+    for (chain, part), members in parts.items():
+        _, h = tests[max(members, key=lambda k: weight[k])]
+        index, weighed = list(h.index), evidences[chain]
+        change = np.zeros(SHARED)
+        held = weighed.information[np.ix_(index, index)] + np.diag(1 / np.array(h.size) ** 2)
+        change[index] = np.linalg.solve(held, weighed.score[index])
+        made.append(Suspect(chain, part, float(weight[members].sum()), change))
+    made.sort(key=lambda suspect: -suspect.probability)
+    return [s for k, s in enumerate(made) if k == 0 or s.probability >= LEAST_PROBABILITY]
+
+
+def _figures(name: str, weighed: Evidence, state: State) -> list[Figure]:
+    """The board against where the calibration found it, and for the scan head light plane and rail, each by itself."""
+    board = np.eye(SHARED)[:, BOARD]
+    moved, covariance = weighed.change(board)
+    sigma = np.sqrt(np.diag(covariance))
+    made = [
+        Figure(f"{name} board, {axis} in the base", 1e3 * float(value), 1e3 * float(s), unit)
+        for axis, unit, value, s in zip(
+            ("x", "y", "z", "about x", "about y", "about z"), ("mm",) * 3 + ("mrad",) * 3, moved, sigma, strict=True
+        )
+    ]
+    if state.plane is not None:
+        quantities = (
+            ("stripe against the photographed board", [PLANE.stop - 1], 1e3, "mm"),
+            ("rail's scale", [RAIL.start], 1e3, "per mille"),
+        )
+        for text, index, factor, unit in quantities:
+            change, spread = weighed.change(np.hstack([board, np.eye(SHARED)[:, index]]))
+            made.append(Figure(text, factor * float(change[-1]), factor * float(np.sqrt(spread[-1, -1])), unit))
+    return made

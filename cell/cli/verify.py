@@ -1,0 +1,79 @@
+"""`cell calibrate verify`: how good the stored calibration is today."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import typer
+
+from cell.cli.options import (
+    ConfigOption,
+    JobOption,
+    JsonOption,
+    Level,
+    LevelOption,
+    SeedOption,
+    SimOption,
+    print_json,
+)  # fmt: skip
+
+
+def register(group: typer.Typer) -> None:
+    """Add the command of this file to `cell calibrate`."""
+    group.command()(verify)
+
+
+def verify(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    json: JsonOption = False,
+) -> None:
+    """Say how good the stored calibration is today, from a view of each deck board and a sweep over the fine one.
+
+    Exit code 0: good. 1: disturbed, with the suspected part and the place error to expect.
+    """
+    from cell.cli.display import ProgressDisplay
+    from cell.supervisor import Cell
+    from drivers.errors import ConfigError
+
+    if config is None and sim is None:
+        raise ConfigError("`cell calibrate verify` needs --config for a real cell or --sim all for a simulated one")
+    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
+        verification = cell.verify(display, job)
+    if json:
+        print_json(verification.summary())
+    else:
+        print_verification(verification.summary())
+    if not verification.good:
+        raise typer.Exit(1)
+
+
+def print_verification(summary: Mapping[str, Any]) -> None:
+    """The comparison for people: each figure with what a good calibration scatters by, then the decision."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title=f"observed today against the calibration of {summary['calibration_date']}")
+    for name in ("quantity", "difference", "sigma if good", "unit"):
+        table.add_column(name, justify="left" if name in ("quantity", "unit") else "right")
+    for row in summary["figures"]:
+        table.add_row(row["name"], f"{row['value']:+.4f}", f"{row['sigma']:.4f}", row["unit"])
+    for kind, value in summary["residuals_over_calibration"].items():
+        table.add_row(
+            f"{kind}: residual over the calibration's", f"{value:.2f}", "1", f"≤ {summary['residuals_allowed']}"
+        )
+    console.print(table)
+    if summary["suspects"]:
+        suspects = Table(title="suspected parts")
+        for name in ("part", "probability", "place error in mm", "most probable change"):
+            suspects.add_column(name, justify="right" if name in ("probability", "place error in mm") else "left")
+        for row in summary["suspects"]:
+            change = ", ".join(f"{name} {value:+.3f}" for name, value in row["change"].items())
+            suspects.add_row(row["part"], f"{row['probability']:.0%}", f"{row['place_error_mm']:.3f}", change)
+        console.print(suspects)
+    console.print(summary["reason"], style="green" if summary["good"] else "red", markup=False, soft_wrap=True)

@@ -1,0 +1,195 @@
+"""Promises of the verification and of the named faults, on worlds that the simulator's optics and arm observe."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.bench.observed_cell import ObservedCell, shifted
+from cell.bench.verification import disturbances, look_again
+from cell.calibration import Priors
+from cell.calibration.faults import refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
+from cell.calibration.joint import solve_joint, solve_staged
+from cell.calibration.results import ScanCalibration
+from cell.calibration.verification_looks import verify
+from cell.config import load_config
+from cell.job import load_job
+from cell.planning import rail_ends, scan_calibration_views
+from cell.steps.verify import Verification
+from cell.stored_calibration import CellCalibration, nominal_camera, read_calibration, save_calibration
+from cell.vision.board import board_pose
+from drivers.errors import CalibrationStale, RefusedError
+from sim_backends.world.scene import draw
+
+CONFIG = load_config(None)
+PRIORS = Priors(CONFIG.arm.repeatability, CONFIG.arm.repeatability_angle, CONFIG.calibration.rail_sigma)
+NOMINAL = nominal_camera(CONFIG.scan_camera)
+ALONG = np.array([1.0, 0.0, 0.0])
+
+
+def world(seed: int, level: str = "nominal") -> ObservedCell:
+    return ObservedCell(draw(seed, level), CONFIG, np.random.default_rng([seed, 7]))
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    cell = world(2)
+    return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "1"}, CONFIG)
+
+
+def test_the_rail_is_known_to_a_tenth_of_a_milliradian(calibrated):
+    cell, calibration = calibrated
+    sigma = np.sqrt(np.diag(calibration.scan.covariance))[12:15]
+    error = calibration.scan.rail_direction - cell.truth.rail_direction
+    assert (sigma[1:] < 0.2e-3).all()
+    assert (np.abs(error) < 4 * sigma).all()
+
+
+def test_a_good_calibration_is_called_good(calibrated):
+    cell, calibration = calibrated
+    verdicts = [verify(calibration.scan, calibration.target, look_again(cell, calibration)) for _ in range(6)]
+    # At 3 % each, two of six would be a matter of one in a hundred.
+    assert sum(not verdict.good for verdict in verdicts) <= 1
+    for verdict in verdicts:
+        assert all(0.7 < value < 1.3 for value in verdict.fit.values())
+
+
+@pytest.mark.parametrize("disturbance", disturbances(), ids=lambda d: d.name)
+def test_a_disturbance_is_found_and_its_part_suspected(calibrated, disturbance):
+    cell, calibration = calibrated
+    before = cell.truth
+    cell.truth = disturbance.moved(before)
+    try:
+        verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
+    finally:
+        cell.truth = before
+    assert not verdict.good
+    camera = disturbance.part.split()[0]
+    # A mount and the lens on it can look the same from one view; never one camera like the other.
+    assert all(s.part.split()[0] == camera for s in verdict.suspects) or disturbance.part == verdict.suspects[0].part
+
+
+def test_the_verdict_reckons_the_place_error(calibrated):
+    cell, calibration = calibrated
+    before = cell.truth
+    cell.truth = replace(before, flange_from_scan=before.flange_from_scan @ shifted(np.array([0.0, 0.6e-3, 0.0])))
+    try:
+        seen = look_again(cell, calibration)
+    finally:
+        cell.truth = before
+    summary = Verification.of(calibration, load_job("pot")[0], seen).summary()
+    assert not summary["good"]
+    assert summary["suspects"][0]["part"] == "scan camera's mount on the flange"
+    # A mount moved by 0.6 mm moves every point by 0.6 mm; the prior and the arm's repeatability take a part of it.
+    assert summary["suspects"][0]["place_error_mm"] == pytest.approx(0.6, abs=0.2)
+    assert "run `cell calibrate`" in summary["reason"]
+    json.dumps(summary, allow_nan=False)
+
+
+def test_the_reference_is_stored_and_an_old_file_is_refused(calibrated, tmp_path):
+    cell, calibration = calibrated
+    save_calibration(calibration, tmp_path / "new.json")
+    back = read_calibration(tmp_path / "new.json")
+    np.testing.assert_allclose(back.scan.reference.covariance, calibration.scan.reference.covariance)
+    assert back.scan.reference.rail == calibration.scan.reference.rail
+    old = calibration.as_dict()
+    for part in ("scan", "target"):
+        del old[part]["reference"]
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    older = read_calibration(tmp_path / "old.json")
+    with pytest.raises(CalibrationStale, match="reference"):
+        verify(older.scan, older.target, look_again(cell, calibration))
+
+
+def test_the_rail_ends_keep_the_rings_in_the_picture(calibrated):
+    cell, calibration = calibrated
+    view = scan_calibration_views(CONFIG, cell.fine)[6]
+    low, high = rail_ends(
+        calibration.scan, calibration.scan.reference.base_from_board, view, cell.fine, CONFIG.rail.travel
+    )
+    assert high - low > 0.025
+    rest = cell.move(view.base_from_flange.homogeneous)
+    rings = {row * cell.fine.cols + column for column, row in cell.fine.rings}
+    for end in (low, high):
+        assert rings <= set(cell.scan_view(rest, end).ids.tolist())
+
+
+# --- named faults ---
+
+
+def rests(cell: ObservedCell) -> list:
+    return [o for o in cell.collect_scan() if not o.same_rest]
+
+
+def check(observations: list) -> None:
+    """What `calibrate_scan` does, without predicting held-out views."""
+    staged = solve_staged(observations, NOMINAL, ALONG)
+    names = [o.name for o in observations]
+    refuse_exchanged(names, [o.base_from_flange for o in observations], staged.camera_from_board)
+    joint = solve_joint(observations, staged, PRIORS, held_out=False)
+    refuse_bent("fine", joint.adjusted, joint.views)
+    poses = [board_pose(o.view, joint.adjusted.state.camera).camera_from_board for o in observations]
+    refuse_slipped("scan", names, joint.adjusted, joint.views, poses)
+    refuse_wrong_lead(joint.adjusted.state.rail_direction, CONFIG.rail.lead)
+
+
+def exchanged(observations: list, i: int, j: int) -> list:
+    made = list(observations)
+    for to, of in ((i, j), (j, i)):
+        made[to] = replace(observations[to], view=observations[of].view, profile=observations[of].profile)
+    return made
+
+
+@pytest.mark.parametrize("level", ["nominal", "harsh"])
+def test_good_observations_are_not_refused(level):
+    check(rests(world(11, level)))
+
+
+@pytest.mark.parametrize(("level", "pair"), [("nominal", (4, 11)), ("harsh", (0, 17))])
+def test_exchanged_pictures_are_named(level, pair):
+    observations = exchanged(rests(world(3, level)), *pair)
+    staged = solve_staged(observations, NOMINAL, ALONG)
+    with pytest.raises(RefusedError, match=f"fine {pair[0] + 1} and fine {pair[1] + 1} are exchanged"):
+        refuse_exchanged([o.name for o in observations], [o.base_from_flange for o in observations],
+                         staged.camera_from_board)  # fmt: skip
+
+
+def test_frames_that_come_one_late_are_named():
+    good = rests(world(3))
+    late = [replace(o, view=good[k - 1].view, profile=good[k - 1].profile) for k, o in enumerate(good)]
+    with pytest.raises(RefusedError, match="one late"):
+        check(late)
+
+
+def test_a_bent_board_is_named_with_its_bend():
+    cell = world(3)
+    cell.bend = 0.3e-3
+    with pytest.raises(RefusedError, match=r"not flat: its dots stand 0\.(29|30|31) mm"):
+        check(rests(cell))
+
+
+def test_a_slipped_mount_is_named_with_the_view():
+    cell, size = world(3), 0.3e-3
+    before = rests(cell)
+    cell.truth = replace(cell.truth, flange_from_scan=cell.truth.flange_from_scan @ shifted(np.array([size, 0, 0])))
+    after = rests(cell)
+    with pytest.raises(RefusedError, match=r"slipped on the flange before fine (9|10|11)"):
+        check(before[:9] + after[9:])
+
+
+def test_a_wrong_lead_is_named_with_the_right_one():
+    cell, scale = world(3), 1.25
+    cell.truth = replace(cell.truth, rail_direction=scale * cell.truth.rail_direction)
+    with pytest.raises(RefusedError, match=rf"configured as 2 mm, the screw seems to have {2 * scale:.1f}"):
+        check(rests(cell))
+
+
+def test_a_scan_calibration_reads_its_own_reference_back(calibrated):
+    scan = calibrated[1].scan
+    back = ScanCalibration.from_dict(json.loads(json.dumps(scan.as_dict())))
+    np.testing.assert_allclose(
+        back.reference.base_from_board.homogeneous, scan.reference.base_from_board.homogeneous, atol=1e-12
+    )
