@@ -12,7 +12,7 @@ import pytest
 from cell.bench.calibration import observe, one_trial
 from cell.bench.calibration_bound import cramer_rao
 from cell.bench.calibration_world import Noise, draw_head
-from cell.calibration import Priors, TargetObservation
+from cell.calibration import Priors, TargetObservation, calibrate_scan
 from cell.calibration.advice import advice
 from cell.calibration.archive import Observations, read_archive, write_archive
 from cell.calibration.coverage import Coverage
@@ -20,7 +20,7 @@ from cell.calibration.influence import Places, derivatives, influences, place_rm
 from cell.calibration.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
 from cell.config import load_config
 from cell.geometry.camera import CameraModel
-from cell.geometry.poses import from_matrix
+from cell.geometry.poses import from_matrix, from_parts
 from cell.stored_calibration import nominal_camera, solve_observations
 from cell.vision.board_view import BoardView
 from drivers.errors import ConfigError
@@ -38,10 +38,12 @@ def archived(world) -> Observations:
     scan = observe(world, NOISE, np.random.default_rng(2))
     config = load_config(None)
     camera = nominal_camera(config.scan_camera)
-    # The same views serve a second camera: what matters here is that they come back.
-    target = [TargetObservation(o.view, o.base_from_flange, o.name) for o in scan]
     priors = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
-    return Observations(scan, target, camera, camera, priors, {"arm": "A1", "rail": "R1"}, "abc", 1.7e9)
+    # The same views serve a camera without a rail, on a flange that went where the carriage had gone.
+    head = calibrate_scan(scan, camera, np.array([1.0, 0.0, 0.0]), priors)
+    along = head.flange_from_camera.rotation @ head.rail_direction
+    target = [TargetObservation(o.view, o.base_from_flange * from_parts(o.rail_position * along), o.name) for o in scan]
+    return Observations(scan, target, camera, camera, priors, 2e-3, {"arm": "A1", "rail": "R1"}, "abc", 1.7e9)
 
 
 @pytest.fixture(scope="module")
