@@ -12,13 +12,15 @@ from cell.steps.swath import Collector, Swath, SweepErrors
 from drivers.errors import DeviceFault
 
 MAX_FLANGE_MOTION = 1e-4
+MAX_RESIDUAL = 5.0
+"""Median deviation of the rail's readings from an even motion that a sweep may have, in σ of a rail position."""
 
 
 def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
     """Sweep the scan head over the placement area and pair every profile with the rail's position.
 
-    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the constant-velocity part, or the
-    flange moved by more than 0.1 mm meanwhile.
+    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the constant-velocity part, the
+    flange moved by more than 0.1 mm meanwhile, or the rail did not run evenly.
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
     mover.to(plan.base_from_flange, "the scan pose")
@@ -51,6 +53,16 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     samples = sweep.samples
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
     deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
+    residual = float(np.median(deviations)) if deviations else 0.0
+    allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
+    if residual > allowed:
+        raise DeviceFault(
+            rail.name,
+            "rail.uneven_sweep",
+            f"the rail's readings lie {1e3 * residual:.3f} mm (median) off an even motion, allowed {1e3 * allowed:.3f}",
+            recoverable=True,
+            hint="Look at the rail's link, at what else this machine is busy with, and whether the carriage jams.",
+        )
     spread = errors.rail * collector.builder.sweep_direction(base_from_flange)
     return Swath(
         builder=collector.builder,
@@ -61,7 +73,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
         line_spread=np.tile(spread, (len(lines), 1)),
         covariance=errors.repeatability,
         lost=collector.lost,
-        residual=float(np.median(deviations)) if deviations else 0.0,
+        residual=residual,
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],
         middle_profile=middle[1],
