@@ -35,6 +35,8 @@ LIMITS: dict[str, dict[str, float]] = {
 }
 """What is to be reached at level nominal."""
 COVERAGE = (0.90, 0.98)
+COVERAGE_RUNS = 20
+"""Fewer runs cannot tell 90 % from 98 %, and their coverage is not held against the limit."""
 _SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -192,7 +194,8 @@ def _within(result: dict[str, Any]) -> bool:
     for key, limits in LIMITS.items():
         kept += [result[key][name] is not None and result[key][name] <= limit for name, limit in limits.items()]
     covered = result["coverage_95"]
-    return all(kept) and covered is not None and COVERAGE[0] <= covered <= COVERAGE[1]
+    few = result["runs"] < COVERAGE_RUNS
+    return all(kept) and (few or (covered is not None and COVERAGE[0] <= covered <= COVERAGE[1]))
 
 
 def _short(run: dict[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 _PANELS = (
     ("scan", "sensor, scan frame", "sensor_scan_mm"),
@@ -33,8 +34,9 @@ def draw(path: Path, result: Mapping[str, Any]) -> None:
             if (limit := figures.get("limits", {}).get(key, {}).get("mean")) is not None:
                 axes.axhline(limit, color="tab:red", linestyle=":", label="limit of the mean")
             lost = [run["seed"] for run in figures["per_run"] if name not in run]
-            axes.plot(lost, [0.0] * len(lost), "x", color="tab:red", label="not reached" if lost else "")
+            axes.plot(lost, [0.0] * len(lost), "x", color="tab:red", label="not reached" if lost else None)
             axes.set_xlabel("seed")
             axes.set_ylabel("mm")
-            axes.legend(fontsize=7)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.savefig(path)
