@@ -35,6 +35,9 @@ from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 
+CHANCE_SCATTER = 1.3
+"""Found over configured scatter of the arm that the few views of a calibration show by chance."""
+
 
 class JobWork:
     """What the runner calls, a method a step; results travel in the step context."""
@@ -183,13 +186,22 @@ class JobWork:
     def repeatability(self) -> Vector:
         """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""
         arm = self._config.arm
-        return np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+        return self._scatter**2 * np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
 
     @property
     def kinematic(self) -> Vector:
         """Covariance (6, 6) of a measured place in the base that the arm realises when it goes there, m² and rad²."""
         arm = self._config.arm
-        return np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+        return self._scatter**2 * np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+
+    @property
+    def _scatter(self) -> float:
+        """How many times as much as configured the arm scattered in the calibration; 1 where chance explains it."""
+        arm, found = self._config.arm, self._calibration.scan.reference
+        if found is None:
+            return 1.0
+        ratio = max(found.arm_translation / arm.repeatability, found.arm_rotation / arm.repeatability_angle)
+        return ratio if ratio > CHANCE_SCATTER else 1.0
 
     def _photograph(self, count: int = 1) -> BoardFix:
         fix = photograph(
