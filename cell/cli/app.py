@@ -7,6 +7,7 @@ import typer
 from cell.cli import (
     bench_acceptance,
     bench_accuracy,
+    bench_board,
     bench_calibration,
     bench_inversion,
     bench_reconstruction,
@@ -41,6 +42,7 @@ bench = typer.Typer(
 for register_bench in (
     bench_acceptance.register,
     bench_accuracy.register,
+    bench_board.register,
     bench_calibration.register,
     bench_inversion.register,
     bench_reconstruction.register,

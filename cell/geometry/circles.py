@@ -8,7 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cell.geometry.camera import Array
+from cell.geometry.camera import Array, CameraModel
+
+STEP = 1e-4
 
 
 def seen_centres(centres: ArrayLike, normal: ArrayLike, radius: float) -> Array:
@@ -35,3 +37,33 @@ def seen_centres_with_jacobians(centres: ArrayLike, normal: ArrayLike, radius: f
     by_normal = n[2] * np.eye(3)
     by_normal[:, 2] += n
     return c + share[:, None] * aside, by_centre, share[:, None, None] * by_normal
+
+
+def lens_shift(camera: CameraModel, centres: ArrayLike, normal: ArrayLike, radius: float) -> Array:
+    """What the lens adds in px (n, 2) to the seen centres of circles with `centres` (n, 3), arguments as above.
+
+    Distortion bends an ellipse: the middle of its area moves by ½ tr(H C) + J C ∇ln|J|, with the distortion's Jacobian
+    J and second derivatives H, and the second moments C of the undistorted ellipse. A dot of 30 px radius seen with
+    k1 = −.2 is moved by .01 px, in one direction all over the picture's rim, which is felt in the board's distance.
+    """
+    c = np.atleast_2d(np.asarray(centres, dtype=np.float64))
+    n = np.asarray(normal, dtype=np.float64)
+    xy = c[:, :2] / c[:, 2:]
+    to_plane = np.zeros((len(c), 2, 3))
+    to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1.0 / c[:, 2]
+    to_plane[:, :, 2] = -xy / c[:, 2:]
+    moments = 0.25 * radius**2 * to_plane @ (np.eye(3) - np.outer(n, n)) @ to_plane.transpose(0, 2, 1)
+
+    def jacobian(shift: tuple[float, float]) -> Array:
+        right, left, down, up = (
+            camera.distort(xy + shift + np.array(d)) for d in ((STEP, 0), (-STEP, 0), (0, STEP), (0, -STEP))
+        )
+        return np.stack([right - left, down - up], axis=2) / (2 * STEP)
+
+    along, across = ((jacobian(d) - jacobian((-d[0], -d[1]))) / (2 * STEP) for d in ((STEP, 0.0), (0.0, STEP)))
+    middle = jacobian((0.0, 0.0))
+    second = np.stack([along, across], axis=3)
+    inverse = np.linalg.inv(middle)
+    slope = np.column_stack([np.trace(inverse @ d, axis1=1, axis2=2) for d in (along, across)])
+    bent = 0.5 * np.einsum("nkij,nij->nk", second, moments) + np.einsum("nki,nij,nj->nk", middle, moments, slope)
+    return np.asarray(bent * (camera.fx, camera.fy), dtype=np.float64)

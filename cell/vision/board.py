@@ -13,11 +13,12 @@ import numpy as np
 import pinocchio as pin
 
 from cell.geometry.camera import Array, CameraModel
-from cell.geometry.circles import seen_centres
+from cell.geometry.circles import lens_shift, seen_centres
 from cell.geometry.poses import difference, from_parts, perturbed, transform
 from cell.vision.board_spec import DOTS, BoardSpec
 from cell.vision.board_view import BoardView
-from cell.vision.chess import find_charuco, find_chessboard
+from cell.vision.charuco import find_charuco
+from cell.vision.chess import find_chessboard
 from cell.vision.dot_board import find_dots
 from cell.vision.outliers import without_outliers
 from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
@@ -100,10 +101,12 @@ def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
 
 def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_radius: float) -> Array:
     """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
-    seen = transform(camera_from_board, points)
-    if dot_radius > 0:
-        seen = seen_centres(seen, camera_from_board.rotation[:, 2], dot_radius)
-    return camera.project(seen)
+    centres = transform(camera_from_board, points)
+    if dot_radius <= 0:
+        return camera.project(centres)
+    normal = camera_from_board.rotation[:, 2]
+    pixels = camera.project(seen_centres(centres, normal, dot_radius))
+    return np.asarray(pixels + lens_shift(camera, centres, normal, dot_radius), dtype=np.float64)
 
 
 def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:

@@ -9,15 +9,19 @@ import cv2
 import numpy as np
 
 from cell.geometry.camera import Array
+from cell.vision.board_ends import check_dot_ends
 from cell.vision.board_spec import BoardSpec
 from cell.vision.board_view import BoardView
 from cell.vision.dots import find_blobs, measure_dots
-from cell.vision.identify import identify
-from cell.vision.lattice import Blobs, Places, grow_lattice
-from cell.vision.pictures import Image, PictureRefused, Reason
+from cell.vision.identify import LEAST_SHARE, identify
+from cell.vision.lattice import Blobs, Places, dot_lattices
+from cell.vision.pictures import Image, PictureRefused, Reason, only_one
+from cell.vision.plane_map import PlaneMap
 
 LEAST_SIGMA_PX = 0.01
 LEAST_DOTS = 12
+SMALL_PX = 400_000
+AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 # Window of the local threshold as a share of the picture's larger side, most common first.
 WINDOWS = (0.06, 0.12, 0.03, 0.25)
 
@@ -25,37 +29,78 @@ WINDOWS = (0.06, 0.12, 0.03, 0.25)
 def find_dots(image: Image, spec: BoardSpec) -> BoardView:
     """The dots of `spec` in an 8-bit image (h, w). Raises PictureRefused with the most telling of its reasons."""
     refusals: list[PictureRefused] = []
-    contrast = float(np.percentile(image, 97) - np.percentile(image, 3))
-    for scale in (1, 2):
+    contrast = float(np.percentile(image[::4, ::4], 97) - np.percentile(image[::4, ::4], 3))
+    # Enlarging helps small pictures of small dots, and only those.
+    for scale in (1, 2) if image.size <= SMALL_PX else (1,):
         picture = (
             image if scale == 1 else np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
         )
         for share in WINDOWS:
             window = int(share * max(picture.shape)) | 1
             for offset in (max(4.0, 0.12 * contrast), max(2.0, 0.03 * contrast)):
-                try:
-                    return _attempt(np.asarray(picture, dtype=np.uint8), spec, window, offset, scale)
-                except PictureRefused as refused:
-                    refusals.append(refused)
-    telling = [r for r in refusals if r.reason is Reason.MIRRORED] or [
-        r for r in refusals if r.reason is Reason.AMBIGUOUS
-    ]
-    raise (telling or refusals[-1:])[0]
+                views, reasons = _attempt(np.asarray(picture, dtype=np.uint8), spec, window, offset, scale)
+                if views:
+                    return only_one(views, spec.name)
+                refusals += reasons
+    rank = (Reason.MIRRORED, Reason.AMBIGUOUS, Reason.NO_BOARD)
+    raise min(refusals, key=lambda r: rank.index(r.reason))
 
 
-def _attempt(image: Image, spec: BoardSpec, window: int, offset: float, scale: int) -> BoardView:
+def _attempt(
+    image: Image, spec: BoardSpec, window: int, offset: float, scale: int
+) -> tuple[list[BoardView], list[PictureRefused]]:
+    """Every board of `spec` among the blobs of one threshold, and why the other lattices are none."""
     blobs = find_blobs(image, window, offset)
-    least = LEAST_DOTS if spec.kind == "marked_dots" else max(4, int(0.85 * len(spec.lattice())))
-    grown = grow_lattice(blobs, min(least, len(spec.lattice())))
-    if grown is None:
-        raise PictureRefused(Reason.NO_BOARD, f"no board: {len(blobs.centres)} dot-like spots, none in a lattice")
-    index, places = grown
-    dots, sigma, scores = measure_dots(image, blobs.take(index), rounds=2)
-    board_places, assumed = identify(
-        spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
-    )
-    known = np.asarray((board_places >= 0).all(axis=1), dtype=np.bool_)
-    return _complete(image, spec, dots.take(known), board_places[known], assumed, scale)
+    least = LEAST_DOTS if spec.kind == "marked_dots" else max(4, int(LEAST_SHARE * len(spec.lattice())))
+    views, reasons = [], []
+    for index, places in dot_lattices(blobs, min(least, len(spec.lattice()))):
+        try:
+            if spec.kind != "marked_dots":
+                grown, places = _extended(image, blobs.take(index), places, spec.name)
+            else:
+                grown = blobs.take(index)
+            dots, sigma, scores = measure_dots(image, grown, rounds=2)
+            board_places, assumed = identify(
+                spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
+            )
+            known = np.asarray((board_places >= 0).all(axis=1), dtype=np.bool_)
+            views.append(_complete(image, spec, dots.take(known), board_places[known], assumed, scale))
+        except PictureRefused as refused:
+            reasons.append(refused)
+    if not views and not reasons:
+        text = f"no {spec.name}: {len(blobs.centres)} dot-like spots, no {least} of them in a lattice"
+        reasons.append(PictureRefused(Reason.NO_BOARD, text))
+    return views, reasons
+
+
+def _extended(image: Image, dots: Blobs, places: Places, name: str) -> tuple[Blobs, Places]:
+    """The lattice with the dots in its gaps and next to it that the threshold missed, as in a shadow's edge."""
+    for _ in range(2):
+        plane = PlaneMap.fit(places, dots.centres, 0.1 * float(np.ptp(dots.centres, axis=0).max()), name)
+        low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
+        grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+        held = {tuple(p) for p in places.tolist()}
+        beside = [
+            p
+            for p in grid.tolist()
+            if tuple(p) not in held and sum((p[0] + a, p[1] + b) in held for a, b in AROUND) >= 2
+        ]
+        if not beside:
+            break
+        flat = np.array(beside, dtype=np.float64)
+        middles, steps = plane.pixels(flat), plane.steps(flat)
+        radius = _relative_radius(dots, plane.steps(places.astype(np.float64)))
+        guess = Blobs(middles, radius * steps)
+        measured, sigma, _ = measure_dots(image, guess, rounds=3)
+        ratio = measured.areas / guess.areas
+        away = np.linalg.norm(measured.centres - middles, axis=1)
+        good = np.isfinite(sigma) & (ratio > 0.75) & (ratio < 1.33) & (away < 0.15 * np.linalg.norm(steps, axis=(1, 2)))
+        if not good.any():
+            break
+        new = measured.take(good)
+        dots = Blobs(np.concatenate([dots.centres, new.centres]), np.concatenate([dots.shapes, new.shapes]))
+        places = np.concatenate([places, np.array(beside, dtype=np.intp)[good]])
+    return dots, places
 
 
 def _upright(places: Places, pixels: Array) -> Places:
@@ -71,10 +116,8 @@ def _upright(places: Places, pixels: Array) -> Places:
 def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assumed: bool, scale: int) -> BoardView:
     """Measure every dot of the board where the dots found so far say that it must be."""
     lattice = spec.lattice().astype(np.float64)
-    homography, _ = cv2.findHomography(places.astype(np.float64), dots.centres, cv2.RANSAC, 3.0 * scale)
-    if homography is None:
-        raise PictureRefused(Reason.NO_BOARD, f"the dots found do not lie in a plane like those of {spec.name}")
-    predicted, jacobian = _map(np.asarray(homography, dtype=np.float64), lattice)
+    plane = PlaneMap.fit(places, dots.centres, 3.0 * scale, spec.name)
+    predicted, jacobian = plane.pixels(lattice), plane.steps(lattice)
     radius = _radius(dots, places, jacobian, lattice)
     height, width = image.shape
     shapes = radius * jacobian
@@ -92,8 +135,9 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
     away = np.linalg.norm(measured.centres - predicted[ids], axis=1)
     pitch = np.sqrt(np.abs(np.linalg.det(jacobian[ids])))
     good = np.isfinite(sigma) & (ratio > 0.6) & (ratio < 1.6) & (away < 0.25 * pitch)
-    if good.sum() < (LEAST_DOTS if spec.kind == "marked_dots" else 0.85 * len(lattice)):
+    if good.sum() < (LEAST_DOTS if spec.kind == "marked_dots" else LEAST_SHARE * len(lattice)):
         raise PictureRefused(Reason.NO_BOARD, f"only {good.sum()} dots of {spec.name} could be measured")
+    check_dot_ends(image, spec, plane, ids[good], radius)
     # Pixel (0, 0) is the middle of the upper left pixel at either scale.
     pixels = (measured.centres[good] + 0.5) / scale - 0.5
     size = (width // scale, height // scale)
@@ -101,16 +145,12 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
     return BoardView(spec, size, ids[good], pixels, deviation, assumed, spec.dot_radius or radius * spec.pitch)
 
 
-def _map(homography: Array, lattice: Array) -> tuple[Array, Array]:
-    """Pixels (n, 2) of lattice places (n, 2), and ∂pixel/∂place (n, 2, 2)."""
-    mapped = np.column_stack([lattice, np.ones(len(lattice))]) @ homography.T
-    pixels = mapped[:, :2] / mapped[:, 2:]
-    jacobian = (homography[None, :2, :2] - pixels[:, :, None] * homography[None, 2:, :2]) / mapped[:, 2, None, None]
-    return pixels, jacobian
-
-
 def _radius(dots: Blobs, places: Places, jacobian: Array, lattice: Array) -> float:
     """Radius of the dots in pitches, as seen."""
     number = {tuple(p): k for k, p in enumerate(lattice.astype(np.intp))}
-    areas = np.abs(np.linalg.det(jacobian))[[number[tuple(p)] for p in places]]
-    return float(np.median(np.sqrt(dots.areas / (np.pi * areas))))
+    return _relative_radius(dots, jacobian[[number[tuple(p)] for p in places]])
+
+
+def _relative_radius(dots: Blobs, steps: Array) -> float:
+    """Median radius of dots in pitches; `steps` (n, 2, 2) are ∂pixel/∂place at each."""
+    return float(np.median(np.sqrt(dots.areas / (np.pi * np.abs(np.linalg.det(steps))))))

@@ -14,6 +14,8 @@ from cell.geometry.camera import Array
 from cell.vision.lattice import Blobs
 from cell.vision.pictures import Image
 
+Outline = NDArray[np.int32]
+
 RAYS = 32
 SAMPLES = 33
 REACH = (0.15, 1.75)
@@ -26,32 +28,60 @@ def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
     mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REPLICATE)
     dark = (smooth.astype(np.int16) < mean.astype(np.int16) - int(offset)).astype(np.uint8)
+    # Grains of noise are opened away: what is not three pixels wide is too small for a dot.
+    dark = np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))))
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    height, width = image.shape
-    centres, shapes = [], []
-    for number, contour in enumerate(contours):
-        # A contour with a parent is a hole, such as the middle of a ring.
-        if len(contour) < 8 or hierarchy[0, number, 3] >= 0:
-            continue
-        x, y, w, h = cv2.boundingRect(contour)
-        if x == 0 or y == 0 or x + w == width or y + h == height or max(w, h) > 0.25 * max(width, height):
-            continue
-        m = cv2.moments(contour)
-        # A contour runs through pixel middles: it encloses half a pixel less all around.
-        area = m["m00"] + 0.5 * len(contour)
-        if m["m00"] < 4 or area < LEAST_AREA_PX:
-            continue
-        second = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / m["m00"]
-        values, vectors = np.linalg.eigh(4 * second)
-        if values[0] <= 0 or values[0] < 0.03 * values[1]:
-            continue
-        # The area of an ellipse of these second moments: the ratio is 1 for ellipses and less for other shapes.
-        if not 0.87 < m["m00"] / (np.pi * np.sqrt(values[0] * values[1])) < 1.1:
-            continue
-        radii = np.sqrt(values) + 0.5
-        centres.append((m["m10"] / m["m00"], m["m01"] / m["m00"]))
-        shapes.append(vectors * radii @ vectors.T)
-    return Blobs(np.array(centres).reshape(-1, 2), np.array(shapes).reshape(-1, 2, 2))
+    # A contour with a parent is a hole, such as the middle of a ring.
+    outer = [c for c, links in zip(contours, hierarchy[0] if contours else (), strict=True) if links[3] < 0]
+    outlines = [c for c in outer if len(c) >= 8]
+    if not outlines:
+        return Blobs(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return _ellipses([np.asarray(c, dtype=np.int32) for c in outlines], (image.shape[1], image.shape[0]))
+
+
+def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
+    """Those of the outlines (m, 1, 2), all at once, that are whole and elliptic."""
+    lengths = np.array([len(c) for c in outlines])
+    begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    points = np.concatenate(outlines)[:, 0, :].astype(np.float64)
+    low, high = np.minimum.reduceat(points, begins), np.maximum.reduceat(points, begins)
+    whole = (low > 0).all(axis=1) & (high < np.array(size) - 1).all(axis=1)
+    whole &= (high - low).max(axis=1) < 0.25 * max(size)
+    origin = 0.5 * (low + high)
+    x, y = (points - np.repeat(origin, lengths, axis=0)).T
+    following = np.arange(len(points)) + 1
+    following[begins + lengths - 1] = begins
+    xn, yn = x[following], y[following]
+    # Moments of the polygons by Green's theorem.
+    cross = x * yn - xn * y
+    terms = np.stack(
+        [
+            cross / 2,
+            cross * (x + xn) / 6,
+            cross * (y + yn) / 6,
+            cross * (x * x + x * xn + xn * xn) / 12,
+            cross * (x * (2 * y + yn) + xn * (y + 2 * yn)) / 24,
+            cross * (y * y + y * yn + yn * yn) / 12,
+        ]
+    )
+    area, sx, sy, xx, xy, yy = np.add.reduceat(terms, begins, axis=1)
+    sign = np.where(area < 0, -1.0, 1.0)
+    area, sx, sy, xx, xy, yy = (sign * m for m in (area, sx, sy, xx, xy, yy))
+    # A contour runs through pixel middles: it encloses half a pixel less all around.
+    whole &= (area >= 4) & (area + 0.5 * lengths >= LEAST_AREA_PX)
+    area, sx, sy, xx, xy, yy, origin = (m[whole] for m in (area, sx, sy, xx, xy, yy, origin))
+    middle = np.column_stack([sx, sy]) / area[:, None]
+    second = np.empty((len(area), 2, 2))
+    second[:, 0, 0], second[:, 1, 1] = xx / area - middle[:, 0] ** 2, yy / area - middle[:, 1] ** 2
+    second[:, 0, 1] = second[:, 1, 0] = xy / area - middle[:, 0] * middle[:, 1]
+    values, vectors = np.linalg.eigh(4 * second)
+    # The area of an ellipse of these second moments: the ratio is 1 for ellipses and less for other shapes.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        roundness = area / (np.pi * np.sqrt(values[:, 0] * values[:, 1]))
+    good = (values[:, 0] > 0) & (values[:, 0] >= 0.03 * values[:, 1]) & (roundness > 0.87) & (roundness < 1.1)
+    radii = np.sqrt(values[good]) + 0.5
+    shapes = np.einsum("nij,nj,nkj->nik", vectors[good], radii, vectors[good])
+    return Blobs((middle + origin)[good], shapes)
 
 
 def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array, Array]:

@@ -19,7 +19,9 @@ Places = NDArray[np.intp]
 # Least ring scores of the three rings: brightness of the middle, missing darkness.
 RING_SCORES = (0.30, 0.12)
 RING_LEAD = 1.6
-MISSING_SHARE = 0.12
+# Of a board without marks that must be found, and points beside it that may be mistaken for part of it.
+LEAST_SHARE = 0.5
+MOST_OUTSIDE = 0.1
 
 
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
@@ -70,42 +72,59 @@ def _by_rings(spec: BoardSpec, places: Places, scores: Array, least: float) -> P
     )
 
 
-def _by_edges(spec: BoardSpec, places: Places) -> tuple[Places, bool]:
-    """The order for boards without marks: their outline, under every change of lattice steps that keeps handedness."""
+def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE) -> list[Places]:
+    """Every order (n, 2) of lattice places (n, 2) in which they fill the board's outline and reach all of its edges.
+
+    Under every change of lattice steps that keeps handedness. Entries beside the board are (−1, −1). Raises
+    PictureRefused when there is none.
+    """
     template = spec.lattice()
     if spec.kind == "asymmetric_dots":
         # Neighbours along the diagonals are a lattice of their own.
         template = np.column_stack([(template[:, 0] + template[:, 1]) // 2, (template[:, 1] - template[:, 0]) // 2])
-    wanted = {tuple(p) for p in template}
-    best: list[tuple[int, Places]] = []
+    number = {tuple(p): tuple(q) for p, q in zip(template.tolist(), spec.lattice().tolist(), strict=True)}
+    best: list[Places] = []
     most = 0
     for change in _changes():
         moved = places @ change.T
         for shift in _shifts(moved, template):
             found = moved + shift
-            hits = sum(tuple(p) in wanted for p in found)
+            hits = sum(tuple(p) in number for p in found.tolist())
             if hits > most:
-                most, best = hits, [(hits, found)]
+                most, best = hits, [found]
             elif hits == most and hits > 0:
-                best.append((hits, found))
-    if most < (1 - MISSING_SHARE) * len(template):
+                best.append(found)
+    outside = len(places) - most
+    if most < least_share * len(template) or outside > max(2, MOST_OUTSIDE * most):
         raise PictureRefused(
-            Reason.NO_BOARD, f"only {most} of the {len(template)} dots of {spec.name} were found; show the whole board"
+            Reason.NO_BOARD,
+            f"{len(places)} points in a lattice were found, of which {most} fit the {len(template)} of {spec.name}; "
+            "show the whole board, or name the board that it is",
         )
-    distinct = [f for _, f in best if _spans(f, wanted, template)]
+    orders = [f for f in best if _spans(f, set(number), template)]
+    if not orders:
+        raise PictureRefused(
+            Reason.AMBIGUOUS,
+            f"the {most} points found do not reach all edges of {spec.name}, so their order is not certain; show the "
+            "whole board",
+        )
+    return [np.array([number.get(tuple(p), (-1, -1)) for p in f.tolist()], dtype=np.intp) for f in orders]
+
+
+def _by_edges(spec: BoardSpec, places: Places) -> tuple[Places, bool]:
+    """The order of dots without marks. Of a symmetric board that whose rows run most nearly along the first step."""
+    orders = by_outline(spec, places)
     allowed = {"dots": 4 if spec.cols == spec.rows else 2}.get(spec.kind, 2 if spec.symmetric else 1)
-    if not distinct or len(distinct) > allowed:
+    if len(orders) > allowed:
         raise PictureRefused(
-            Reason.AMBIGUOUS, f"the {most} dots found fit {spec.name} in {len(distinct)} ways; show the whole board"
+            Reason.AMBIGUOUS, f"the dots found fit {spec.name} in {len(orders)} ways; show the whole board"
         )
-    chosen = min(distinct, key=lambda found: _lean(found, places))
-    number = {tuple(p): q for p, q in zip(template, spec.lattice(), strict=True)}
-    return np.array([number.get(tuple(p), (-1, -1)) for p in chosen], dtype=np.intp), spec.symmetric
+    return min(orders, key=lambda order: _lean(order, places)), spec.symmetric
 
 
 def _spans(found: Places, wanted: set[tuple[int, ...]], template: Places) -> bool:
     """True when the dots that fit reach all four edges of the board."""
-    hits = np.array([p for p in found if tuple(p) in wanted])
+    hits = np.array([p for p in found.tolist() if tuple(p) in wanted])
     x_low, y_low = template.min(axis=0)
     x_high, y_high = template.max(axis=0)
     (low_x, low_y), (high_x, high_y) = hits.min(axis=0), hits.max(axis=0)
@@ -114,9 +133,9 @@ def _spans(found: Places, wanted: set[tuple[int, ...]], template: Places) -> boo
 
 def _lean(found: Places, places: Places) -> float:
     """Smallest for the order whose rows run most nearly along the first lattice step."""
-    fit = np.linalg.lstsq(
-        np.column_stack([found, np.ones(len(found))]).astype(np.float64), places.astype(np.float64), rcond=None
-    )[0]
+    known = (found >= 0).all(axis=1)
+    flat = np.column_stack([found[known], np.ones(known.sum())]).astype(np.float64)
+    fit = np.linalg.lstsq(flat, places[known].astype(np.float64), rcond=None)[0]
     return float(-fit[0, 0])
 
 

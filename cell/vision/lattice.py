@@ -1,10 +1,11 @@
-"""Order among found dots: grows a lattice from neighbour to neighbour, so that perspective does not matter.
+"""Order among found dots or corners: grows a lattice from neighbour to neighbour, so that perspective does not matter.
 
-Lattice places here are whole steps along two neighbour vectors of the picture; `identify.py` says which dots they are.
+Lattice places are whole steps along two neighbour vectors of the picture; `identify.py` says which points.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ Places = NDArray[np.intp]
 
 TOLERANCE = 0.27
 SIZE_RATIO = 1.7
+SEEDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,38 +38,44 @@ class Blobs:
         return Blobs(self.centres[index], self.shapes[index])
 
 
-def grow_lattice(blobs: Blobs, least: int) -> tuple[NDArray[np.intp], Places] | None:
-    """Indices (m,) of blobs that form a lattice and their places (m, 2); None when there is none of `least` dots.
+def dot_lattices(blobs: Blobs, least: int) -> Iterator[tuple[NDArray[np.intp], Places]]:
+    """Lattices of at least `least` blobs, none sharing a blob: indices (m,) and places (m, 2).
 
     Right-handed as the picture is: the second step lies clockwise of the first, as y does of x.
     """
     n = len(blobs.centres)
     if n < least:
-        return None
+        return
     tree = cKDTree(blobs.centres)
     distances, neighbours = tree.query(blobs.centres, k=min(n, 9))
     near, who = np.asarray(distances), np.asarray(neighbours)
     # Seeds: dots whose neighbours are about as big as they are, the most regular surroundings first.
     areas = blobs.areas
     similar = np.mean(np.abs(np.log(areas[who] / areas[:, None])) < np.log(SIZE_RATIO), axis=1)
-    order = np.lexsort((near[:, -1], -similar))
-    best: tuple[NDArray[np.intp], Places] | None = None
-    for seed in order[:12]:
-        basis = _basis(blobs.centres, areas, int(seed), who[seed][1:])
+    order = np.lexsort((near[:, -1] / np.maximum(near[:, 1], 1e-9), -np.round(4 * similar)))
+    free = np.ones(n, dtype=np.bool_)
+
+    def alike(a: int, b: int) -> bool:
+        return bool(free[b]) and bool(1 / SIZE_RATIO < areas[a] / areas[b] < SIZE_RATIO)
+
+    tries = 0
+    for seed in order:
+        if not free[seed] or tries >= SEEDS:
+            continue
+        basis = _basis(blobs.centres, int(seed), [int(k) for k in who[seed][1:] if alike(int(seed), int(k))])
         if basis is None:
             continue
-        found = _grow(blobs.centres, areas, tree, int(seed), basis)
-        if best is None or len(found) > len(best[0]):
-            index = np.array(list(found.values()))
-            best = index, np.array(list(found))
-        if len(best[0]) > 0.8 * n:
-            break
-    return best if best is not None and len(best[0]) >= least else None
+        tries += 1
+        found = grow(blobs.centres, tree, int(seed), basis, alike)
+        if len(found) >= least:
+            index = np.array(list(found.values()), dtype=np.intp)
+            free[index] = False
+            yield index, np.array(list(found), dtype=np.intp)
 
 
-def _basis(centres: Array, areas: Array, seed: int, neighbours: NDArray[np.intp]) -> tuple[Array, Array] | None:
+def _basis(centres: Array, seed: int, neighbours: list[int]) -> tuple[Array, Array] | None:
     """Two shortest steps from the seed to similar neighbours that are not nearly parallel."""
-    steps = [centres[k] - centres[seed] for k in neighbours if _similar(areas, seed, int(k))]
+    steps = [centres[k] - centres[seed] for k in neighbours]
     if len(steps) < 2:
         return None
     first = steps[0]
@@ -78,14 +86,13 @@ def _basis(centres: Array, areas: Array, seed: int, neighbours: NDArray[np.intp]
     return None
 
 
-def _similar(areas: Array, a: int, b: int) -> bool:
-    return bool(1 / SIZE_RATIO < areas[a] / areas[b] < SIZE_RATIO)
-
-
-def _grow(
-    centres: Array, areas: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array]
+def grow(
+    centres: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], alike: Callable[[int, int], bool]
 ) -> dict[tuple[int, int], int]:
-    """Place → blob, from the seed outwards; each dot hands its own local steps to its neighbours."""
+    """Place → point, from the seed outwards; each hands its own local steps to its neighbours.
+
+    `alike(a, b)` says whether b can be a neighbour of a.
+    """
     found = {(0, 0): seed}
     steps = {seed: [basis[0], basis[1]]}
     taken = {seed}
@@ -102,7 +109,7 @@ def _grow(
             guess = centres[here] + sign * step
             reach = TOLERANCE * min(np.linalg.norm(step), np.linalg.norm(across))
             distance, blob = tree.query(guess)
-            if distance > reach or int(blob) in taken or not _similar(areas, here, int(blob)):
+            if distance > reach or int(blob) in taken or not alike(here, int(blob)):
                 continue
             measured = sign * (centres[blob] - centres[here])
             local = list(steps[here])

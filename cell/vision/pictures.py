@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from drivers.errors import RefusedError
 
 Image = NDArray[np.uint8]
+Found = TypeVar("Found")
 
 BLACK_DN = 10
 SATURATED_SHARE = 0.6
@@ -93,3 +95,12 @@ def _is_cut(data: bytes) -> bool:
     if data.startswith(b"BM") and len(data) > 6:
         return int.from_bytes(data[2:6], "little") > len(data)
     return False
+
+
+def only_one(found: list[Found], name: str) -> Found:
+    """The one board found; refuses two that could both be meant rather than choose between them."""
+    if len(found) > 1:
+        raise PictureRefused(
+            Reason.AMBIGUOUS, f"{len(found)} boards that could be {name} are in view; cover or remove all but one"
+        )
+    return found[0]

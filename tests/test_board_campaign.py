@@ -1,0 +1,111 @@
+"""Promises of the board detection under light, blur, hidden parts and wrong boards, on pictures drawn by ray casting.
+
+A small part of `cell bench board`: the renderer shares no code with the detection, and OpenCV's lens is the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.bench.board import Tally as BoardTally
+from cell.bench.board import camera_of, judge
+from cell.bench.board_conditions import CONDITIONS, LENSES, draw_pose, draw_spec, draw_view
+from cell.bench.board_render import Placed, true_pixels
+from cell.geometry.poses import difference
+from cell.vision import PictureRefused, Reason, board_pose, find_board
+from cell.vision.board_spec import KINDS
+from cell.vision.board_view import BoardView
+
+BY_NAME = {condition.name: condition for condition in CONDITIONS}
+DOTS = ("marked_dots", "asymmetric_dots", "dots")
+
+
+def seen(name, kind, seed=0):
+    return draw_view(BY_NAME[name], kind, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["even light", "defocus sigma 3 px", "cluttered background"])
+def test_a_board_is_found_with_every_point_under_its_own_name(name, kind):
+    tally = BoardTally()
+    judge(seen(name, kind), "found", tally)
+    assert (tally.found, tally.wrong) == (1, 0)
+    assert tally.row()["centre_rms_px"] < 0.15
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
+def test_corners_are_had_to_a_fiftieth_of_a_pixel(kind):
+    view = seen("tilt 35-50 deg", kind)
+    found = find_board(view.picture, view.spec)
+    named = min(found.turns(), key=lambda t: float(np.abs(t.pixels - view.pixels[t.ids]).max()))
+    assert np.sqrt(np.mean((named.pixels - view.pixels[named.ids]) ** 2)) < 0.02
+
+
+@pytest.mark.parametrize("kind", DOTS)
+@pytest.mark.parametrize("tilt", [0, 25, 50])
+def test_dots_seen_through_a_lens_leave_no_bias_in_the_pose(kind, tilt):
+    rng = np.random.default_rng(tilt)
+    spec, lens = draw_spec(kind, rng), LENSES[2]
+    placed = Placed(spec, draw_pose(spec, lens, np.radians(tilt), rng, 0.8))
+    ids = np.arange(len(spec.lattice()))
+    pixels = true_pixels(lens, placed)
+    view = BoardView(spec, (lens.width, lens.height), ids, pixels, np.full(len(ids), 0.02), False, placed.radius)
+    found = board_pose(view, camera_of(lens))
+    error = difference(found.camera_from_board, pin.SE3(placed.pose))
+    assert found.rms_px < 1e-3
+    assert np.abs(error[:3]).max() < 1e-5
+    assert np.abs(error[3:]).max() < 3e-5
+    # Corners where the dots are: without the conic's projection the same pixels give a worse fit.
+    assert board_pose(replace(view, dot_radius=0.0), camera_of(lens)).rms_px > 10 * found.rms_px
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("mirrored", "marked_dots"),
+        ("mirrored", "charuco"),
+        ("a smaller board instead", "marked_dots"),
+        ("a larger board instead", "marked_dots"),
+        ("a larger board instead", "chessboard"),
+        ("a smaller board instead", "asymmetric_dots"),
+        ("another kind instead", "charuco"),
+        ("nothing but noise", "dots"),
+    ],
+)
+def test_what_is_not_the_named_board_is_refused(name, kind):
+    view = seen(name, kind)
+    with pytest.raises(PictureRefused) as refused:
+        find_board(view.picture, view.spec)
+    assert refused.value.reason in (Reason.NO_BOARD, Reason.AMBIGUOUS, Reason.MIRRORED)
+    assert len(str(refused.value)) > 20
+
+
+@pytest.mark.parametrize("kind", ["marked_dots", "chessboard", "charuco"])
+def test_two_boards_that_could_both_be_meant_are_refused(kind):
+    view = seen("two of the same board", kind, 2)
+    with pytest.raises(PictureRefused) as refused:
+        find_board(view.picture, view.spec)
+    assert refused.value.reason is Reason.AMBIGUOUS
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_stated_covariance_of_the_pose_is_that_of_the_errors(kind):
+    rng = np.random.default_rng(11)
+    squares = []
+    for _ in range(60):
+        spec, lens = draw_spec(kind, rng), LENSES[int(rng.integers(3))]
+        placed = Placed(spec, draw_pose(spec, lens, float(rng.uniform(0.25, 0.8)), rng, 0.7))
+        truth = true_pixels(lens, placed)
+        sigma = np.full(len(truth), 0.05)
+        pixels = truth + rng.normal(0, 0.05, truth.shape)
+        radius = placed.radius if kind in DOTS else 0.0
+        view = BoardView(spec, (lens.width, lens.height), np.arange(len(truth)), pixels, sigma, False, radius)
+        found = board_pose(view, camera_of(lens))
+        error = difference(found.camera_from_board, pin.SE3(placed.pose))
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    # 360 degrees of freedom: one standard deviation of the mean is .07 of it.
+    assert 0.86 < np.sqrt(np.mean(squares) / 6) < 1.14
