@@ -17,6 +17,8 @@ from cell.vision.plane_map import PlaneMap
 # Share of the places along a side that have to show its end, and how many further points contradict it.
 LEAST_ENDS = 0.3
 MOST_BEYOND = 2
+# What is brighter than this share of the step from black to white beside it is the sheet, not a cover.
+AS_WHITE = 0.85
 
 
 def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], radius: float) -> None:
@@ -75,7 +77,7 @@ def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: ND
     # Both colours are met half a pitch around any point.
     around = np.array([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5], [0.2, 0.2], [-0.2, 0.2]])
     levels = grey(smooth, plane.pixels((own[:, None, :] + around).reshape(-1, 2))).reshape(len(own), -1)
-    black, white = (float(np.nanmedian(f(levels, axis=1))) for f in (np.nanmin, np.nanmax))
+    black, white = np.nanmin(levels, axis=1), np.nanmax(levels, axis=1)
     for name, axis, sign, last in (
         ("first row", 1, -1, 0),
         ("last row", 1, 1, rows - 1),
@@ -85,13 +87,14 @@ def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: ND
         reached = int((sign * own[:, axis]).max()) * sign
         if reached == last:
             continue
-        line = own[own[:, axis] == reached].astype(np.float64)
+        at_line = own[:, axis] == reached
+        line = own[at_line].astype(np.float64)
         outward = np.zeros(2)
         outward[axis] = sign
         there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + outward])))
         margin, next_line = there[: len(line)], there[len(line) :]
         seen = np.isfinite(margin) & np.isfinite(next_line)
-        bright = margin[seen] > black + 0.6 * (white - black)
+        bright = (margin > black[at_line] + AS_WHITE * (white - black)[at_line])[seen]
         if seen.sum() >= 2 and bright.mean() > 0.6:
             raise PictureRefused(
                 Reason.NO_BOARD,
