@@ -43,7 +43,7 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
             dark, between, middle, near_side = grey(smooth, plane.pixels(spots))
             rim = grey(smooth, plane.pixels(place + around))
             step = between - dark
-            if not step > max(4.0, 0.12 * float(np.nanmedian(between - level))):
+            if not step > max(4.0, 0.12 * typical(between - level)):
                 continue
             seen += 1
             darker = rim - middle > 0.4 * step
@@ -66,6 +66,12 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
         check_hidden_sides(image, spec, plane, found, 0.5)
 
 
+def typical(values: Array) -> float:
+    """Median of the values that are numbers; 0 when none is."""
+    numbers = values[np.isfinite(values)]
+    return float(np.median(numbers)) if len(numbers) else 0.0
+
+
 def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], beyond: float) -> None:
     """Refuse a smaller board: a whole side without a point, though the bright sheet is seen before it.
 
@@ -74,8 +80,8 @@ def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: ND
     smooth = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
     cols, rows = spec.grid
     own = spec.lattice()[found]
-    # Both colours are met half a pitch around any point.
-    around = np.array([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5], [0.2, 0.2], [-0.2, 0.2]])
+    # Both colours are met around any point: of a ChArUco board between corner and marker.
+    around = np.array([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5], [0.1, 0.1], [-0.1, 0.1]])
     levels = grey(smooth, plane.pixels((own[:, None, :] + around).reshape(-1, 2))).reshape(len(own), -1)
     black, white = np.nanmin(levels, axis=1), np.nanmax(levels, axis=1)
     for name, axis, sign, last in (
