@@ -96,7 +96,7 @@ def _solve(
     places, pixels = layout[ids[own]].reshape(-1, 2), corners[own].reshape(-1, 2)
     side = float(np.median(np.linalg.norm(np.diff(corners[own], axis=1), axis=2))) * spec.pitch / spec.marker
     homography, inside = cv2.findHomography(places, pixels, cv2.RANSAC, max(2.0, TOLERANCE * side))
-    if homography is None:
+    if homography is None or len(inside) == 0:
         return None
     whole = inside.reshape(-1, 4).all(axis=1)
     used = np.zeros(len(ids), dtype=np.bool_)
