@@ -66,6 +66,8 @@ def _crossings(smooth: NDArray[np.float32], places: Array) -> tuple[NDArray[np.b
     unit = np.column_stack([np.cos(angles), np.sin(angles)])
     good = np.zeros(len(places), dtype=np.bool_)
     dark = np.zeros(len(places))
+    if not len(places):
+        return good, dark
     for radius in RADII:
         at = (places[:, None, :] + radius * unit).astype(np.float32)
         ring = cv2.remap(smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

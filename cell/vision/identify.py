@@ -22,6 +22,8 @@ RING_LEAD = 1.6
 # Of a board without marks that must be found, and points beside it that may be mistaken for part of it.
 LEAST_SHARE = 0.5
 MOST_OUTSIDE = 0.1
+# With fewer of its points and not all of its edges it is more likely another board.
+WHOLE_SHARE = 0.88
 
 
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
@@ -103,10 +105,11 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
         )
     orders = [f for f in best if _spans(f, set(number), template)]
     if not orders:
+        whole = most >= WHOLE_SHARE * len(template)
         raise PictureRefused(
-            Reason.AMBIGUOUS,
-            f"the {most} points found do not reach all edges of {spec.name}, so their order is not certain; show the "
-            "whole board",
+            Reason.AMBIGUOUS if whole else Reason.NO_BOARD,
+            f"the {most} points found, of {len(template)}, do not reach all edges of {spec.name}, so their order is not "
+            "certain; show the whole board, or name the board that it is",
         )
     return [np.array([number.get(tuple(p), (-1, -1)) for p in f.tolist()], dtype=np.intp) for f in orders]
 
