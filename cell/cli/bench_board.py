@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption, print_json, wide_console
 
 
 def register(bench: typer.Typer) -> None:
@@ -130,10 +130,9 @@ COLUMNS = (
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = wide_console()
     lines = [(row["condition"], row["expect"], row) for row in report["rows"] if row["kind"] == "all"]
     kinds = [(kind, "found", row) for kind, row in report["kinds"].items()]
     for title, first, rows in (

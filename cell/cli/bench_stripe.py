@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption, print_json, wide_console
 
 
 def register(app: typer.Typer) -> None:
@@ -59,10 +59,9 @@ def _without_nan(data: Any) -> Any:
 
 
 def _print(result: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = wide_console()
     if "accuracy" in result:
         noise = result["accuracy"]["assumed_noise"]
         table = Table(

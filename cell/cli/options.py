@@ -35,3 +35,10 @@ SimOption = Annotated[
 def print_json(data: Any) -> None:
     """Write JSON to standard output."""
     typer.echo(json.dumps(data, indent=2))
+
+
+def wide_console(least: int = 120) -> Any:
+    """A rich console for wide tables: at least `least` columns also where the output is no terminal."""
+    from rich.console import Console
+
+    return Console(width=max(Console().width, least))

@@ -108,8 +108,8 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
         whole = most >= WHOLE_SHARE * len(template)
         raise PictureRefused(
             Reason.AMBIGUOUS if whole else Reason.NO_BOARD,
-            f"the {most} points found, of {len(template)}, do not reach all edges of {spec.name}, so their order is not "
-            "certain; show the whole board, or name the board that it is",
+            f"the {most} points found, of {len(template)}, do not reach all edges of {spec.name}, so their order is "
+            "not certain; show the whole board, or name the board that it is",
         )
     return [np.array([number.get(tuple(p), (-1, -1)) for p in f.tolist()], dtype=np.intp) for f in orders]
 
