@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption, print_json, wide_console
 
 
 def register(app: typer.Typer) -> None:
@@ -36,10 +36,9 @@ def inversion(
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = wide_console(140)
     table = Table(title="Pose inversion: 10,000 points, same cloud and start, one thread")
     for title in ("part", "start", "method", "starts", "converged %", "mean mm", "p95 mm", "mean mrad", "p95 mrad"):
         table.add_column(title, justify="left" if title in ("part", "start", "method") else "right")
@@ -54,7 +53,7 @@ def _print(report: dict[str, Any]) -> None:
     for title in ("case", "within", "refused", "outside", "worst mm", "worst mrad", "refused, for example, because"):
         cases.add_column(title)
     for row in report["refusals"]:
-        cases.add_row(*("–" if value is None else str(value) for value in row.values()))
+        cases.add_row(*("–" if value is None else str(value).partition(". ")[0] for value in row.values()))
     console.print(cases)
     cover = report["coverage"]
     console.print(
