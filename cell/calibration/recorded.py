@@ -23,9 +23,20 @@ from cell.calibration.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
 from cell.calibration.intrinsics import Intrinsics, choose_lens
 from cell.calibration.joint import Joint, Staged, solve_joint, solve_staged, start_state
 from cell.calibration.observations import ScanObservation
+from cell.calibration.recorded_result import (
+    camera_dict,
+    closed_form_dict,
+    empty_result,
+    finite_mm,
+    flatness_dict,
+    frame_dict,
+    hand_eye_dict,
+    intrinsics_dict,
+    plane_dict,
+    seen_depths,
+)
 from cell.calibration.starts import plane_from_board, stripe_pixels
-from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
-from cell.geometry.light_plane import LightPlane
+from cell.geometry.camera import PARAMETER_NAMES, CameraModel
 from cell.vision.board import board_pose
 from cell.vision.board_spec import BoardSpec
 from cell.vision.pictures import Reason
@@ -80,33 +91,14 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
         if pairs:
             return _from_pairs(pairs)
         raise
-    result = _empty(spec)
+    result = empty_result(spec)
     result["notes"] += [
         f"{name} is not used: no picture has its number" for name in poses_without_frame(folder, frames)
     ]
     _from_frames(frames, result)
-    result["frames"] = [_frame_dict(frame, result["frames_rms"]) for frame in frames]
+    result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
-
-
-def _empty(spec: BoardSpec | None) -> dict[str, Any]:
-    keys = (
-        "intrinsics",
-        "intrinsics_without_distortion",
-        "intrinsics_from_pictures",
-        "hand_eye",
-        "light_plane",
-        "flatness",
-        "noise",
-    )
-    return {
-        "board": None if spec is None else spec.name,
-        "frames": [],
-        "frames_rms": {},
-        **dict.fromkeys(keys),
-        "notes": [],
-    }
 
 
 def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
@@ -130,8 +122,8 @@ def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
             posed = [f for f in posed if f.reason is None]
     rest = used(frames)
     result["frames_rms"] = {f.path.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
-    result["intrinsics"] = result["intrinsics_from_pictures"] = _intrinsics_dict(chosen)
-    result["intrinsics_without_distortion"] = _intrinsics_dict(plain)
+    result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
+    result["intrinsics_without_distortion"] = intrinsics_dict(plain)
     if len(posed) >= LEAST_POSES:
         without_pose = len(rest) - len(posed)
         if without_pose:
@@ -226,7 +218,7 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
     turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]
     sigma = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))
     result["intrinsics"] = {
-        **_camera_dict(state.camera),
+        **camera_dict(state.camera),
         "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
         "held_out_at_reported_poses_rms_px": math.sqrt(2) * chain.joint.held_out_px,
         "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[:4].tolist(), strict=True)),
@@ -234,13 +226,13 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
     }
     result["hand_eye"] = {
         "method": "joint adjustment",
-        **_hand_eye_dict(chain.setup, state.flange_from_camera),
+        **hand_eye_dict(chain.setup, state.flange_from_camera),
         "scatter_mm": 1e3 * float(np.sqrt(np.mean(np.sum(np.square(apart), axis=1)))),
         "scatter_deg": math.degrees(float(np.sqrt(np.mean(np.square(turns))))),
         "sigma_mm": (1e3 * sigma[15:18]).tolist(),
         "sigma_deg": np.degrees(sigma[18:21]).tolist(),
         "frames": len(frames),
-        "closed_form": _closed_form_dict(chain.setup, chain.staged.hand_eye),
+        "closed_form": closed_form_dict(chain.setup, chain.staged.hand_eye),
     }
     result["noise"] = {
         "arm_translation_mm": 1e3 * adjusted.priors.arm_translation,
@@ -253,15 +245,15 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
         result["notes"].append("no light plane: no frame shows a laser stripe on the board in a usable way")
         return
     result["light_plane"] = {
-        **_plane_dict(state.plane),
+        **plane_dict(state.plane),
         "rms_mm": 1e3 * adjusted.stripe_rms_m,
-        "depth_range_mm": _depths(state.plane, state.camera, [v.stripe for v in chain.joint.views]),
+        "depth_range_mm": seen_depths(state.plane, state.camera, [v.stripe for v in chain.joint.views]),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
         "method": "joint adjustment",
         "staged": {
-            **_plane_dict(chain.staged.plane.plane),
+            **plane_dict(chain.staged.plane.plane),
             "rms_mm": 1e3 * chain.staged.plane.rms,
-            "cross_ratio_check_mm": None if chain.staged.paper is None else _mm(chain.staged.paper.cross_ratio_m),
+            "cross_ratio_check_mm": None if chain.staged.paper is None else finite_mm(chain.staged.paper.cross_ratio_m),
         },
     }
     names = [f.path.name for f in frames]
@@ -269,10 +261,10 @@ def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[s
     result["stripe_points"] = {n: len(r) for n, r in zip(names, rows, strict=True)}
     if chain.flat is not None:
         result["flatness"] = {
-            **_flatness_dict(chain.flat, names),
+            **flatness_dict(chain.flat, names),
             "frame": "base" if chain.setup == "eye_in_hand" else "flange",
-            "leave_one_out": None if chain.left_out is None else _flatness_dict(chain.left_out, names),
-            "staged": None if chain.flat_staged is None else _flatness_dict(chain.flat_staged, names),
+            "leave_one_out": None if chain.left_out is None else flatness_dict(chain.left_out, names),
+            "staged": None if chain.flat_staged is None else flatness_dict(chain.flat_staged, names),
         }
 
 
@@ -291,9 +283,9 @@ def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: 
         return
     seen = [stripe_pixels(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None]
     result["light_plane"] = {
-        **_plane_dict(plane.plane),
+        **plane_dict(plane.plane),
         "rms_mm": 1e3 * plane.rms,
-        "depth_range_mm": _depths(plane.plane, camera, seen),
+        "depth_range_mm": seen_depths(plane.plane, camera, seen),
         "method": "fit on the board's poses",
     }
     result["stripe_points"] = {f.path.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
@@ -311,98 +303,18 @@ def _from_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
             raise ConfigError(f"the {len(pairs)} pairs of poses give no hand-eye: {error}") from error
         solutions.append((setup, closed, refine_hand_eye(flanges, boards, closed)))
     setup, closed, refined = min(solutions, key=lambda s: s[1].scatter_m)
-    result = _empty(None)
+    result = empty_result(None)
     del result["frames_rms"]
     result["frames"] = [
         {"name": f"pair {k}", "used": True, "reason": None, "text": "", "rms_px": None} for k in range(len(pairs))
     ]
     result["hand_eye"] = {
         "method": "Park-Martin, then robust least squares on the poses",
-        **_hand_eye_dict(setup, refined.flange_from_camera),
+        **hand_eye_dict(setup, refined.flange_from_camera),
         "scatter_mm": 1e3 * refined.scatter_m,
         "scatter_deg": math.degrees(refined.scatter_rad),
         "frames": len(pairs),
-        "closed_form": _closed_form_dict(setup, closed),
+        "closed_form": closed_form_dict(setup, closed),
     }
     result["notes"].append("pairs of poses only: no intrinsics, no light plane, no flatness")
     return result
-
-
-def _frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
-    return {
-        "name": frame.path.name,
-        "used": frame.reason is None,
-        "reason": None if frame.reason is None else str(frame.reason),
-        "text": frame.text,
-        "rms_px": rms.get(frame.path.name),
-        "points": 0 if frame.view is None else len(frame.view.ids),
-        "pose": frame.base_from_flange is not None,
-        "stripe": frame.profile is not None,
-        "order_assumed": frame.view is not None and frame.view.order_assumed,
-    }
-
-
-def _intrinsics_dict(found: Intrinsics) -> dict[str, Any]:
-    return {
-        **_camera_dict(found.camera),
-        "rms_px": found.point_rms_px,
-        "held_out_rms_px": math.sqrt(2) * found.held_out_px,
-        "sigma_px": dict(zip(PARAMETER_NAMES[:4], found.sigma[:4].tolist(), strict=True)),
-        "method": "pictures alone",
-    }
-
-
-def _camera_dict(camera: CameraModel) -> dict[str, Any]:
-    values = dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True))
-    return {**values, "width": camera.width, "height": camera.height}
-
-
-def _closed_form_dict(setup: str, found: HandEye) -> dict[str, Any]:
-    return {
-        "method": "Park-Martin",
-        **_hand_eye_dict(setup, found.flange_from_camera),
-        "scatter_mm": 1e3 * found.scatter_m,
-        "scatter_deg": math.degrees(found.scatter_rad),
-    }
-
-
-def _hand_eye_dict(setup: str, pose: pin.SE3) -> dict[str, Any]:
-    r = pose.rotation
-    middle = math.asin(max(-1.0, min(1.0, float(r[0, 2]))))
-    first, last = math.atan2(-r[1, 2], r[2, 2]), math.atan2(-r[0, 1], r[0, 0])
-    if first < 0:
-        # Of the two triples for one rotation, that with the first angle in 0 … π.
-        first, middle, last = first + math.pi, math.pi - middle, last + math.pi
-        middle, last = (math.remainder(angle, 2 * math.pi) for angle in (middle, last))
-    return {
-        "setup": setup,
-        "pose": "flange_from_camera" if setup == "eye_in_hand" else "base_from_camera",
-        "translation_mm": (1e3 * pose.translation).tolist(),
-        "rotation": r.tolist(),
-        "rotation_vector_rad": pin.log3(r).tolist(),
-        "euler_xyz_rad": [first, middle, last],
-    }
-
-
-def _plane_dict(plane: LightPlane) -> dict[str, Any]:
-    return {"normal": list(plane.normal), "distance_mm": 1e3 * plane.distance}
-
-
-def _depths(plane: LightPlane, camera: CameraModel, stripes: Sequence[Array]) -> list[float]:
-    """Least and largest distance in mm before the camera at which the stripe was seen on the board."""
-    depths = plane.intersect(camera.rays(np.concatenate(stripes)))[:, 2]
-    return [1e3 * float(np.nanmin(depths)), 1e3 * float(np.nanmax(depths))]
-
-
-def _flatness_dict(flat: Flatness, names: Sequence[str]) -> dict[str, Any]:
-    return {
-        "rms_mm": 1e3 * flat.rms,
-        "p95_mm": 1e3 * flat.p95,
-        "points": flat.points,
-        "extent_mm": (1e3 * flat.extent).tolist(),
-        "per_frame": [{"name": n, "rms_mm": _mm(v)} for n, v in zip(names, flat.per_frame, strict=True)],
-    }
-
-
-def _mm(metres: float) -> float | None:
-    return 1e3 * metres if math.isfinite(metres) else None
