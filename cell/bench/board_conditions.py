@@ -141,15 +141,14 @@ def draw_view(condition: Condition, kind: Kind, rng: np.random.Generator) -> Vie
         shown = draw_spec(others[int(rng.integers(len(others)))], rng)
     crowd = "other" in has or "twin" in has
     tilt = np.radians(rng.uniform(*condition.tilt))
-    pose = draw_pose(shown, lens, tilt, rng, float(rng.uniform(0.35, 0.45) if crowd else rng.uniform(0.5, 0.85)))
-    placed = Placed(shown, pose, 0.85, 0.07, float(rng.uniform(0.6, 1.2)))
+    placed, second = _placed(shown, lens, tilt, rng, crowd), None
+    if crowd:
+        while (second := _beside(lens, placed, spec if "twin" in has else _another(spec, rng), rng)) is None:
+            placed = _placed(shown, lens, tilt, rng, crowded=True)
     albedo = _background(lens, rng, "clutter" in has)
+    if second is not None:
+        paint(albedo, lens, second)
     if "none" not in has:
-        if crowd:
-            spec2 = spec if "twin" in has else _another(spec, rng)
-            beside = _beside(lens, placed, spec2, rng)
-            if beside is not None:
-                paint(albedo, lens, beside)
         paint(albedo, lens, placed)
     pixels = true_pixels(lens, placed)
     if "hidden" in has:
@@ -160,6 +159,12 @@ def draw_view(condition: Condition, kind: Kind, rng: np.random.Generator) -> Vie
     if "mirrored" in has:
         picture = np.ascontiguousarray(picture[:, ::-1])
     return View(picture, spec, lens, placed, pixels)
+
+
+def _placed(shown: BoardSpec, lens: Lens, tilt: float, rng: np.random.Generator, crowded: bool = False) -> Placed:
+    """A board somewhere in the picture, with room beside it where it is to be `crowded`."""
+    share = float(rng.uniform(0.35, 0.45) if crowded else rng.uniform(0.5, 0.85))
+    return Placed(shown, draw_pose(shown, lens, tilt, rng, share), 0.85, 0.07, float(rng.uniform(0.6, 1.2)))
 
 
 def _another(spec: BoardSpec, rng: np.random.Generator) -> BoardSpec:
