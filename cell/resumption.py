@@ -16,7 +16,7 @@ from statemachine.journal import JournalError, read
 
 
 @dataclass(frozen=True)
-class Interrupted:
+class UnfinishedRun:
     """A run that did not come to its end: its folder, its job, and what its journal says of it."""
 
     folder: Path
@@ -24,7 +24,7 @@ class Interrupted:
     info: dict[str, Any]
 
     @classmethod
-    def find(cls, folder: Path) -> Interrupted:
+    def find(cls, folder: Path) -> UnfinishedRun:
         """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now."""
         try:
             run = read(folder).run

@@ -20,7 +20,7 @@ from cell.injection import Injection, Injector
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job, require_fit
 from cell.job_run import JobRun, Observer, RunOutcome, both, stop_cell
-from cell.resumption import Interrupted, job_source
+from cell.resumption import UnfinishedRun, job_source
 from cell.runs import CellLock, find_run
 from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
@@ -166,11 +166,11 @@ class Cell:
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
         the board has not moved. Raises `ConfigError` when there is nothing to resume.
         """
-        before = Interrupted.find(find_run(self.runs_folder, None if run is None else str(run)))
+        before = UnfinishedRun.find(find_run(self.runs_folder, None if run is None else str(run)))
         return self._perform(before.job, observer, {"resumed_from": before.folder.name}, before)
 
     def _perform(
-        self, job: str | Path, observer: Observer | None, info: dict[str, Any], before: Interrupted | None
+        self, job: str | Path, observer: Observer | None, info: dict[str, Any], before: UnfinishedRun | None
     ) -> RunOutcome:
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config)

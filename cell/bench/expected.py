@@ -188,7 +188,7 @@ def _calibration(
     )
     joint = solve_joint(observations, staged, priors, held_out=False)
     problem = Adjustment(joint.views, shared_mask(plane=True, rail=True), joint.adjusted.priors)
-    inverse = problem.information(joint.adjusted.state).inverse()
+    inverse = problem.normal_at(joint.adjusted.state).inverse()
     weight = 1.0 / np.array([priors.arm_translation**2] * 3 + [priors.arm_rotation**2] * 3)
     shift = np.zeros((SHARED, 18))
     for k, view in enumerate(joint.views):

@@ -117,10 +117,6 @@ class Adjustment:
             {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
         )
 
-    def information(self, state: State) -> Normal:
-        """The normal equations at a state, which has a flange pose and a rail position for each view."""
-        return self.normal_at(state)
-
     def residual_rms(self, state: State) -> tuple[float, float]:
         """RMS of the dots in px (per component) and of the stripe's distances from the board in m; NaN when unseen."""
         dots, stripe = [np.zeros(0)], [np.zeros(0)]

@@ -90,12 +90,12 @@ def resume(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
     from cell.job import load_job
-    from cell.resumption import Interrupted
+    from cell.resumption import UnfinishedRun
     from cell.runs import find_run
     from cell.supervisor import SIM_SPEED, Cell
     from drivers.errors import ConfigError
 
-    before = Interrupted.find(find_run(_runs_folder(config), name))
+    before = UnfinishedRun.find(find_run(_runs_folder(config), name))
     simulated = before.info["simulated"]
     if not simulated and config is None:
         raise ConfigError(f"run {before.folder.name} moved real devices: `cell resume` needs their --config")

@@ -1,11 +1,12 @@
 """How the hot loops of this package are compiled, and whether they can be.
 
 Where numba is missing, broken or switched off, `AVAILABLE` is False, `compiled` leaves functions as they are, and
-`stripe.py` takes the numpy way.
+`stripe.py` takes the numpy way, which is said once.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,8 +14,17 @@ try:
     import numba
 
     AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
-except Exception:  # A numba that does not fit the installed numpy or LLVM raises more than ImportError.
+    _reason = "it is switched off"
+except Exception as error:  # A numba that does not fit the installed numpy or LLVM raises more than ImportError.
     AVAILABLE = False
+    _reason = f"{type(error).__name__}: {error}"
+if not AVAILABLE:
+    warnings.warn(
+        f"numba cannot compile here ({_reason}): stripes are extracted about ten times slower, and a sweep may lose "
+        "frames. Reinstall numba, or lower scan.frame_rate",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cell.resumption import Interrupted
+from cell.resumption import UnfinishedRun
 from cell.steps.stored_sweep import FILE
 from drivers.errors import ConfigError
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
@@ -92,7 +92,7 @@ def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path
     assert empty.returncode == 1
     assert "holds no part" in json.loads(empty.stdout)["reason"]
     with pytest.raises(ConfigError, match="only a run that was aborted"):
-        Interrupted.find(place / "runs" / report["run"])
+        UnfinishedRun.find(place / "runs" / report["run"])
     assert (place / "runs" / report["run"] / FILE).exists()
 
 
