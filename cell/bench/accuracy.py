@@ -1,6 +1,7 @@
 """`cell bench accuracy`: the whole job on many simulated cells, its errors beside their bounds and limits.
 
-A world a seed and level, each calibrated and run by the product's own steps in lock step, spread over the cores.
+A world a seed and level, each calibrated and run by the product's own steps in lock step, spread over the cores; at
+every level the acceptance tests of the trade on the first seed's scan head.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.stats import chi2
 
+from cell.bench.acceptance import acceptance
 from cell.bench.expected import expect
 from cell.bench.scan_errors import COVERED, by_pose, own_base, scan_errors
 from cell.bench.whole_job import JobRecord, run_whole_job
@@ -41,9 +43,9 @@ _SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 
 
 def campaign(
-    seeds: Sequence[int], levels: Sequence[str], job: str, done: Callable[[dict[str, Any]], None], workers: int = 0
+    seeds: Sequence[int], levels: Sequence[str], job: str, done: Callable[[str], None], workers: int = 0
 ) -> dict[str, Any]:
-    """Run every seed at every level and sum up; `done` is told each run's figures as they come, in any order.
+    """Run every seed at every level and sum up; `done` is told in words of each run and acceptance test that ended.
 
     `workers` processes, by default one a core. Figures of one level stand at the top as well, that of the first.
     """
@@ -55,13 +57,21 @@ def campaign(
     pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
     try:
         waiting = [pool.submit(one_run, job, seed, level) for level in levels for seed in seeds]
-        for future in as_completed(waiting):
-            runs.append(future.result())
-            done(runs[-1])
+        tests = {pool.submit(acceptance, seeds[0], level): level for level in levels}
+        for future in as_completed([*waiting, *tests]):
+            if future in tests:
+                done(f"acceptance {tests[future]}: measured")
+                continue
+            run = future.result()
+            runs.append(run)
+            done(f"seed {run['seed']} {run['level']}: {run['outcome']}")
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
     runs.sort(key=lambda run: run["seed"])
-    by_level = {level: summed_up([run for run in runs if run["level"] == level], level) for level in levels}
+    by_level = {
+        level: summed_up([run for run in runs if run["level"] == level], level) | {"acceptance": test.result()}
+        for test, level in tests.items()
+    }
     return {"job": job, "seeds": list(seeds), **by_level[levels[0]], "levels": by_level}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -27,6 +27,8 @@ def accuracy(
 ) -> None:
     """Calibrate and run many simulated cells in lock step and measure them against the truth.
 
+    At each level the acceptance tests of `cell bench acceptance` are done too, on the first seed's scan head.
+
     Exit code 1 when a part was placed outside the job's tolerance, or a limit of level nominal is not kept.
     """
     from rich.console import Console
@@ -42,10 +44,13 @@ def accuracy(
         raise ConfigError(f"--picture {picture} must end in .png")
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("the first runs are on their way", total=seeds * len(levels))
+        task = progress.add_task("the first runs are on their way", total=(seeds + 1) * len(levels))
 
-        def done(run: dict[str, Any]) -> None:
-            progress.update(task, advance=1, description=f"seed {run['seed']} {run['level']}: {run['outcome']}")
+        def done(what: str) -> None:
+            progress.update(task, advance=1, description=what)
+            if not progress.console.is_terminal:
+                # A log shows no bar until its end.
+                progress.console.print(what, markup=False)
 
         result = campaign(range(1, seeds + 1), levels, job, done, workers)
     if picture is not None:

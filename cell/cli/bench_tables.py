@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cell.cli.display import SHOWN_UNITS
+from cell.cli.paper_tables import print_acceptance
 from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 
 _ROWS = (
@@ -33,6 +34,7 @@ def print_accuracy(result: Mapping[str, Any]) -> None:
     for level, figures in result["levels"].items():
         _errors(console, level, figures)
         _outcomes(console, figures)
+        print_acceptance(figures["acceptance"])
         _noise(console, level, figures["assumed_noise"])
     console.print(
         "Simulated, with the noise above; the paper's figures are its own hardware's, Table 1 as printed (the "
