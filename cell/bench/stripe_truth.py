@@ -43,10 +43,10 @@ def draw(cell: Cell, shape: tuple[int, int], seed: int) -> tuple[NDArray[np.uint
     column = first[:, None] + np.arange(2 * half + 1)
     stripe = cell.peak * _integrated(column, centres[:, None], cell.width)
     if cell.contrast:
-        parts = [gaussian_filter(rng.normal(size=stripe.shape), FIELD_SMOOTHING) for _ in range(2)]
-        # Neighbouring rows' windows start at nearly the same column, so that the grain is round.
+        parts = [gaussian_filter(rng.normal(size=shape), FIELD_SMOOTHING) for _ in range(2)]
         intensity = parts[0] ** 2 + parts[1] ** 2
-        stripe = stripe * np.maximum(1 + cell.contrast * (intensity / intensity.mean() - 1), 0)
+        intensity = (intensity / intensity.mean())[row[:, None], column]
+        stripe = stripe * np.maximum(1 + cell.contrast * (intensity - 1), 0)
     light = np.broadcast_to(cell.ambient + cell.slope * np.arange(width), shape).copy()
     light[row[:, None], column] += stripe
     signal = rng.poisson(light * ELECTRONS_PER_DN) / ELECTRONS_PER_DN + rng.normal(0, READ_NOISE_DN, shape)

@@ -24,15 +24,15 @@ from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe_methods import METHODS
 from cell.vision.stripe_noise import pixel_noise
 from cell.vision.stripe_rivals import choose, smooth_widths
-from cell.vision.stripe_speckle import correlation, measure_speckle
+from cell.vision.stripe_speckle import ASSUMED_GRAIN, correlation, measure_speckle
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Axis = Literal["rows", "columns"]
 
-ASSUMED_SPECKLE = 0.15, 0.7
-"""Contrast and grain in px where a picture shows too few lines to measure them."""
-SPECKLE_LINES = 256
+ASSUMED_CONTRAST = 0.15
+"""Of the speckle where a picture shows too few lines to measure it."""
+SPECKLE_PAIRS = 128
 NO_LAGS = np.zeros(0, np.float32)
 # Propagation is linear in the speckle's contrast C; what it leaves out grows as C⁴, and was taken from simulation.
 SECOND_ORDER = 3.0
@@ -149,13 +149,15 @@ def extract(
 
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
     if contrast is None or (contrast > 0 and grain is None):
-        clear = found[(start[found, 0, find.CORE] == 0) & ~double[found]]
-        sample = clear[:: max(1, len(clear) // SPECKLE_LINES)]
-        run(sample, widths, ASSUMED_SPECKLE[0], NO_LAGS)
+        clear = (start[:, 0, find.ENERGY] > 0) & (start[:, 0, find.CORE] == 0) & ~double
+        pairs = np.flatnonzero(clear[:-1] & clear[1:])
+        pairs = pairs[:: max(1, len(pairs) // SPECKLE_PAIRS)]
+        sample = np.union1d(pairs, pairs + 1)
+        run(sample, widths, ASSUMED_CONTRAST, NO_LAGS)
         measured = measure_speckle(
-            work, shade, dark is not None, sample, fitted, noise.pixel, settings.gain_dn, ASSUMED_SPECKLE[0]
+            work, shade, dark is not None, pairs, fitted, noise.pixel, settings.gain_dn, ASSUMED_CONTRAST
         )
-        measured = measured or ASSUMED_SPECKLE
+        measured = measured or (ASSUMED_CONTRAST, ASSUMED_GRAIN)
         contrast = measured[0] if contrast is None else contrast
         grain = measured[1] if grain is None else grain
         if len(sample):
