@@ -179,7 +179,7 @@ def _calibration(
 ) -> tuple[Vector, Vector]:
     """Covariance (21, 21) of the scan head's parameters under the declared noise, and their shift (21, 18) by the
     arm's kinematic error: the flange is not where it is reported, view by view, and the adjustment follows."""
-    observations = [o for o in record.observations[0] if not o.same_rest]
+    observations = record.observations[0]
     staged = solve_staged(observations, nominal_camera(config.scan_camera), np.array([1.0, 0.0, 0.0]))
     priors = Priors(
         arm_translation=max(noise["arm_repeatability"] / np.sqrt(3.0), 1e-6),
@@ -192,6 +192,8 @@ def _calibration(
     weight = 1.0 / np.array([priors.arm_translation**2] * 3 + [priors.arm_rotation**2] * 3)
     shift = np.zeros((SHARED, 18))
     for k, view in enumerate(joint.views):
+        if view.same_rest:
+            continue
         # The arm stands where the table's error puts it; what is reported lies the opposite way from it.
         shift -= inverse.cross[k][:, :6] * weight @ kinematics.shifts(view.base_from_flange)
     return inverse.shared[:21, :21], shift[:21]

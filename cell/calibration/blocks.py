@@ -29,6 +29,8 @@ class ViewData:
     """Measurements of one view: board points (n, 3) in m, their pixels (n, 2) and σ (n,), stripe pixels on the board.
 
     `base_from_flange` and `rail` are as reported; `dot_radius` in m, 0 for corners. Empty arrays where nothing is seen.
+    The stripe was measured along `stripe_axis` (0: along rows, its column has the noise; 1: along columns).
+    `same_rest` says that the flange stands exactly where it stood in the view before, wherever that was.
     """
 
     points: Array
@@ -39,6 +41,8 @@ class ViewData:
     stripe_sigma: Array
     base_from_flange: pin.SE3
     rail: float
+    stripe_axis: int = 0
+    same_rest: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,5 +169,5 @@ def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> 
     jacobian[:, 27:30] = normal
     jacobian[:, 30:33] = cross(swung, normal)
     jacobian[:, 33] = normal_camera @ state.rail_direction
-    sigma = np.linalg.norm(by_pixel, axis=1) * view.stripe_sigma
+    sigma = np.abs(by_pixel[:, view.stripe_axis]) * view.stripe_sigma
     return -distance, jacobian, np.maximum(sigma, 1e-7)
