@@ -186,6 +186,16 @@ def test_influences_and_advice_agree_with_the_covariance(world, solved):
     moved = np.einsum("nik,mk->mni", by_parameter, draws)
     assert figures["total_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(moved**2, axis=2))), rel=0.03)
     assert all(row["if_known_mm"] <= figures["total_mm"] * (1 + 1e-9) for row in figures["parameters"])
+    # What each does alone and what each pair does together make the total.
+    alone = {row["name"]: row["alone_mm"] for row in figures["parameters"]}
+    pairs = 2e6 * np.triu(np.einsum("nik,kl,nil->kl", by_parameter, covariance[:21, :21], by_parameter), 1).sum() / 3
+    assert sum(v**2 for v in alone.values()) + pairs == pytest.approx(figures["total_mm"] ** 2, rel=1e-6)
+    # The cloud's covariance goes by variants of the calibration: they leave the points as uncertain.
+    scan = solved.calibration.scan
+    nominal = scan.geometry().solve(places.pixels, places.rails)[0]
+    off = [variant.solve(places.pixels, places.rails)[0] - nominal for variant in scan.variants()]
+    expected = figures["total_mm"] * solved.scan.adjusted.inflation
+    assert 1e3 * np.sqrt(np.sum(np.square(off)) / len(nominal)) == pytest.approx(expected, rel=0.01)
     rows = advice(solved.scan, world.spec, (0.0, 0.1), lambda other: place_rms(by_parameter, other))
     assert all(row["gain"] > -1e-9 for row in rows)
     again = next(row for row in rows if row["what"].startswith("all present views"))

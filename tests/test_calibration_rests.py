@@ -9,8 +9,8 @@ import pytest
 
 from cell.bench.calibration import observe
 from cell.bench.calibration_world import HeadWorld, Noise, draw_head, turned
-from cell.calibration.adjustment import Priors, rests_of, shared_mask
-from cell.calibration.blocks import OWN, SHARED
+from cell.calibration.adjustment import Priors, shared_mask
+from cell.calibration.blocks import OWN, SHARED, rests_of
 from cell.calibration.joint import Joint, solve_joint, solve_staged
 from cell.calibration.normal import Normal
 from cell.calibration.observations import ScanObservation

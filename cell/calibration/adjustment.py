@@ -25,6 +25,7 @@ from cell.calibration.blocks import (
     State,
     ViewData,
     dots_block,
+    rests_of,
     stripe_block,
 )
 from cell.calibration.normal import Block, Inverse, Normal
@@ -215,12 +216,6 @@ def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:
     if block.count == 0:
         return 1.0
     return float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
-
-
-def rests_of(views: Sequence[ViewData]) -> NDArray[np.intp]:
-    """The number (n,) of the rest of the arm in which each view was taken, from 0."""
-    new = np.array([k == 0 or not view.same_rest for k, view in enumerate(views)], dtype=np.bool_)
-    return np.asarray(np.cumsum(new) - 1, dtype=np.intp)
 
 
 def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:

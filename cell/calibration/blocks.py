@@ -6,10 +6,12 @@ board (6), then the view's own flange pose (6) and rail position (1). Poses move
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.circles import seen_centres_with_jacobians
@@ -43,6 +45,12 @@ class ViewData:
     rail: float
     stripe_axis: int = 0
     same_rest: bool = False
+
+
+def rests_of(views: Sequence[ViewData]) -> NDArray[np.intp]:
+    """The number (n,) of the rest of the arm in which each view was taken, from 0."""
+    new = np.array([k == 0 or not view.same_rest for k, view in enumerate(views)], dtype=np.bool_)
+    return np.asarray(np.cumsum(new) - 1, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)

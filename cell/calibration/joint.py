@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.adjustment import Adjusted, Adjustment, Priors, rests_of, shared_mask
-from cell.calibration.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, stripe_block
+from cell.calibration.adjustment import Adjusted, Adjustment, Priors, shared_mask
+from cell.calibration.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
 from cell.calibration.hand_eye import HandEye, solve_hand_eye
 from cell.calibration.observations import ScanObservation
 from cell.calibration.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system

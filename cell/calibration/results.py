@@ -22,6 +22,7 @@ from cell.calibration.joint import (
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.reference import Reference
 from cell.geometry.camera import Array, CameraModel
+from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, from_parts
 from cell.reconstruction.build import ScanGeometry
@@ -100,8 +101,6 @@ class ScanCalibration:
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        columns = vectors[:, values > 1e-9 * values.max()] * np.sqrt(values[values > 1e-9 * values.max()])
         state = State(
             self.camera,
             self.light_plane,
@@ -112,7 +111,7 @@ class ScanCalibration:
             np.zeros(0),
         )
         made = []
-        for column in columns.T:
+        for column in covariance_root(self.covariance).T:
             moved = state.moved(np.concatenate([column, np.zeros(SHARED - KEPT)]))
             assert moved.plane is not None
             made.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
