@@ -172,8 +172,9 @@ def test_errors_lie_at_the_bound():
         assert 0.93 < trial.chi2_drawn_noise < 1.07
         assert max(abs(z) for z in trial.z.values()) < 5
         assert trial.z_whitened == pytest.approx(trial.best_z_whitened, rel=0.1)
-        for frame in trial.errors.values():
-            assert frame["mean"] < 1.12 * frame["best_mean"]
+        # Where the scan frame lies is partly gauge; what a place feels is as good as the best on the same noise.
+        for frame, most in {"scan": 1.35, "scan_aligned": 1.03, "base": 1.06}.items():
+            assert trial.errors[frame]["mean"] < most * trial.errors[frame]["best_mean"]
         assert trial.errors["scan_aligned"]["mean"] < 1.1 * trial.errors["scan_aligned"]["bound_mean"]
 
 

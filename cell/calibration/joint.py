@@ -19,7 +19,7 @@ from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts
 from drivers.errors import RefusedError
 
-STRIPE_POINTS = 60
+STRIPE_POINTS = 120
 """About so many means of neighbouring rows stand for a stripe: quicker than all rows, and no less is known.
 
 Rows that share their speckle are less independent than their stated σ says; that scale is found from the residuals.
