@@ -51,7 +51,8 @@ def examine(solved: Solved, observations: Observations, config: CellConfig, job:
     loaded, mesh = load_job(job)
     nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
     places = places_of_job(config, loaded, nominal, solved.calibration.scan)
-    state, covariance = solved.scan.adjusted.state, solved.scan.adjusted.covariance
+    adjusted = solved.scan.adjusted
+    state, covariance = adjusted.state, adjusted.reliable_covariance
     by_parameter = derivatives(state, covariance, places)
     board = next(o.view.spec for o in observations.scan if o.view is not None)
     scan, target = Coverage.of(solved.scan), Coverage.of(solved.target)
@@ -103,8 +104,7 @@ def paper_check(joint: Joint, observations: Observations) -> dict[str, Any] | No
     poses = [
         state.camera_from_board(flange, rail) for flange, rail in zip(state.flanges, state.rails.tolist(), strict=True)
     ]
-    rests = [o for o in observations.scan if not o.same_rest]
-    paper = paper_plane_of(state.camera, poses, rests, staged.plane.rows)
+    paper = paper_plane_of(state.camera, poses, observations.scan, staged.plane.rows)
     if paper is None:
         return None
     seen = state.plane.intersect(state.camera.rays(np.concatenate([view.stripe for view in joint.views])))

@@ -143,7 +143,7 @@ def solve_observations(observations: Observations) -> Solved:
     """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
     o = observations
     scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
-    head = ScanCalibration.of(scan, o.scan)
+    head = ScanCalibration.of(scan)
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
     made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made)

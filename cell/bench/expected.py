@@ -20,6 +20,7 @@ from cell.calibration.adjustment import Adjustment, Priors, shared_mask
 from cell.calibration.blocks import SHARED, State
 from cell.calibration.joint import solve_joint, solve_staged
 from cell.config import CellConfig
+from cell.geometry.covariance import covariance_root
 from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface
 from cell.job import Job
@@ -77,7 +78,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     sigma = np.concatenate([np.full(12, lengths), np.full(6, zeros)])
     scan = -at_surface @ kinematics.shifts(sweep.base_from_flange) * sigma - head.poses(by_kinematics * sigma)
     own = scan + at_part @ kinematics.shifts(place_flange) * sigma
-    common = pose.random + at_surface @ rest @ at_surface.T + _square(head.poses(_root(shared)))
+    common = pose.random + at_surface @ rest @ at_surface.T + _square(head.poses(covariance_root(shared)))
     placing = common + _square(own) + at_part @ rest @ at_part.T + _grasp(noise, pose.base_from_surface)
     placing = placing + _square(_lean(noise, config, sweep.base_from_flange, place_flange, pose.base_from_surface))
     absolute, of_own = common + _square(scan), common + _square(own)
@@ -87,7 +88,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
         arms = by_pose(points)
         return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
 
-    in_camera = head.in_camera(np.concatenate([_root(shared), by_kinematics * sigma], axis=1))
+    in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
     return Expected(
         absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera), _square(own)
     )
@@ -179,7 +180,7 @@ def _calibration(
 ) -> tuple[Vector, Vector]:
     """Covariance (21, 21) of the scan head's parameters under the declared noise, and their shift (21, 18) by the
     arm's kinematic error: the flange is not where it is reported, view by view, and the adjustment follows."""
-    observations = [o for o in record.observations[0] if not o.same_rest]
+    observations = record.observations[0]
     staged = solve_staged(observations, nominal_camera(config.scan_camera), np.array([1.0, 0.0, 0.0]))
     priors = Priors(
         arm_translation=max(noise["arm_repeatability"] / np.sqrt(3.0), 1e-6),
@@ -192,6 +193,8 @@ def _calibration(
     weight = 1.0 / np.array([priors.arm_translation**2] * 3 + [priors.arm_rotation**2] * 3)
     shift = np.zeros((SHARED, 18))
     for k, view in enumerate(joint.views):
+        if view.same_rest:
+            continue
         # The arm stands where the table's error puts it; what is reported lies the opposite way from it.
         shift -= inverse.cross[k][:, :6] * weight @ kinematics.shifts(view.base_from_flange)
     return inverse.shared[:21, :21], shift[:21]
@@ -224,10 +227,3 @@ def _lean(
 
 def _square(columns: Vector) -> Vector:
     return np.asarray(columns @ columns.T)
-
-
-def _root(covariance: Vector) -> Vector:
-    """Columns whose outer products sum to the covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    keep = values > 1e-9 * values.max()
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))

@@ -1,7 +1,8 @@
 """The joint adjustment: camera, light plane, rail, hand-eye and board in one robust least-squares problem.
 
 The arm's poses and the rail's readings are unknowns too, held by their repeatability; groups of measurements whose
-noise is not known get it from their own residuals (variance components). Theory sheet, part 4.
+noise is not known get it from their own residuals (variance components). Views between which only the rail moved share
+the flange's pose, wherever that was. Theory sheet, part 4.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from cell.calibration.blocks import (
     State,
     ViewData,
     dots_block,
+    rests_of,
     stripe_block,
 )
 from cell.calibration.normal import Block, Inverse, Normal
@@ -65,6 +67,7 @@ class Priors:
 class Adjusted:
     """Result: the state, the covariance (27, 27) of the shared parameters, χ² per degree of freedom, found noise.
 
+    The covariance is for the noise in `priors`; `reliable_covariance` allows for the scatter that was found.
     `excess` says by how much the flange's shifts and turns and the rail's readings scatter more than the priors say
     ("shift", "turn", "rail": found over stated standard deviation; 1 where nothing was found).
     """
@@ -78,6 +81,16 @@ class Adjusted:
     iterations: int
     excess: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def inflation(self) -> float:
+        """Factor of all deviations for a flange that scatters more than the priors say; it makes most of them."""
+        return max(1.0, self.excess.get("shift", 1.0), self.excess.get("turn", 1.0))
+
+    @property
+    def reliable_covariance(self) -> Array:
+        """The covariance (27, 27) with this factor."""
+        return self.covariance * self.inflation**2
+
 
 class Adjustment:
     """One problem: views, what is free, and the priors. `solve` iterates from a start."""
@@ -85,6 +98,7 @@ class Adjustment:
     def __init__(self, views: Sequence[ViewData], free: NDArray[np.bool_], priors: Priors) -> None:
         """`free` (27,) says which shared parameters move, in the order of `blocks`."""
         self.views = list(views)
+        self.rests = rests_of(self.views)
         self.free = free
         self.own_free = np.ones(OWN, dtype=np.bool_)
         self.own_free[6] = bool(free[RAIL].any())
@@ -99,7 +113,7 @@ class Adjustment:
         normal = self.normal_at(state)
         for turn in range(variance_rounds + 1):
             # Until the noise is settled there is no point in the last digits.
-            settled = 1e-3 if turn < variance_rounds else 1e-7
+            settled = 1e-3 if turn < variance_rounds else 1e-9
             state, normal, used = self._minimise(state, normal, settled)
             iterations += used
             if turn < variance_rounds:
@@ -131,15 +145,16 @@ class Adjustment:
         damping = 1e-6
         used = 0
         for _ in range(STEPS):
+            step = normal.step(damping)
+            # A minimum that is reached promises nothing; trying on would only meet the last digits' noise.
+            if normal.promised(step) < settled * normal.total + 1e-9:
+                break
             used += 1
-            candidate = state.moved(normal.step(damping))
+            candidate = state.moved(step)
             new = self.normal_at(candidate)
             if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
-                gain = normal.total - new.total
                 state, normal = candidate, new
                 damping = max(1e-9, 0.1 * damping)
-                if gain < settled * normal.total + 1e-9:
-                    break
             else:
                 damping *= 20
                 if damping > 1e4:
@@ -148,7 +163,8 @@ class Adjustment:
 
     def normal_at(self, state: State) -> Normal:
         """The normal equations at a state whose flanges and rails are those of the views, with the present priors."""
-        normal = Normal(len(self.views), self.free, self.own_free)
+        normal = Normal(self.rests, self.free, self.own_free)
+        settles = np.diff(self.rests, prepend=-1) > 0
         for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
             if len(view.points):
                 residual, jacobian = dots_block(state, view, flange, float(rail))
@@ -164,10 +180,11 @@ class Adjustment:
                 weight, cost = _huber(np.abs(residual / sigma))
                 root = np.sqrt(weight) / sigma
                 normal.add_view("stripe", k, jacobian * root[:, None], residual * root, cost)
-            apart = -difference(flange, view.base_from_flange)
-            shift, turn = self.priors.arm_translation, self.priors.arm_rotation
-            normal.add_prior("shift", k, 0, apart[:3] / shift, shift)
-            normal.add_prior("turn", k, 3, apart[3:] / turn, turn)
+            if settles[k]:
+                apart = -difference(flange, view.base_from_flange)
+                shift, turn = self.priors.arm_translation, self.priors.arm_rotation
+                normal.add_prior("shift", k, 0, apart[:3] / shift, shift)
+                normal.add_prior("turn", k, 3, apart[3:] / turn, turn)
             if self.own_free[6]:
                 normal.add_prior("rail", k, 6, np.array([view.rail - rail]) / self.priors.rail, self.priors.rail)
         lens = np.arange(4, 8)[self.free[4:8]]

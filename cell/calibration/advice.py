@@ -16,7 +16,7 @@ import pinocchio as pin
 from cell.calibration.adjustment import Adjustment, Priors, shared_mask
 from cell.calibration.blocks import State, ViewData
 from cell.calibration.coverage import Coverage
-from cell.calibration.joint import STRIPE_POINTS, Joint
+from cell.calibration.joint import Joint
 from cell.geometry.camera import Array
 from cell.geometry.circles import seen_centres
 from cell.geometry.poses import from_parts, transform
@@ -37,7 +37,7 @@ def advice(
     `place_rms` takes a covariance (27, 27) to m. Four views each, so that the gains compare; `kind` is "views", or
     "noise" for what another device or a longer exposure would have to bring.
     """
-    now = place_rms(joint.adjusted.covariance)
+    now = place_rms(joint.adjusted.reliable_covariance)
     rows = []
     for what, views in _more_views(joint, board, rail_travel).items():
         covariance = _predicted(joint, views, joint.adjusted.priors)
@@ -60,7 +60,7 @@ def _predicted(joint: Joint, more: list[ViewData], priors: Priors) -> Array:
         rails=np.append(state.rails, [view.rail for view in more]),
     )
     normal = Adjustment([*joint.views, *more], free, priors).normal_at(wider)
-    return normal.inverse().shared
+    return np.asarray(normal.inverse().shared * joint.adjusted.inflation**2)
 
 
 def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> dict[str, list[ViewData]]:
@@ -78,7 +78,8 @@ def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> 
 
     diagonal = [(SLIGHT, SLIGHT), (-SLIGHT, SLIGHT), (SLIGHT, -SLIGHT), (-SLIGHT, -SLIGHT)]
     corners = [(-field[0], -field[1]), (field[0], -field[1]), (-field[0], field[1]), (field[0], field[1])]
-    several = np.linspace(0, len(joint.views) - 1, 4).astype(int)
+    alone = [replace(view, same_rest=False) for view in joint.views]
+    several = np.linspace(0, len(alone) - 1, 4).astype(int)
     ends = f"{1e3 * low:.0f} and {1e3 * high:.0f} mm"
     return {
         "four more views, tilted steeply about the picture's x": made(
@@ -107,7 +108,7 @@ def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> 
             ],
             between,
         ),
-        "four of the present views once more": [joint.views[k] for k in several],
+        "four of the present views once more": [alone[k] for k in several],
         "all present views once more": list(joint.views),
     }
 
@@ -136,9 +137,10 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
     seen = transform(camera_from_board, points)
     pixels = state.camera.project(seen_centres(seen, rotation[:, 2], radius) if radius > 0 else seen)
     inside = _inside(state, pixels)
-    stripe = _stripe(state, board, camera_from_board, radius)
+    lit = [view for view in joint.views if len(view.stripe)]
+    stripe = _stripe(state, board, camera_from_board, radius, int(np.median([len(view.stripe) for view in lit])))
     sigma = float(np.median(np.concatenate([view.sigma for view in joint.views])))
-    stripe_sigma = float(np.median(np.concatenate([np.zeros(0), *(view.stripe_sigma for view in joint.views)])))
+    stripe_sigma = float(np.median(np.concatenate([view.stripe_sigma for view in lit])))
     return ViewData(
         points[inside],
         pixels[inside],
@@ -148,11 +150,12 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
         np.full(len(stripe), stripe_sigma),
         flange,
         rail,
+        lit[0].stripe_axis,
     )
 
 
-def _stripe(state: State, board: BoardSpec, camera_from_board: pin.SE3, radius: float) -> Array:
-    """Pixels (n, 2) of the stripe where light plane and board meet, in the picture and clear of the dots."""
+def _stripe(state: State, board: BoardSpec, camera_from_board: pin.SE3, radius: float, count: int) -> Array:
+    """Pixels (n, 2), at most `count`, where light plane and board meet, in the picture and clear of the dots."""
     assert state.plane is not None
     normal = camera_from_board.rotation[:, 2]
     middle = transform(camera_from_board, np.array(board.centre))
@@ -163,15 +166,13 @@ def _stripe(state: State, board: BoardSpec, camera_from_board: pin.SE3, radius: 
     points = board.points()[:, :2]
     low, high = points.min(axis=0) - MARGIN_PITCHES * board.pitch, points.max(axis=0) + MARGIN_PITCHES * board.pitch
     reach = float(np.linalg.norm(high - low)) / 2
-    line = start + np.linspace(-reach, reach, 2 * STRIPE_POINTS)[:, None] * along
+    line = start + np.linspace(-reach, reach, 4 * count)[:, None] * along
     local = (line - camera_from_board.translation) @ camera_from_board.rotation[:, :2]
     clear = np.linalg.norm(local[:, None] - points, axis=2).min(axis=1) > 1.3 * radius
     pixels = state.camera.project(line)
     there = ((local > low) & (local < high)).all(axis=1) & clear & _inside(state, pixels)
     chosen = np.flatnonzero(there)
-    thin = (
-        chosen[np.linspace(0, len(chosen) - 1, min(STRIPE_POINTS, len(chosen))).astype(int)] if len(chosen) else chosen
-    )
+    thin = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).astype(int)] if len(chosen) else chosen
     return np.asarray(pixels[thin], dtype=np.float64)
 
 

@@ -6,10 +6,12 @@ board (6), then the view's own flange pose (6) and rail position (1). Poses move
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.circles import seen_centres_with_jacobians
@@ -29,6 +31,8 @@ class ViewData:
     """Measurements of one view: board points (n, 3) in m, their pixels (n, 2) and σ (n,), stripe pixels on the board.
 
     `base_from_flange` and `rail` are as reported; `dot_radius` in m, 0 for corners. Empty arrays where nothing is seen.
+    The stripe was measured along `stripe_axis` (0: along rows, its column has the noise; 1: along columns).
+    `same_rest` says that the flange stands exactly where it stood in the view before, wherever that was.
     """
 
     points: Array
@@ -39,6 +43,14 @@ class ViewData:
     stripe_sigma: Array
     base_from_flange: pin.SE3
     rail: float
+    stripe_axis: int = 0
+    same_rest: bool = False
+
+
+def rests_of(views: Sequence[ViewData]) -> NDArray[np.intp]:
+    """The number (n,) of the rest of the arm in which each view was taken, from 0."""
+    new = np.array([k == 0 or not view.same_rest for k, view in enumerate(views)], dtype=np.bool_)
+    return np.asarray(np.cumsum(new) - 1, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,5 +177,5 @@ def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> 
     jacobian[:, 27:30] = normal
     jacobian[:, 30:33] = cross(swung, normal)
     jacobian[:, 33] = normal_camera @ state.rail_direction
-    sigma = np.linalg.norm(by_pixel, axis=1) * view.stripe_sigma
+    sigma = np.abs(by_pixel[:, view.stripe_axis]) * view.stripe_sigma
     return -distance, jacobian, np.maximum(sigma, 1e-7)

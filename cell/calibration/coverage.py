@@ -22,6 +22,8 @@ LEAST_IN_CELL = 3
 class Coverage:
     """Dots: pixels and residuals (n, 2) in px; stripe: pixels (m, 2), residuals (m,) in px across it, depths (m,) in m.
 
+    The stripe's points are means of neighbouring rows, and its residuals are theirs.
+
     One entry for each view: `depth` (v,) of the board's middle in m, `tilt` (v, 2) of its normal about the picture's
     x and y in rad, `rail` (v,) in m. `size` is that of the picture in px.
     """

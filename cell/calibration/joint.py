@@ -10,17 +10,20 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.calibration.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.calibration.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, stripe_block
+from cell.calibration.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
 from cell.calibration.hand_eye import HandEye, solve_hand_eye
 from cell.calibration.observations import ScanObservation
 from cell.calibration.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
-from cell.calibration.starts import PlaneStart, plane_from_board, stripe_pixels
+from cell.calibration.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts
 from drivers.errors import RefusedError
 
-# Neighbouring rows share their speckle: this many points of a stripe are enough, and independent.
 STRIPE_POINTS = 120
+"""About so many means of neighbouring rows stand for a stripe: quicker than all rows, and no less is known.
+
+Rows that share their speckle are less independent than their stated σ says; that scale is found from the residuals.
+"""
 FOLDS = 4
 
 
@@ -28,7 +31,8 @@ FOLDS = 4
 class Staged:
     """The closed-form solution: camera and its RMS per view, hand-eye, light plane (None without a stripe).
 
-    `plane` holds the stripe's usable rows; its plane is that of the paper's steps (`paper`) where they give one.
+    From the first view of each rest of the arm. `plane` holds the stripe's usable rows of all observations; its plane
+    is that of the paper's steps (`paper`) where they give one.
     """
 
     camera: CameraModel
@@ -58,6 +62,7 @@ def solve_staged(
     lens: bool = True,
 ) -> Staged:
     """Camera, then hand-eye, then light plane, each from the result before. All observations need a view."""
+    every, observations = observations, [o for o in observations if not o.same_rest]
     views = [o.view for o in observations if o.view is not None]
     camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
     with_view = [o for o in observations if o.view is not None]
@@ -80,6 +85,8 @@ def solve_staged(
         paper = paper_plane_of(camera, everywhere, observations, plane.rows)
         if paper is not None:
             plane = replace(plane, plane=paper.plane, rms=paper.rms)
+        rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
+        plane = replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
     return Staged(camera, view_rms, poses, hand_eye, plane, paper)
 
 
@@ -102,18 +109,22 @@ def paper_plane_of(
 
 
 def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
-    """Measurements of one observation, the stripe thinned out to `STRIPE_POINTS`."""
+    """Measurements of one observation, the stripe as about `STRIPE_POINTS` means of neighbouring rows."""
     view, profile = observation.view, observation.profile
-    thin = rows[:: max(1, len(rows) // STRIPE_POINTS)]
+    stripe, sigma = np.zeros((0, 2)), np.zeros(0)
+    if profile is not None and len(rows):
+        stripe, sigma = stripe_means(profile, rows, STRIPE_POINTS)
     return ViewData(
         points=np.zeros((0, 3)) if view is None else view.object_points,
         pixels=np.zeros((0, 2)) if view is None else view.pixels,
         sigma=np.zeros(0) if view is None else view.sigma,
         dot_radius=0.0 if view is None else view.dot_radius,
-        stripe=np.zeros((0, 2)) if profile is None else stripe_pixels(profile, thin),
-        stripe_sigma=np.zeros(0) if profile is None else profile.sigma[thin],
+        stripe=stripe,
+        stripe_sigma=sigma,
         base_from_flange=observation.base_from_flange,
         rail=observation.rail_position,
+        stripe_axis=1 if profile is not None and profile.axis == "columns" else 0,
+        same_rest=observation.same_rest,
     )
 
 
@@ -135,7 +146,7 @@ def solve_joint(
     tangential: bool = True,
     held_out: bool = True,
 ) -> Joint:
-    """Adjust everything together, and predict every fourth view from the others in turn."""
+    """Adjust everything together, and predict the views of every fourth rest from the others in turn."""
     if staged.plane is None:
         rows = [np.empty(0, dtype=np.intp)] * len(observations)
     else:
@@ -151,12 +162,13 @@ def solve_joint(
 
 
 def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:
-    """RMS in px and m of the views that each fold leaves out, at the flange poses that the arm reports."""
+    """RMS in px and m of the views of the rests that each fold leaves out, at the flange poses that the arm reports."""
     dots, stripe = [np.zeros(0)], [np.zeros(0)]
+    folds = rests_of(views) % FOLDS
     for fold in range(FOLDS):
-        kept = [v for k, v in enumerate(views) if k % FOLDS != fold]
+        kept = [v for v, of in zip(views, folds, strict=True) if of != fold]
         result = Adjustment(kept, free, adjusted.priors).solve(adjusted.state, variance_rounds=0)
-        for view in views[fold::FOLDS]:
+        for view in (v for v, of in zip(views, folds, strict=True) if of == fold):
             off, away = residuals_as_reported(result.state, view)
             dots.append(off.ravel())
             stripe.append(away)

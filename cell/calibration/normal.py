@@ -1,7 +1,7 @@
 """Normal equations of the joint adjustment in the shape that it has: shared parameters, and a few of each view's own.
 
-Views touch each other only through the shared parameters, so their own are eliminated view by view (Schur complement):
-the work grows with the number of views, not with its cube.
+Rests of the arm touch each other only through the shared parameters, so their own (one flange pose, and a rail position
+for each view) are eliminated rest by rest (Schur complement): the work grows with the number of views, not its cube.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GROUPS = ("dots", "stripe", "shift", "turn", "rail", "lens")
 
 @dataclass(eq=False)
 class Block:
-    """Information of one group of measurements: shared (27, 27), shared by own (n, 27, 7), own (n, 7, 7)."""
+    """Information of a group of measurements: shared (27, 27), and by view shared by own (n, 27, 7), own (n, 7, 7)."""
 
     shared: Array
     cross: Array
@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(eq=False)
 class Inverse:
-    """The same blocks of the covariance; fixed parameters have zeros."""
+    """The same blocks of the covariance; fixed parameters have zeros. Views of one rest repeat its flange's."""
 
     shared: Array
     cross: Array
@@ -45,8 +45,12 @@ class Inverse:
 class Normal:
     """Accumulates groups of whitened Jacobians and residuals, then solves."""
 
-    def __init__(self, views: int, free: NDArray[np.bool_], own_free: NDArray[np.bool_]) -> None:
-        """`free` (27,) and `own_free` (7,) say which parameters move."""
+    def __init__(self, rests: NDArray[np.intp], free: NDArray[np.bool_], own_free: NDArray[np.bool_]) -> None:
+        """`rests` (views,) numbers the rest of the arm in which each view was taken; free ones of (27,) and (7,) move.
+
+        Views of one rest have one flange pose in common; each has a rail position of its own.
+        """
+        views = len(rests)
         self.groups = {
             name: Block(np.zeros((SHARED, SHARED)), np.zeros((views, SHARED, OWN)), np.zeros((views, OWN, OWN)))
             for name in GROUPS
@@ -54,22 +58,16 @@ class Normal:
         self.right = np.zeros(SHARED)
         self.right_own = np.zeros((views, OWN))
         self._free, self._own_free = np.flatnonzero(free), np.flatnonzero(own_free)
-        self._views = views
+        self._views, self._rests = views, rests
+        # Where a view's free own parameters stand among its rest's: the flange's first, then a rail for each view.
+        turn = np.array([np.count_nonzero(rests[:k] == rest) for k, rest in enumerate(rests)], dtype=np.intp)
+        self._places = np.tile(self._own_free, (views, 1))
+        self._places[:, self._own_free == OWN - 1] += turn[:, None]
 
     @property
     def total(self) -> float:
         """The robust sum of squares."""
         return float(sum(block.squares for block in self.groups.values()))
-
-    @property
-    def measured(self) -> int:
-        """Number of measurements, priors included."""
-        return sum(block.count for block in self.groups.values())
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters that move."""
-        return len(self._free) + self._views * len(self._own_free)
 
     def add_view(self, name: str, view: int, jacobian: Array, residual: Array, cost: float) -> None:
         """Rows (m, 34) of one view, whitened, with their whitened residuals (m,)."""
@@ -97,7 +95,7 @@ class Normal:
         self._count(name, white)
 
     def step(self, damping: float) -> Array:
-        """The damped step (27 + 7 per view,)."""
+        """The damped step (27 + 7 per view,); views of one rest have the flange's in common."""
         shared, cross, own, right, right_own = self._free_parts()
         # In units in which the information's diagonal is 1.
         a = 1 / np.sqrt(np.maximum(np.diag(shared), 1e-30))
@@ -112,8 +110,12 @@ class Normal:
         own_step = eliminated[:, :, -1] - eliminated[:, :, :-1] @ shared_step
         step, own_all = np.zeros(SHARED), np.zeros((self._views, OWN))
         step[self._free] = shared_step * a
-        own_all[:, self._own_free] = own_step * b
+        own_all[:, self._own_free] = (own_step * b)[self._rests[:, None], self._places]
         return np.concatenate([step, own_all.ravel()])
+
+    def promised(self, step: Array) -> float:
+        """By how much a Gauss–Newton step (27 + 7 per view,) lowers the sum of squares if the problem is linear."""
+        return float(self.right @ step[:SHARED] + self.right_own.ravel() @ step[SHARED:])
 
     def inverse(self) -> Inverse:
         """Covariance blocks at the solution."""
@@ -127,20 +129,34 @@ class Normal:
             np.zeros((SHARED, SHARED)), np.zeros((self._views, SHARED, OWN)), np.zeros((self._views, OWN, OWN))
         )
         mixed = -covariance @ gain
+        inner = own_inverse - gain.transpose(0, 2, 1) @ mixed
+        views, rests, places = np.arange(self._views), self._rests[:, None, None], self._places
         result.shared[np.ix_(self._free, self._free)] = covariance
-        result.cross[np.ix_(np.arange(self._views), self._free, self._own_free)] = mixed
-        result.own[np.ix_(np.arange(self._views), self._own_free, self._own_free)] = (
-            own_inverse - gain.transpose(0, 2, 1) @ mixed
-        )
+        result.cross[np.ix_(views, self._free, self._own_free)] = mixed[
+            rests, np.arange(len(self._free))[:, None], places[:, None, :]
+        ]
+        result.own[np.ix_(views, self._own_free, self._own_free)] = inner[rests, places[:, :, None], places[:, None, :]]
         return result
 
     def _free_parts(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Of the free parameters: shared, shared by own of each rest, own of each rest, and both right sides."""
         free, own_free, views = self._free, self._own_free, np.arange(self._views)
         blocks = self.groups.values()
         shared = np.sum([b.shared for b in blocks], axis=0)[np.ix_(free, free)]
         cross = np.sum([b.cross for b in blocks], axis=0)[np.ix_(views, free, own_free)]
         own = np.sum([b.own for b in blocks], axis=0)[np.ix_(views, own_free, own_free)]
-        return shared, cross, own, self.right[free], self.right_own[:, own_free]
+        count, width = int(self._rests.max()) + 1, int(self._places.max()) + 1
+        rests, places = self._rests[:, None], self._places
+        by_rest, right = np.zeros((count, width, len(free))), np.zeros((count, width))
+        inner = np.zeros((count, width, width))
+        np.add.at(by_rest, (rests, places), cross.transpose(0, 2, 1))
+        np.add.at(inner, (rests[:, :, None], places[:, :, None], places[:, None, :]), own)
+        np.add.at(right, (rests, places), self.right_own[:, own_free])
+        # A rest of fewer views than another has fewer rail positions: those that do not exist stay where they are.
+        missing = np.ones((count, width), dtype=np.bool_)
+        missing[rests, places] = False
+        inner[np.nonzero(missing)[0], np.nonzero(missing)[1], np.nonzero(missing)[1]] = 1.0
+        return shared, by_rest.transpose(0, 2, 1), inner, self.right[free], right
 
     def _count(self, name: str, white: Array) -> None:
         self.groups[name].squares += float(white @ white)

@@ -8,35 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
-from cell.calibration.blocks import PLANE
 from cell.calibration.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
-from cell.calibration.flatness import Flatness, choose_arm, flatness, leave_one_out
 from cell.calibration.folder import RecordedFrame, poses_without_frame, read_frames, read_pose_pairs, used
-from cell.calibration.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
 from cell.calibration.intrinsics import Intrinsics, choose_lens
-from cell.calibration.joint import Joint, Staged, solve_joint, solve_staged, start_state
-from cell.calibration.observations import ScanObservation
-from cell.calibration.recorded_result import (
-    camera_dict,
-    closed_form_dict,
-    empty_result,
-    finite_mm,
-    flatness_dict,
-    frame_dict,
-    hand_eye_dict,
-    intrinsics_dict,
-    plane_dict,
-    seen_depths,
-)
+from cell.calibration.recorded_chain import report_chain, solve_chain
+from cell.calibration.recorded_pairs import calibrate_pairs
+from cell.calibration.recorded_result import empty_result, frame_dict, intrinsics_dict, plane_dict, seen_depths
 from cell.calibration.starts import plane_from_board, stripe_pixels
-from cell.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.geometry.camera import CameraModel
 from cell.vision.board import board_pose
 from cell.vision.board_spec import BoardSpec
 from cell.vision.pictures import Reason
@@ -45,21 +29,7 @@ from drivers.errors import ConfigError, RefusedError
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_POSES = 3
-TANGENTIAL_VIEWS = 12
 OBLIQUE = math.radians(75.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Chain:
-    """What frames with poses give."""
-
-    setup: str
-    staged: Staged
-    joint: Joint
-    tried: dict[str, float]
-    flat_staged: Flatness | None
-    flat: Flatness | None
-    left_out: Flatness | None
 
 
 def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
@@ -84,12 +54,12 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
     if spec is None:
         if not pairs:
             raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
-        return _from_pairs(pairs)
+        return calibrate_pairs(pairs)
     try:
         frames = read_frames(folder, spec)
     except ConfigError:
         if pairs:
-            return _from_pairs(pairs)
+            return calibrate_pairs(pairs)
         raise
     result = empty_result(spec)
     result["notes"] += [
@@ -129,7 +99,7 @@ def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
         if without_pose:
             notes.append(f"{without_pose} used frames have no flange pose: they count for the intrinsics only")
         try:
-            _report_chain(_chain(posed), posed, result)
+            report_chain(solve_chain(posed), posed, result)
             return
         except (RefusedError, np.linalg.LinAlgError) as error:
             notes.append(f"no hand-eye: {error}")
@@ -167,107 +137,6 @@ def _camera(frames: list[RecordedFrame]) -> tuple[Intrinsics, Intrinsics]:
             return chosen, plain
 
 
-def _chain(frames: Sequence[RecordedFrame]) -> _Chain:
-    """Staged and joint solution with the camera on the flange, or before it, whichever fits."""
-    best: tuple[float, str, list[ScanObservation], Staged] | None = None
-    for setup in ("eye_in_hand", "eye_to_hand"):
-        observations = [_observation(f, invert=setup == "eye_to_hand") for f in frames]
-        lit = sum(o.profile is not None for o in observations) >= 2
-        staged = None
-        for stripe in (True, False) if lit else (False,):
-            try:
-                staged = solve_staged(observations, stripe=stripe)
-                break
-            except RefusedError:
-                if not stripe:
-                    raise
-        assert staged is not None
-        if best is None or staged.hand_eye.scatter_m < 0.5 * best[0]:
-            best = staged.hand_eye.scatter_m, setup, observations, staged
-    assert best is not None
-    _, setup, observations, staged = best
-    tangential = len(observations) >= TANGENTIAL_VIEWS
-    priors, tried = choose_arm(observations, staged, tangential)
-    joint = solve_joint(observations, staged, priors, tangential)
-    state = joint.adjusted.state
-    return _Chain(
-        setup,
-        staged,
-        joint,
-        tried,
-        flatness(start_state(staged), observations, staged),
-        flatness(state, observations, staged),
-        leave_one_out(observations, staged, state, joint.adjusted.priors, tangential),
-    )
-
-
-def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
-    assert frame.base_from_flange is not None
-    pose = frame.base_from_flange.inverse() if invert else frame.base_from_flange
-    return ScanObservation(frame.view, frame.profile, pose, 0.0, frame.path.name)
-
-
-def _report_chain(chain: _Chain, frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
-    adjusted, state = chain.joint.adjusted, chain.joint.adjusted.state
-    boards = [
-        f * state.flange_from_camera * board_pose(frame.view, state.camera).camera_from_board
-        for f, frame in zip((v.base_from_flange for v in chain.joint.views), frames, strict=True)
-        if frame.view is not None
-    ]
-    apart = [b.translation - state.base_from_board.translation for b in boards]
-    turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]
-    sigma = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))
-    result["intrinsics"] = {
-        **camera_dict(state.camera),
-        "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
-        "held_out_at_reported_poses_rms_px": math.sqrt(2) * chain.joint.held_out_px,
-        "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[:4].tolist(), strict=True)),
-        "method": "joint adjustment",
-    }
-    result["hand_eye"] = {
-        "method": "joint adjustment",
-        **hand_eye_dict(chain.setup, state.flange_from_camera),
-        "scatter_mm": 1e3 * float(np.sqrt(np.mean(np.sum(np.square(apart), axis=1)))),
-        "scatter_deg": math.degrees(float(np.sqrt(np.mean(np.square(turns))))),
-        "sigma_mm": (1e3 * sigma[15:18]).tolist(),
-        "sigma_deg": np.degrees(sigma[18:21]).tolist(),
-        "frames": len(frames),
-        "closed_form": closed_form_dict(chain.setup, chain.staged.hand_eye),
-    }
-    result["noise"] = {
-        "arm_translation_mm": 1e3 * adjusted.priors.arm_translation,
-        "arm_rotation_deg": math.degrees(adjusted.priors.arm_rotation),
-        "arm_chosen_by": "least error of left-out frames; tried mm: figure",
-        "arm_tried": chain.tried,
-        "chi2_per_dof": adjusted.chi2_per_dof,
-    }
-    if state.plane is None or chain.staged.plane is None:
-        result["notes"].append("no light plane: no frame shows a laser stripe on the board in a usable way")
-        return
-    result["light_plane"] = {
-        **plane_dict(state.plane),
-        "rms_mm": 1e3 * adjusted.stripe_rms_m,
-        "depth_range_mm": seen_depths(state.plane, state.camera, [v.stripe for v in chain.joint.views]),
-        "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
-        "method": "joint adjustment",
-        "staged": {
-            **plane_dict(chain.staged.plane.plane),
-            "rms_mm": 1e3 * chain.staged.plane.rms,
-            "cross_ratio_check_mm": None if chain.staged.paper is None else finite_mm(chain.staged.paper.cross_ratio_m),
-        },
-    }
-    names = [f.path.name for f in frames]
-    rows = chain.staged.plane.rows
-    result["stripe_points"] = {n: len(r) for n, r in zip(names, rows, strict=True)}
-    if chain.flat is not None:
-        result["flatness"] = {
-            **flatness_dict(chain.flat, names),
-            "frame": "base" if chain.setup == "eye_in_hand" else "flange",
-            "leave_one_out": None if chain.left_out is None else flatness_dict(chain.left_out, names),
-            "staged": None if chain.flat_staged is None else flatness_dict(chain.flat_staged, names),
-        }
-
-
 def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: dict[str, Any]) -> None:
     """The light plane from pictures alone, when the stripe is in them."""
     views = [f.view for f in frames if f.view is not None]
@@ -289,32 +158,3 @@ def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: 
         "method": "fit on the board's poses",
     }
     result["stripe_points"] = {f.path.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-
-
-def _from_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
-    """Hand-eye from pairs (base_from_flange, camera_from_board), camera on the flange or standing before the board."""
-    solutions: list[tuple[str, HandEye, HandEye]] = []
-    boards = [board for _, board in pairs]
-    for setup in ("eye_in_hand", "eye_to_hand"):
-        flanges = [f if setup == "eye_in_hand" else f.inverse() for f, _ in pairs]
-        try:
-            closed = solve_hand_eye(flanges, boards)
-        except RefusedError as error:
-            raise ConfigError(f"the {len(pairs)} pairs of poses give no hand-eye: {error}") from error
-        solutions.append((setup, closed, refine_hand_eye(flanges, boards, closed)))
-    setup, closed, refined = min(solutions, key=lambda s: s[1].scatter_m)
-    result = empty_result(None)
-    del result["frames_rms"]
-    result["frames"] = [
-        {"name": f"pair {k}", "used": True, "reason": None, "text": "", "rms_px": None} for k in range(len(pairs))
-    ]
-    result["hand_eye"] = {
-        "method": "Park-Martin, then robust least squares on the poses",
-        **hand_eye_dict(setup, refined.flange_from_camera),
-        "scatter_mm": 1e3 * refined.scatter_m,
-        "scatter_deg": math.degrees(refined.scatter_rad),
-        "frames": len(pairs),
-        "closed_form": closed_form_dict(setup, closed),
-    }
-    result["notes"].append("pairs of poses only: no intrinsics, no light plane, no flatness")
-    return result

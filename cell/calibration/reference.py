@@ -35,12 +35,11 @@ class Reference:
     @classmethod
     def of(cls, adjusted: Adjusted) -> Self:
         """Of a joint adjustment."""
-        excess = {name: max(1.0, factor) for name, factor in adjusted.excess.items()}
+        excess = {name: max(1.0, adjusted.excess.get(name, 1.0)) for name in ("shift", "turn", "rail")}
         priors = adjusted.priors
         return cls(
             adjusted.state.base_from_board,
-            # The flange's scatter is what makes most of the covariance.
-            adjusted.covariance * max(excess["shift"], excess["turn"]) ** 2,
+            adjusted.reliable_covariance,
             priors.arm_translation * excess["shift"],
             priors.arm_rotation * excess["turn"],
             priors.rail * excess["rail"],

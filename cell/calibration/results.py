@@ -20,9 +20,9 @@ from cell.calibration.joint import (
     solve_staged,
 )
 from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.rail_moves import with_rail_moves
 from cell.calibration.reference import Reference
 from cell.geometry.camera import Array, CameraModel
+from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, from_parts
 from cell.reconstruction.build import ScanGeometry
@@ -77,9 +77,9 @@ class ScanCalibration:
     reference: Reference | None = None
 
     @classmethod
-    def of(cls, joint: Joint, observations: Sequence[ScanObservation]) -> ScanCalibration:
-        """What a joint adjustment with a stripe found, with the rail from observations of one rest each."""
-        state, reference = with_rail_moves(joint.adjusted, observations)
+    def of(cls, joint: Joint) -> ScanCalibration:
+        """What a joint adjustment with a stripe found."""
+        state, reference = joint.adjusted.state, Reference.of(joint.adjusted)
         assert state.plane is not None
         return cls(
             state.camera,
@@ -101,8 +101,6 @@ class ScanCalibration:
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        columns = vectors[:, values > 1e-9 * values.max()] * np.sqrt(values[values > 1e-9 * values.max()])
         state = State(
             self.camera,
             self.light_plane,
@@ -113,7 +111,7 @@ class ScanCalibration:
             np.zeros(0),
         )
         made = []
-        for column in columns.T:
+        for column in covariance_root(self.covariance).T:
             moved = state.moved(np.concatenate([column, np.zeros(SHARED - KEPT)]))
             assert moved.plane is not None
             made.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
@@ -192,19 +190,15 @@ class TargetCalibration:
 def calibrate_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> ScanCalibration:
-    """Closed form, the joint adjustment, and the rail from observations of one rest each.
-
-    Raises `RefusedError` when the observations do not determine it.
-    """
-    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors), observations)
+    """Closed form and joint adjustment; raises `RefusedError` when the observations do not determine it."""
+    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors))
 
 
 def adjust_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> Joint:
-    """The joint adjustment of the scan head, from the observations with a rest of the arm of their own."""
-    rests = [o for o in observations if not o.same_rest]
-    return _solve(rests, solve_staged(rests, nominal, rail_direction), priors, "scan", "fine")
+    """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
+    return _solve(observations, solve_staged(observations, nominal, rail_direction), priors, "scan", "fine")
 
 
 def calibrate_target(
@@ -222,15 +216,17 @@ def adjust_target(observations: Sequence[TargetObservation], nominal: CameraMode
 
 def _solve(observations: Sequence[ScanObservation], staged: Staged, priors: Priors, camera: str, board: str) -> Joint:
     """The joint adjustment, after and before the checks for faults that have a name."""
-    names = [o.name for o in observations]
-    if all(o.view is not None for o in observations):
-        refuse_exchanged(names, [o.base_from_flange for o in observations], staged.camera_from_board)
+    rests = [o for o in observations if not o.same_rest]
+    names = [o.name for o in rests]
+    if all(o.view is not None for o in rests):
+        refuse_exchanged(names, [o.base_from_flange for o in rests], staged.camera_from_board)
     joint = solve_joint(observations, staged, priors)
     refuse_bent(board, joint.adjusted, joint.views)
-    seen = [o.view for o in observations if o.view is not None]
-    if len(seen) == len(observations):
+    seen = [o.view for o in rests if o.view is not None]
+    if len(seen) == len(rests):
         poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
-        refuse_slipped(camera, names, joint.adjusted, joint.views, poses)
+        alone = [view for view in joint.views if not view.same_rest]
+        refuse_slipped(camera, names, joint.adjusted, alone, poses)
     return joint
 
 

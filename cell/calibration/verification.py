@@ -16,6 +16,7 @@ import numpy as np
 from cell.calibration.blocks import BOARD, HAND, PLANE, RAIL, SHARED, State
 from cell.calibration.evidence import Evidence
 from cell.geometry.camera import Array
+from cell.geometry.covariance import covariance_root
 
 SHIFT, TURN = 0.2e-3, float(np.deg2rad(0.05))
 """The disturbance that has to be found, m and rad."""
@@ -109,7 +110,8 @@ def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> V
     rng = np.random.default_rng(0)
     drawn = np.empty((DRAWS, len(tests)))
     for name, weighed in evidences.items():
-        scores = rng.normal(size=(DRAWS, SHARED)) @ _root(weighed.information).T
+        root = covariance_root(weighed.information)
+        scores = rng.normal(size=(DRAWS, root.shape[1])) @ root.T
         for k, (chain, h) in enumerate(tests):
             if chain == name:
                 drawn[:, k] = _log_factor(weighed, h, scores)
@@ -137,13 +139,6 @@ def _log_mean(factors: Array) -> Array:
     """Logarithm (n,) of the mean of exp over the last axis of (n, k)."""
     most = factors.max(axis=1)
     return np.asarray(most + np.log(np.mean(np.exp(factors - most[:, None]), axis=1)), dtype=np.float64)
-
-
-def _root(information: Array) -> Array:
-    """A matrix (27, 27) whose product with its transpose is the information."""
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / scale[:, None] / scale)
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
 
 
 def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothesis]], found: Array) -> list[Suspect]:

@@ -12,7 +12,7 @@ from cell.calibration.blocks import State, ViewData
 from cell.calibration.evidence import Look, dots_of, evidence
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.results import ScanCalibration, TargetCalibration
-from cell.calibration.starts import stripe_pixels
+from cell.calibration.starts import stripe_means
 from cell.calibration.stripe_on_board import points_on_board
 from cell.calibration.verification import Verdict, verdict
 from cell.geometry.poses import from_parts
@@ -20,7 +20,7 @@ from cell.vision.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
 
 SWEEP_PROFILES, STRIPE_POINTS = 24, 40
-"""Enough of a sweep: neighbouring points share their speckle and neighbouring profiles the rail's error."""
+"""Enough of a sweep, as means of neighbouring rows: neighbouring profiles share the rail's error."""
 LEAST_PROFILES = 10
 
 
@@ -99,15 +99,16 @@ def _stripe(
     rows = points_on_board(state.camera, here, near.view.spec, lit.profile, near.view.dot_radius)
     if not len(rows):
         return None
-    rows = rows[:: max(1, len(rows) // STRIPE_POINTS)]
+    stripe, sigma = stripe_means(lit.profile, rows, STRIPE_POINTS)
     data = ViewData(
         points=np.zeros((0, 3)),
         pixels=np.zeros((0, 2)),
         sigma=np.zeros(0),
         dot_radius=0.0,
-        stripe=stripe_pixels(lit.profile, rows),
-        stripe_sigma=lit.profile.sigma[rows],
+        stripe=stripe,
+        stripe_sigma=sigma,
         base_from_flange=lit.base_from_flange,
         rail=lit.rail_position,
+        stripe_axis=1 if lit.profile.axis == "columns" else 0,
     )
     return Look(data, rest, stop, sweeping=True)

@@ -1,0 +1,92 @@
+"""Promises of photographs between which only the rail moves: they share where the arm really stands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.bench.calibration import observe
+from cell.bench.calibration_world import HeadWorld, Noise, draw_head, turned
+from cell.calibration.adjustment import Priors, shared_mask
+from cell.calibration.blocks import OWN, SHARED, rests_of
+from cell.calibration.joint import Joint, solve_joint, solve_staged
+from cell.calibration.normal import Normal
+from cell.calibration.observations import ScanObservation
+from cell.config import load_config
+from cell.geometry.poses import from_matrix
+from cell.stored_calibration import nominal_camera
+
+NOISE = Noise(arm=2e-4, arm_angle=4e-4)
+PRIORS = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
+RESTS = np.array([0, 1, 1, 1, 2, 3, 3])
+
+
+def test_rests_are_eliminated_as_the_dense_system_says():
+    rng = np.random.default_rng(1)
+    free = shared_mask(plane=True, rail=True)
+    normal = Normal(RESTS, free, np.ones(OWN, dtype=bool))
+    # One column for each unknown there is: the shared ones, six of each rest, one of each view.
+    size = SHARED + 6 * 4 + len(RESTS)
+    places = [
+        np.concatenate([np.arange(SHARED), SHARED + 6 * rest + np.arange(6), [SHARED + 24 + view]])
+        for view, rest in enumerate(RESTS)
+    ]
+    information, right = np.zeros((size, size)), np.zeros(size)
+    for view, place in enumerate(places):
+        jacobian, residual = rng.normal(size=(40, SHARED + OWN)), rng.normal(size=40)
+        normal.add_view("dots", view, jacobian, residual, float(residual @ residual))
+        information[np.ix_(place, place)] += jacobian.T @ jacobian
+        right[place] += jacobian.T @ residual
+    kept = np.concatenate([free, np.ones(24 + len(RESTS), dtype=bool)])
+    covariance = np.zeros_like(information)
+    covariance[np.ix_(kept, kept)] = np.linalg.inv(information[np.ix_(kept, kept)])
+    solution = covariance @ right
+    inverse, step = normal.inverse(), normal.step(0.0)
+    np.testing.assert_allclose(step[:SHARED], solution[:SHARED], atol=1e-10)
+    np.testing.assert_allclose(inverse.shared, covariance[:SHARED, :SHARED], atol=1e-12)
+    for view, place in enumerate(places):
+        own = place[SHARED:]
+        np.testing.assert_allclose(step[SHARED:].reshape(-1, OWN)[view], solution[own], atol=1e-10)
+        np.testing.assert_allclose(inverse.cross[view], covariance[np.ix_(np.arange(SHARED), own)], atol=1e-12)
+        np.testing.assert_allclose(inverse.own[view], covariance[np.ix_(own, own)], atol=1e-12)
+    # The sum of squares falls by what the exact solution takes from it.
+    assert normal.promised(step) == pytest.approx(right @ solution, rel=1e-9)
+
+
+def moved_at(world: HeadWorld, view: int, rng: np.random.Generator) -> list[ScanObservation]:
+    """A view, and two more after the rail has moved 15 mm either way; the arm's departure is drawn once."""
+    stands = turned(world.flanges[view], NOISE.own[:6] * rng.normal(size=6))
+    rails = world.rails[view] + np.array([0.0, -0.015, 0.015])
+    there = replace(world, flanges=np.array([stands] * 3), rails=rails)
+    seen = observe(there, replace(NOISE, arm=1e-12, arm_angle=1e-12), rng)
+    said = from_matrix(world.flanges[view])
+    return [
+        replace(o, base_from_flange=said, same_rest=k > 0, profile=None if k else o.profile) for k, o in enumerate(seen)
+    ]
+
+
+def solved(observations: list[ScanObservation]) -> Joint:
+    nominal = nominal_camera(load_config(None).scan_camera)
+    return solve_joint(observations, solve_staged(observations, nominal), PRIORS, held_out=False)
+
+
+def test_moves_of_the_rail_at_rest_make_it_surer_as_stated():
+    deviations, scores = [], []
+    for seed in (3, 4):
+        rng = np.random.default_rng(seed)
+        world = draw_head(rng)
+        plain = observe(world, NOISE, rng)
+        moved = [moved_at(world, view, rng) for view in (6, 10, 14)]
+        both = [o for k, o in enumerate(plain) if k not in (6, 10, 14)] + [o for rest in moved for o in rest]
+        joint = solved(both)
+        before, after = solved(plain).adjusted, joint.adjusted
+        deviations.append(np.sqrt(np.diag(after.covariance)[12:15] / np.diag(before.covariance)[12:15]))
+        scores.append((after.state.rail_direction - world.rail) / np.sqrt(np.diag(after.covariance)[12:15]))
+        assert 0.93 < after.chi2_per_dof < 1.07
+        assert rests_of(joint.views).max() == len(plain) - 1
+        flanges = [pose.homogeneous for pose in after.state.flanges[-3:]]
+        np.testing.assert_allclose(flanges, flanges[:1] * 3, atol=1e-12)
+    assert np.mean(deviations) < 0.4
+    assert np.sqrt(np.mean(np.square(scores))) < 1.7
