@@ -83,7 +83,7 @@ def run_whole_job(
     """
     tell = progress or (lambda fraction, text: None)
     record = JobRecord(seed, level)
-    cell = LockstepCell(config, seed, level, job.job.name)
+    cell = LockstepCell(config, seed, level, Path(job.surface.mesh).stem)
     try:
         with _Timed(record, "calibrate"):
             record.calibration = _calibrate(cell, config, job, record, lambda f, t: tell(0.6 * f, f"calibrate: {t}"))
