@@ -125,7 +125,7 @@ class JobWork:
     def board_photo(self, context: StepContext) -> BoardFix:
         """See `cell.steps.board_photo`."""
         arrival = cast(Arrival, context.results["drive_to_target"])
-        self._mover.meet_station(arrival.base_from_place, self._job, self._board)
+        self._mover.meet_station(arrival.base_from_place, self._job, self._board, self._nominal.extent)
         goal = photo_pose(
             self._job, self._board, arrival.fix.base_from_board, self._calibration.target.flange_from_camera
         )

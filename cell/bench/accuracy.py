@@ -101,8 +101,8 @@ def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSur
     pose = record.results.get("invert_pose")
     if not isinstance(pose, PlacePose):
         return made
-    assert record.repeatability is not None and record.at_sweep is not None and record.kinematic is not None
-    scan = scan_errors(record, nominal, record.repeatability, record.kinematic)
+    assert record.at_sweep is not None and record.kinematic is not None
+    scan = scan_errors(record, nominal, record.kinematic)
     assert scan is not None
     expected = expect(record, config, job, nominal)
     made |= {name: _mm(getattr(scan, name)) for name in ("scan", "aligned", "own", "absolute")}

@@ -24,7 +24,7 @@ from cell.geometry.covariance import covariance_root
 from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface
 from cell.job import Job
-from cell.reconstruction import Cloud, calibration_motions
+from cell.reconstruction import Cloud, calibration_motions, flange_motions
 from cell.reconstruction.build import ScanGeometry
 from cell.report.truth import part_points
 from cell.steps.laser_sweep import SweepRecord
@@ -66,9 +66,9 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     pose = record.results["invert_pose"]
     kinematics = _Kinematics(record.rests)
     shared, by_kinematics = _calibration(record, config, noise, kinematics)
-    head = _Head(record, cloud, sweep, nominal, pose.base_from_surface)
-
     rest = np.diag([noise["arm_repeatability"] ** 2 / 3] * 3 + [noise["arm_repeatability_rotation"] ** 2] * 3)
+    head = _Head(record, cloud, [rest] * len(sweep.swaths), nominal, pose.base_from_surface)
+
     at_surface = _carried(sweep.base_from_flange, pose.base_from_surface)
     place_flange = (
         pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()
@@ -78,7 +78,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     sigma = np.concatenate([np.full(12, lengths), np.full(6, zeros)])
     scan = -at_surface @ kinematics.shifts(sweep.base_from_flange) * sigma - head.poses(by_kinematics * sigma)
     own = scan + at_part @ kinematics.shifts(place_flange) * sigma
-    common = pose.random + at_surface @ rest @ at_surface.T + _square(head.poses(covariance_root(shared)))
+    common = pose.random + _square(head.by_rests) + _square(head.poses(covariance_root(shared)))
     placing = common + _square(own) + at_part @ rest @ at_part.T + _grasp(noise, pose.base_from_surface)
     placing = placing + _square(_lean(noise, config, sweep.base_from_flange, place_flange, pose.base_from_surface))
     absolute, of_own = common + _square(scan), common + _square(own)
@@ -129,14 +129,18 @@ class _Kinematics:
 
 
 class _Head:
-    """How the cloud, and the pose found in it, move with the scan head's parameters."""
+    """How the cloud, and the pose found in it, move with the scan head's parameters and with the sweeps' poses.
+
+    `rests`: the covariance (6, 6) of base_from_flange of each sweep. `by_rests` (6, m): motions of the surface's pose
+    by one standard deviation of each of their parts.
+    """
 
     def __init__(
-        self, record: JobRecord, cloud: Cloud, sweep: SweepRecord, nominal: NominalSurface, surface: pin.SE3
+        self, record: JobRecord, cloud: Cloud, rests: list[Vector], nominal: NominalSurface, surface: pin.SE3
     ) -> None:
         assert record.calibration is not None
         self._calibration = record.calibration.scan
-        self._cloud, self._sweep = cloud, sweep
+        self._cloud = cloud
         self._lines, self._rows = cloud.subsample(POINTS)
         points = cloud.points[self._lines, self._rows]
         chosen, feet = nominal.feet(transform(surface.inverse(), points), 0.0005)
@@ -145,21 +149,28 @@ class _Head:
         normals = feet.normals[feet.inner] @ surface.rotation.T
         arms = points[keep] - surface.translation
         self._normals = normals
-        self._rigid = np.linalg.pinv(np.concatenate([normals, np.cross(arms, normals)], axis=1))
+        by_pose = np.concatenate([normals, np.cross(arms, normals)], axis=1)
+        by_sweeps = np.einsum("ni,nim->nm", normals, flange_motions(cloud, self._lines, self._rows, rests))
+        columns = np.concatenate([by_pose, by_sweeps], axis=1)
+        weighted = columns / cloud.sigma_along(self._lines, self._rows, normals)[:, None] ** 2
+        # What the sweeps' poses are off is found with the pose, and known beforehand to its standard deviation.
+        known = np.diag([0.0] * 6 + [1.0] * by_sweeps.shape[1])
+        self._rigid = np.linalg.solve(weighted.T @ columns + known, weighted.T)[:6]
+        self.by_rests: Vector = self._rigid @ by_sweeps
 
     def poses(self, steps: Vector) -> Vector:
         """Motion (6, m) of the surface's pose for steps (21, m) of the parameters, by points along the normals."""
-        moved = self._moved(steps, self._sweep.base_from_flange, self._calibration.flange_from_camera)
+        moved = self._moved(steps, None, self._calibration.flange_from_camera)
         return np.asarray(self._rigid @ np.einsum("ni,nim->nm", self._normals, moved))
 
     def in_camera(self, steps: Vector) -> Vector:
         """Covariances (n, 3, 3) of single points in the camera's frame at rail zero: parameters, stripe and rail."""
         moved = self._moved(steps, pin.SE3.Identity(), pin.SE3.Identity())
-        base_from_camera = self._sweep.base_from_flange.rotation @ self._calibration.flange_from_camera.rotation
-        random = base_from_camera.T @ self._cloud.covariances(self._lines, self._rows) @ base_from_camera
+        turns = self._cloud.flanges[self._lines, :3, :3] @ self._calibration.flange_from_camera.rotation
+        random = turns.transpose(0, 2, 1) @ self._cloud.covariances(self._lines, self._rows) @ turns
         return np.asarray(random + moved @ moved.transpose(0, 2, 1))
 
-    def _moved(self, steps: Vector, base_from_flange: pin.SE3, hand: pin.SE3) -> Vector:
+    def _moved(self, steps: Vector, base_from_flange: pin.SE3 | None, hand: pin.SE3) -> Vector:
         c = self._calibration
         state = State(c.camera, c.light_plane, c.rail_direction, hand, pin.SE3.Identity())
         variants = []

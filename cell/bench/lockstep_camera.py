@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.camera.clock_map import ClockMap, Latch
 from drivers.clock import Clock
@@ -17,10 +19,20 @@ from drivers.errors import LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics
 from sim_backends.models.camera import CameraModel
 from sim_backends.world.hardware import camera_spec
+from sim_backends.world.nominal import inverse
 from sim_backends.world.world import World
 
 ROUND_TRIP_S = 0.0005
 LATCHES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Where things truly were half-way through an exposure: poses (4, 4), the carriage's displacement in m."""
+
+    base_from_flange: NDArray[np.float64]
+    base_from_surface: NDArray[np.float64]
+    carriage: float
 
 
 class LockstepCamera:
@@ -37,6 +49,8 @@ class LockstepCamera:
         self._model = CameraModel(camera_spec(world.scene, camera))
         self._map = ClockMap()
         self.shape = (self._model.spec.height, self._model.spec.width)
+        self.shots: dict[int, Shot] = {}
+        """The truth at each exposure so far, by the frame's id."""
 
     def identity(self) -> Identity:
         """The model's own plate."""
@@ -96,7 +110,13 @@ class LockstepCamera:
         frame_id, _ = self._model.expose()
         stamp = 1e-9 * spec.device_ns(begin + spec.latency)
         image = self._world.render(self._camera, begin + 0.5 * exposure, exposure)
+        self.shots[frame_id] = self._shot(begin + 0.5 * exposure)
         return Frame(image, frame_id, exposure, stamp, self._map.host_time(stamp), self._clock.now())
+
+    def _shot(self, t: float) -> Shot:
+        world = self._world
+        base_from_surface = inverse(world.world_from_base(t)) @ world.scene.world_from_surface
+        return Shot(world.arm.base_from_flange(t), base_from_surface, world.rail.carriage(t))
 
 
 class LockstepStream:

@@ -1,4 +1,4 @@
-"""How far the points of one simulated sweep lie from their true places, frame by frame.
+"""How far the points of simulated sweeps lie from their true places, frame by frame.
 
 The true place of a point is where the light plane really met the true surface in that image row, so that the noise of
 the stripe is part of the point's error. The camera's own frame is partly a convention: a shift of the principal point
@@ -22,13 +22,13 @@ from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, transform
 from cell.inversion import NominalSurface
-from cell.reconstruction import Cloud, calibration_motions
+from cell.reconstruction import Cloud
 from cell.reconstruction.build import ScanGeometry
 from cell.report.truth import SENSOR_POINTS, part_points, pose_of
-from cell.steps.laser_sweep import SweepRecord
 from cell.steps.reconstruct import Reconstruction
 from drivers.interfaces import Vector
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import draw
 
 Indices = NDArray[np.intp]
@@ -65,14 +65,13 @@ class _Compared:
     rows: Indices
 
 
-def scan_errors(record: JobRecord, nominal: NominalSurface, arm: Vector, kinematic: Vector) -> ScanErrors | None:
+def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -> ScanErrors | None:
     """The errors of a record's cloud, None when it has none.
 
-    As stated, m² and rad²: `arm` (6, 6) covariance of base_from_flange during the sweep, `kinematic` (6, 6) of a place
-    in the base that the arm realises.
+    `kinematic` (6, 6), m² and rad²: the covariance that is stated of a place in the base that the arm realises.
     """
-    made, sweep = record.results.get("reconstruct"), record.results.get("laser_sweep")
-    if not isinstance(made, Reconstruction) or not isinstance(sweep, SweepRecord):
+    made = record.results.get("reconstruct")
+    if not isinstance(made, Reconstruction):
         return None
     cloud = made.cloud
     assert record.calibration is not None and record.at_sweep is not None
@@ -81,22 +80,22 @@ def scan_errors(record: JobRecord, nominal: NominalSurface, arm: Vector, kinemat
     chosen = on_surface[np.linspace(0, len(on_surface) - 1, SENSOR_POINTS).astype(int)]
     some = _compare(record, nominal, cloud, lines[chosen], rows[chosen])
     truth = record.at_sweep
-    true_flange = pose_of(truth, "base_from_flange")
+    reported, flanges = cloud.flanges, np.array([shot.base_from_flange for shot in record.shots])
     own_from_base = own_base(record)
     by_camera = record.calibration.scan.flange_from_camera.inverse()
     true_by_camera = pose_of(truth, "flange_from_scan_camera").inverse()
     in_camera, true_in_camera = transform(by_camera, some.found), transform(true_by_camera, some.true)
-    off = transform(sweep.base_from_flange, some.found) - transform(own_from_base * true_flange, some.true)
+    off = _moved(reported[some.lines], some.found) - transform(own_from_base, _moved(flanges[some.lines], some.true))
     arms = by_pose(cloud.points[some.lines, some.rows] - pose_of(truth, "base_from_surface").translation)
-    stated = _stated(record, cloud, sweep, some, arm) + arms @ kinematic @ arms.transpose(0, 2, 1)
+    stated = _stated(made, some) + arms @ kinematic @ arms.transpose(0, 2, 1)
     near = _near_part(record, nominal, cloud, lines, rows)
     part = _compare(record, nominal, cloud, lines[near], rows[near])
-    found = transform(sweep.base_from_flange, part.found)
+    found, true = _moved(reported[part.lines], part.found), _moved(flanges[part.lines], part.true)
     return ScanErrors(
         scan=_length(in_camera - true_in_camera),
         aligned=_length(transform(_rigid(in_camera, true_in_camera), in_camera) - true_in_camera),
-        own=_length(found - transform(own_from_base * true_flange, part.true)),
-        absolute=_length(found - transform(true_flange, part.true)),
+        own=_length(found - transform(own_from_base, true)),
+        absolute=_length(found - true),
         inside=np.einsum("ni,nij,nj->n", off, np.linalg.inv(stated), off) <= chi2.ppf(COVERED, 3),
     )
 
@@ -135,15 +134,14 @@ def _true_points(
     record: JobRecord, nominal: NominalSurface, cloud: Cloud, lines: Indices, rows: Indices
 ) -> tuple[Indices, Vector]:
     """Which of the points have a true place on the surface (indices), and that place (m, 3) in the true flange."""
-    assert record.at_sweep is not None and record.carriage is not None
-    carriage = record.carriage[lines]
-    poses = [pose_of(record.at_sweep, name) for name in ("base_from_surface", "base_from_flange")]
-    surface_from_flange = poses[0].inverse() * poses[1]
+    shots = record.shots
+    carriage = np.array([shot.carriage for shot in shots])[lines]
+    surface_from_flange = np.array([inverse(s.base_from_surface) @ s.base_from_flange for s in shots])[lines]
     geometry = true_geometry(record)
     pixels = np.column_stack([cloud.centres[lines, rows], rows.astype(np.float64)])
 
     def height(at: Vector) -> Vector:
-        return nominal.deviations(transform(surface_from_flange, geometry.solve(at, carriage)[0]))
+        return nominal.deviations(_moved(surface_from_flange, geometry.solve(at, carriage)[0]))
 
     for _ in range(_SLIDES):
         above = height(pixels)
@@ -162,15 +160,18 @@ def _compare(record: JobRecord, nominal: NominalSurface, cloud: Cloud, lines: In
     return _Compared(found, true, lines, rows)
 
 
-def _stated(record: JobRecord, cloud: Cloud, sweep: SweepRecord, some: _Compared, arm: Vector) -> Vector:
-    """Covariances (n, 3, 3) in m², base axes: stripe, rail, calibration and arm."""
-    assert record.calibration is not None
-    scan, lines, rows = record.calibration.scan, some.lines, some.rows
-    moved = calibration_motions(cloud, lines, rows, sweep.base_from_flange, scan.geometry(), scan.variants())
-    arms = by_pose(cloud.points[lines, rows] - sweep.base_from_flange.translation)
-    return np.asarray(
-        cloud.covariances(lines, rows) + moved @ moved.transpose(0, 2, 1) + arms @ arm @ arms.transpose(0, 2, 1)
-    )
+def _stated(made: Reconstruction, some: _Compared) -> Vector:
+    """Covariances (n, 3, 3) in m², base axes: stripe, rail, calibration and the sweeps' poses."""
+    stated = made.cloud.covariances(some.lines, some.rows)
+    for motions in (made.by_calibration, made.by_poses):
+        moved = motions(some.lines, some.rows)
+        stated = stated + moved @ moved.transpose(0, 2, 1)
+    return stated
+
+
+def _moved(poses: Vector, points: Vector) -> Vector:
+    """Points (n, 3), each moved by the pose (n, 4, 4) of its own."""
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3])
 
 
 def by_pose(arms: Vector) -> Vector:

@@ -14,7 +14,7 @@ import numpy as np
 
 from cell.bench.lockstep import LockstepCell
 from cell.bench.lockstep_arm import LockstepArm
-from cell.bench.lockstep_rail import LockstepRail
+from cell.bench.lockstep_camera import LockstepCamera, Shot
 from cell.calibration import ScanObservation, TargetObservation
 from cell.config import CellConfig
 from cell.frames import FrameStore
@@ -22,6 +22,7 @@ from cell.inversion import NominalSurface
 from cell.job import Job
 from cell.job_run import classify
 from cell.steps.collect import collect_scan, collect_target
+from cell.steps.laser_sweep import SweepRecord
 from cell.steps.moves import Mover
 from cell.stored_calibration import CellCalibration
 from cell.work import JobWork
@@ -31,8 +32,6 @@ from sim_backends.world.truth import truth
 from statemachine.policy import Policy
 from statemachine.runner import StepContext
 from statemachine.sequence import State
-
-SWEEP_MEMORY_S = 20.0
 
 Progress = Callable[[float, str], None]
 
@@ -51,10 +50,10 @@ class NoFrames(FrameStore):
 class JobRecord:
     """How one simulated cell did: `outcome` is placed, refused, faulted or aborted, `stage` what it came to.
 
-    `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `repeatability`
-    and `kinematic` are the configured (6, 6) covariances of the arm; `rests` (n, 6) the joint angles at the end of
-    each motion, rad; `carriage` (n,) the carriage's true displacement in m at the sweep's rail positions. `wall_s` are
-    seconds on the wall by stage.
+    `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `kinematic` is the
+    configured (6, 6) covariance of a place that the arm goes to; `rests` (n, 6) the joint angles at the end of each
+    motion, rad; `shots` the truth at each line of the cloud, sweep after sweep. `wall_s` are seconds on the wall by
+    stage.
     """
 
     seed: int
@@ -67,26 +66,37 @@ class JobRecord:
     results: dict[str, Any] = field(default_factory=dict)
     at_sweep: dict[str, Any] | None = None
     at_end: dict[str, Any] | None = None
-    repeatability: Vector | None = None
     kinematic: Vector | None = None
     rests: Vector | None = None
-    carriage: Vector | None = None
+    shots: list[Shot] = field(default_factory=list)
     wall_s: dict[str, float] = field(default_factory=dict)
 
 
 def run_whole_job(
-    config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str, progress: Progress | None = None
+    config: CellConfig,
+    job: Job,
+    nominal: NominalSurface,
+    seed: int,
+    level: str,
+    progress: Progress | None = None,
+    calibrated: JobRecord | None = None,
 ) -> JobRecord:
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
-    Refusals and faults end it as they end a run, without the runner's repetitions.
+    Refusals and faults end it as they end a run, without the runner's repetitions. `calibrated` is a record of the same
+    cell, whose calibration is used again.
     """
     tell = progress or (lambda fraction, text: None)
     record = JobRecord(seed, level)
-    cell = LockstepCell(config, seed, level, job.job.name)
+    cell = LockstepCell(config, seed, level, Path(job.surface.mesh).stem)
     try:
-        with _Timed(record, "calibrate"):
-            record.calibration = _calibrate(cell, config, job, record, lambda f, t: tell(0.6 * f, f"calibrate: {t}"))
+        if calibrated is not None:
+            record.calibration, record.observations = calibrated.calibration, calibrated.observations
+        else:
+            with _Timed(record, "calibrate"):
+                record.calibration = _calibrate(
+                    cell, config, job, record, lambda f, t: tell(0.6 * f, f"calibrate: {t}")
+                )
         with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
             _steps(cell, config, job, nominal, record, Path(folder), tell)
     except CellError as error:
@@ -95,7 +105,8 @@ def run_whole_job(
     record.at_end = truth(cell.world)
     arm = cell.devices.arm
     assert isinstance(arm, LockstepArm)
-    record.rests = np.array(arm.rests)
+    before = [] if calibrated is None or calibrated.rests is None else list(calibrated.rests)
+    record.rests = np.array([*before, *arm.rests])
     return record
 
 
@@ -120,7 +131,7 @@ def _steps(
 ) -> None:
     assert record.calibration is not None
     work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder)
-    record.repeatability, record.kinematic = work.repeatability, work.kinematic
+    record.kinematic = work.kinematic
     policy = Policy()
     for k, (name, step) in enumerate(work.steps().items()):
         record.stage = name
@@ -130,19 +141,13 @@ def _steps(
             record.results[name] = step(context)
         if name == "laser_sweep":
             record.at_sweep = truth(cell.world)
-            record.carriage = _carriage(cell, record.results[name].swaths[0].rail)
+            record.shots = _shots(cell, record.results[name])
 
 
-def _carriage(cell: LockstepCell, positions: Vector) -> Vector:
-    """True displacement (n,) in m of the carriage when the sweep that has just ended was at `positions` (n,) in m."""
-    rail, now = cell.devices.rail, cell.clock.now()
-    assert isinstance(rail, LockstepRail)
-    times = np.arange(max(0.0, now - SWEEP_MEMORY_S), now, 0.002)
-    read = np.array([rail.counted(t) for t in times])
-    # The last rise of the counter is the sweep; before it the rail ran back to where the sweep begins.
-    start = int(np.flatnonzero(np.diff(read) < 0)[-1]) + 1 if (np.diff(read) < 0).any() else 0
-    moments = np.interp(positions, read[start:], times[start:])
-    return np.array([cell.world.rail.carriage(float(t)) for t in moments])
+def _shots(cell: LockstepCell, sweep: SweepRecord) -> list[Shot]:
+    camera = cell.devices.scan_camera
+    assert isinstance(camera, LockstepCamera)
+    return [camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
 
 
 class _Timed:

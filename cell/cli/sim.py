@@ -22,7 +22,7 @@ def serve(
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
     speed: SpeedOption = 1.0,
-    surface: Annotated[str, typer.Option(help="What stands on the place: pot or seat.")] = "pot",
+    surface: Annotated[str, typer.Option(help="What stands on the place: pot, seat or panel.")] = "pot",
     json: JsonOption = False,
     config_out: Annotated[
         Path | None, typer.Option(help="Also write a configuration that names the simulated endpoints.")

@@ -86,6 +86,11 @@ class NominalSurface:
             )
         return cls(vertices, faces, rim)
 
+    @property
+    def extent(self) -> tuple[Array, Array]:
+        """Lowest and highest corner (3,) of the box around the mesh, surface frame, m."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
     def feet(self, points: ArrayLike, within: float = np.inf) -> tuple[Indices, Feet]:
         """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""
         p = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)

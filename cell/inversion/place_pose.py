@@ -15,6 +15,7 @@ from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, judge
 from cell.inversion.registration import Prior, Registration, Scan, register
 from cell.inversion.search import across
+from cell.inversion.sweeps import balance
 from cell.reconstruction.cloud import Cloud
 from drivers.errors import RefusedError
 
@@ -102,6 +103,7 @@ def invert_pose(
     *,
     systematic: Array | None = None,
     calibration: Resolve | None = None,
+    sweeps: Resolve | None = None,
     start: pin.SE3 | None = None,
     demands: Demands | None = None,
     most_points: int = 10_000,
@@ -109,8 +111,9 @@ def invert_pose(
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
     `systematic` (6×6, base axes) is an uncertainty of the pose that all points share, such as the arm's; `calibration`
-    says how the calibration's uncertainty moves each point, and is propagated through the registration. `start` is
-    where the search begins unless at the prior.
+    says how the calibration's uncertainty moves each point, and is propagated through the registration; `sweeps` how
+    each sweep's own uncertainty moves its points, which is taken out as far as the sweeps tell it. `start` is where the
+    search begins unless at the prior.
 
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
@@ -123,11 +126,15 @@ def invert_pose(
     coverage = nominal.coverage(local, 0.0025)
     _demand(found, coverage, demands)
     _demand_whole(scan, pose, nominal, tolerance, demands)
+    lines, rows = (index[found.used] for index in cloud.subsample(most_points))
+    displaced = [resolve(lines, rows) for resolve in (calibration, sweeps) if resolve is not None]
+    if sweeps is not None:
+        found = balance(found, scan, displaced[-1], prior)
+        pose = found.base_from_surface
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
-    if calibration is not None:
-        lines, rows = cloud.subsample(most_points)
-        moved = _propagate(found, calibration(lines[found.used], rows[found.used]), prior)
-        shared = shared + moved @ moved.T
+    for moved in displaced:
+        by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved)
+        shared = shared + by_parameter @ by_parameter.T
     covariance = found.covariance + shared
     correction = difference(pose, prior.base_from_surface)
     disagreement = _disagreement(shared, prior, correction)
@@ -155,15 +162,6 @@ def invert_pose(
         correction=correction,
         disagreement=disagreement,
     )
-
-
-def _propagate(found: Registration, moved_points: Array, prior: Prior) -> Array:
-    """(6, m) motion of the pose for displacements (m used points, 3, m parameters) of the points, in m and rad."""
-    jacobian = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1)
-    weighted = jacobian / found.sigmas[:, None] ** 2
-    along = np.einsum("ni,nim->nm", found.normals, moved_points)
-    total = found.scan_information + prior.information()
-    return np.asarray(np.linalg.solve(total, weighted.T @ along))
 
 
 def _demand(found: Registration, coverage: float, demands: Demands) -> None:

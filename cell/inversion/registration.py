@@ -7,7 +7,7 @@ gated from coarse to fine. What the uncertainty means for the job is judged in `
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -80,7 +80,7 @@ class Registration:
     """The pose found. All 6×6 matrices are of (translation, rotation) in base axes, about the surface's origin.
 
     base_from_surface: the pose; scan_information: what the scan alone says, from stripe noise; covariance: random part,
-    scan and prior together; gain: how the pose follows a displacement of the scan, I where the scan decides.
+    scan and prior together; follow: (6, m) how the pose follows each accepted point along its normal.
     used: indices of the accepted points of the scan; heights: their distances from the surface (m);
     normals, arms: (m, 3) their normals and places relative to the surface's origin, in base axes; sigmas: m.
     share: accepted points among those over the surface; offered: points of the scan.
@@ -89,7 +89,7 @@ class Registration:
     base_from_surface: pin.SE3
     scan_information: Array
     covariance: Array
-    gain: Array
+    follow: Array
     used: NDArray[np.intp]
     heights: Array
     normals: Array
@@ -97,6 +97,11 @@ class Registration:
     sigmas: Array
     share: float
     offered: int
+
+    @property
+    def gain(self) -> Array:
+        """How the pose follows a motion of the whole scan (6, 6): I where the scan decides."""
+        return np.asarray(self.follow @ np.concatenate([self.normals, np.cross(self.arms, self.normals)], axis=1))
 
     @property
     def rms(self) -> float:
@@ -244,18 +249,13 @@ def _result(
     weighted = rows.jacobian[keep] / sigmas[keep, None] ** 2
     information = weighted.T @ rows.jacobian[keep]
     total = np.linalg.inv(information + prior.information())
-    index = rows.index[keep]
-    by_rail = np.einsum("ni,ni->n", scan.rail_spread[index], rows.normals[keep])
-    _, line = np.unique(scan.lines[index], return_inverse=True)
-    per_line = np.zeros((int(line.max()) + 1, 6))
-    np.add.at(per_line, line, weighted * by_rail[:, None])
     over = _correspondences(pose, scan, nominal, 0.003)
-    return Registration(
+    found = Registration(
         base_from_surface=pose,
         scan_information=information,
-        covariance=np.asarray(total + total @ per_line.T @ per_line @ total, dtype=np.float64),
-        gain=total @ information,
-        used=index,
+        covariance=np.asarray(total, dtype=np.float64),
+        follow=-total @ weighted.T,
+        used=rows.index[keep],
         heights=rows.heights[keep],
         normals=rows.normals[keep],
         arms=rows.arms[keep],
@@ -263,6 +263,17 @@ def _result(
         share=len(keep) / max(1, len(over.index)),
         offered=len(scan.points),
     )
+    lines = by_lines(found.follow, scan, found)
+    return replace(found, covariance=found.covariance + lines @ lines.T)
+
+
+def by_lines(follow: Array, scan: Scan, found: Registration) -> Array:
+    """(6, l) motion of the pose by one standard deviation of the rail's error of each of the l lines."""
+    along = np.einsum("ni,ni->n", scan.rail_spread[found.used], found.normals)
+    _, line = np.unique(scan.lines[found.used], return_inverse=True)
+    made = np.zeros((int(line.max()) + 1, 6))
+    np.add.at(made, line, (follow * along).T)
+    return made.T
 
 
 def _correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> _Rows:

@@ -88,20 +88,28 @@ def vehicle_bodies(plates: Sequence[tuple[str, pin.SE3, Sequence[float]]] = ()) 
 
 
 def station_bodies(
-    base_from_place: pin.SE3, place_from_board_centre: pin.SE3, surface_size: Sequence[float] = (0.070, 0.036, 0.015)
+    base_from_place: pin.SE3,
+    place_from_board_centre: pin.SE3,
+    place_from_surface: pin.SE3 | None = None,
+    surface_extent: tuple[Sequence[float], Sequence[float]] = ((-0.035, -0.018, 0.0), (0.035, 0.018, 0.015)),
 ) -> list[Body]:
-    """Table, nominal surface, board and its post, placed by the measured pose of the place frame in the arm base."""
+    """Table, nominal surface, board and its post, placed by the measured pose of the place frame in the arm base.
+
+    `surface_extent` are the lowest and the highest corner of the surface in its own frame, m.
+    """
 
     def placed(name: str, low: Sequence[float], high: Sequence[float]) -> Body:
         local = block(name, BASE, low, high)
         return box(name, BASE, base_from_place * local.placement, local.size)
 
-    x, y, z = surface_size
+    (x, y, z), over = surface_extent
+    surface = block("surface", BASE, (x, y, z - 0.002), over)
+    on_place = (place_from_surface or pin.SE3.Identity()) * surface.placement
     cx, cy, cz = place_from_board_centre.translation
     board = base_from_place * place_from_board_centre * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.006]))
     return [
         placed("table", (-0.35, -0.50, -0.60), (0.45, 0.50, -0.002)),
-        placed("surface", (-x / 2, -y / 2, -0.002), (x / 2, y / 2, z)),
+        box("surface", BASE, base_from_place * on_place, surface.size),
         placed("board post", (cx, cy - 0.02, -0.002), (cx + 0.04, cy + 0.02, cz)),
         box("board", BASE, board, (0.21, 0.17, 0.01)),
     ]

@@ -32,5 +32,6 @@ def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalS
         Prior(expected, spread),
         Tolerance(job.place.tolerance, job.place.tolerance_angle),
         systematic=kinematic,
-        calibration=scan.motions,
+        calibration=scan.by_calibration,
+        sweeps=scan.by_poses,
     )

@@ -18,9 +18,11 @@ from cell.motion.trajectory import LineLimits, Trajectory
 from cell.planning import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
-from drivers.interfaces import Arm, ArmMotion
+from drivers.interfaces import Arm, ArmMotion, Vector
 
 PLATE_THICKNESS = 0.01
+ROOM_ABOVE = 0.005
+"""How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
 GRACE_WALL_S = 10.0
 """How much longer than planned a motion may take before it is stopped, in seconds on the wall."""
 HOME = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
@@ -44,10 +46,19 @@ class Mover:
         self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(_plates(config))]
         self._planner = self._plan_among([])
 
-    def meet_station(self, base_from_place: pin.SE3, job: Job, board: BoardSpec) -> None:
-        """From now on avoid the station as well, where it was measured."""
+    def meet_station(
+        self, base_from_place: pin.SE3, job: Job, board: BoardSpec, surface_extent: tuple[Vector, Vector]
+    ) -> None:
+        """From now on avoid the station as well, where it was measured.
+
+        `surface_extent` are the lowest and the highest corner (3,) of the nominal surface in its own frame, m.
+        """
         centre = job.place_from_board * from_parts(centre_of(board))
-        self._planner = self._plan_among(station_bodies(base_from_place, centre))
+        on_place = job.surface.place_from_surface.se3()
+        low, (x, y, z) = (corner.tolist() for corner in surface_extent)
+        self._planner = self._plan_among(
+            station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
+        )
 
     def leave_part(self) -> None:
         """From now on the claw is empty; the part is where it was put, among the bodies that may be near the claw."""

@@ -18,17 +18,20 @@ from cell.reconstruction import (
     merge,
     write_cloud,
 )
+from cell.reconstruction.cloud import Array, Indices
 from cell.reconstruction.seams import Motions
 from cell.steps.laser_sweep import SweepRecord
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """The cloud, how its sweeps agree where they overlap, and how its points move under each systematic error."""
+    """The cloud, how its sweeps agree where they overlap, and how its points move by one standard deviation of each
+    independent parameter of the calibration and by what each sweep's flange pose is off."""
 
     cloud: Cloud
     seams: tuple[Seam, ...]
-    motions: Motions
+    by_calibration: Motions
+    by_poses: Motions
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -46,20 +49,18 @@ def reconstruct(sweep: SweepRecord, calibration: ScanCalibration, largest_hole: 
     Raises `RefusedError` when too few points are left.
     """
     cloud = fill_holes(build_cloud(sweep).require(), largest_hole)
-    motions = systematic(cloud, sweep, calibration)
-    seams = tuple(find_seams(cloud, motions))
-    write_cloud(path, cloud)
-    return Reconstruction(cloud, seams, motions)
-
-
-def systematic(cloud: Cloud, sweep: SweepRecord, calibration: ScanCalibration) -> Motions:
-    """How one standard deviation of each independent parameter of the calibration, and of each sweep's flange pose,
-    moves points of the cloud."""
     geometry, variants = calibration.geometry(), calibration.variants()
     covariances = [swath.covariance for swath in sweep.swaths]
 
-    def motions(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        by_calibration = calibration_motions(cloud, lines, rows, None, geometry, variants)
-        return np.concatenate([by_calibration, flange_motions(cloud, lines, rows, covariances)], axis=2)
+    def by_calibration(lines: Indices, rows: Indices) -> Array:
+        return calibration_motions(cloud, lines, rows, None, geometry, variants)
 
-    return motions
+    def by_poses(lines: Indices, rows: Indices) -> Array:
+        return flange_motions(cloud, lines, rows, covariances)
+
+    def by_both(lines: Indices, rows: Indices) -> Array:
+        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
+
+    seams = tuple(find_seams(cloud, by_both))
+    write_cloud(path, cloud)
+    return Reconstruction(cloud, seams, by_calibration, by_poses)

@@ -17,7 +17,8 @@ from sim_backends.optics.scene import Board, BoardInstance, LaserOptics, Light, 
 from sim_backends.world import nominal
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Lens, Scene, stream
-from sim_backends.world.surfaces import HALF_X, HALF_Y, mesh
+from sim_backends.world.surfaces import mesh
+from sim_backends.world.surfaces import surface as named_surface
 
 Pose = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -49,8 +50,9 @@ class Cameras:
         )
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
-        made = mesh(surface)
+        made, shape = mesh(surface), named_surface(surface)
         self._mesh = Mesh(made.vertices, made.triangles)
+        self._mesh_radius = float(np.hypot(shape.half_x, shape.half_y)) + 0.015
         self._large = Board(*nominal.LARGE_BOARD)
         self._fine = Board(*nominal.FINE_BOARD)
         self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._optics}
@@ -85,7 +87,7 @@ class Cameras:
             placed.append((BoardInstance(pose, board), pose, radius))
         if camera == "scan":
             shown = MeshInstance(camera_from_surface, self._mesh, SURFACE_ALBEDO)
-            placed.append((shown, camera_from_surface, float(np.hypot(HALF_X, HALF_Y)) + 0.015))
+            placed.append((shown, camera_from_surface, self._mesh_radius))
         optics = self._optics[camera]
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, _FAR[camera])]
 

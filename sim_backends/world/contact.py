@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_backends.world import nominal
 from sim_backends.world.nominal import inverse
-from sim_backends.world.surfaces import HALF_X, HALF_Y, Surface
+from sim_backends.world.surfaces import Surface
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -41,7 +41,9 @@ class PartContact:
         self._claw_closed = True
         self._lock = threading.Lock()
         # A margin keeps the points off the border, where the height field falls to the table.
-        grid = np.meshgrid(np.linspace(-HALF_X, HALF_X, 25) * 0.98, np.linspace(-HALF_Y, HALF_Y, 13) * 0.97)
+        along = np.linspace(-0.98, 0.98, 25) * surface.half_x
+        across = np.linspace(-0.97, 0.97, 13) * surface.half_y
+        grid = np.meshgrid(along, across)
         x, y = (axis.ravel() for axis in grid)
         self._underside = np.stack([x, y, surface.height(x, y)], axis=-1)
 

@@ -1,7 +1,8 @@
 """The placement surfaces: closed-form height fields z = h(x, y) in the surface frame S, and meshes of them.
 
 `pot` is a free-form relief without symmetry, `seat` a curved seat with a ledge, a step and a recess whose flanks are
-steep but finite. Both cover |x| ≤ 35 mm, |y| ≤ 18 mm; around them lies the table, z = 0.
+steep but finite; both cover |x| ≤ 35 mm, |y| ≤ 18 mm. `panel` is a curved sheet with three beads, |y| ≤ 30 mm: wider
+than the scan camera's field. Around them lies the table, z = 0.
 `python -m sim_backends.world.surfaces pot pot.stl` writes the nominal surface as binary STL in metres.
 """
 
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 HALF_X = 0.035
-"""Half the footprint along x_S, the sweep direction, m."""
+"""Half the pot's footprint along x_S, the sweep direction, m."""
 HALF_Y = 0.018
-"""Half the footprint along y_S, the direction of the stripe, m."""
+"""Half the pot's footprint along y_S, the direction of the stripe, m."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +36,19 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """A height field over the footprint; `relief(x, y)` gives height, ∂h/∂x and ∂h/∂y in m and m/m."""
+    """A height field over the footprint |x| ≤ `half_x`, |y| ≤ `half_y`, m.
+
+    `relief(x, y)` gives height, ∂h/∂x and ∂h/∂y in m and m/m.
+    """
 
     name: str
     relief: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+    half_x: float = HALF_X
+    half_y: float = HALF_Y
 
     def sample(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Heights (n,), m, and upward unit normals (n, 3) at x, y (n,) in S; outside the footprint the table's."""
-        inside = (np.abs(x) <= HALF_X) & (np.abs(y) <= HALF_Y)
+        inside = (np.abs(x) <= self.half_x) & (np.abs(y) <= self.half_y)
         h, gx, gy = (np.where(inside, value, 0.0) for value in self.relief(x, y))
         steepness = np.sqrt(1.0 + gx * gx + gy * gy)
         return h, np.stack([-gx / steepness, -gy / steepness, 1.0 / steepness], axis=-1)
@@ -94,7 +100,29 @@ def _seat(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     return h + up - 0.0020, gx + slope * dx / radius, gy + slope * dy / radius
 
 
-SURFACES = {"pot": Surface("pot", _pot), "seat": Surface("seat", _seat)}
+# Normal (x, y), offset (m), rise (m) and width (m) of the panel's beads; no two run in parallel.
+_BEADS = (
+    (0.940, 0.342, -0.011, 0.0030, 0.0050),
+    (-0.270, 0.963, 0.007, 0.0024, 0.0045),
+    (0.620, -0.785, 0.019, 0.0026, 0.0055),
+)
+
+
+def _panel(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+    h = 0.0035 + 1.8 * x * x + 2.4 * y * y + 1.2 * x * y + 0.02 * x - 0.015 * y
+    gx = 3.6 * x + 1.2 * y + 0.02
+    gy = 4.8 * y + 1.2 * x - 0.015
+    for nx, ny, offset, rise, width in _BEADS:
+        along = (nx * x + ny * y - offset) / width
+        up = rise / np.cosh(along) ** 2
+        slope = -2.0 * up * np.tanh(along) / width
+        h, gx, gy = h + up, gx + slope * nx, gy + slope * ny
+    return h, gx, gy
+
+
+SURFACES = {
+    made.name: made for made in (Surface("pot", _pot), Surface("seat", _seat), Surface("panel", _panel, half_y=0.030))
+}
 
 
 def surface(name: str) -> Surface:
@@ -114,9 +142,10 @@ def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> Mesh:
     field = surface(name)
     if triangles < 100:
         raise ValueError(f"a surface mesh of {triangles} triangles is too coarse: ask for 100 or more")
-    cell = np.sqrt(8.0 * HALF_X * HALF_Y / triangles)
-    nx, ny = (max(2, round(2.0 * half / cell) + 1) for half in (HALF_X, HALF_Y))
-    x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, nx), np.linspace(-HALF_Y, HALF_Y, ny), indexing="ij")
+    half_x, half_y = field.half_x, field.half_y
+    cell = np.sqrt(8.0 * half_x * half_y / triangles)
+    nx, ny = (max(2, round(2.0 * half / cell) + 1) for half in (half_x, half_y))
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, nx), np.linspace(-half_y, half_y, ny), indexing="ij")
     vertices = np.stack([x.ravel(), y.ravel(), field.height(x.ravel(), y.ravel())], axis=-1)
     index = np.arange(nx * ny).reshape(nx, ny)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]

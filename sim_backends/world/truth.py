@@ -12,7 +12,7 @@ import numpy as np
 from sim_backends.world import nominal
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import CameraClock, Lens
-from sim_backends.world.surfaces import HALF_X, HALF_Y
+from sim_backends.world.surfaces import surface
 from sim_backends.world.world import Pose, World
 
 
@@ -25,6 +25,7 @@ def truth(world: World) -> dict[str, Any]:
     base_from_flange = world.arm.base_from_flange(t)
     world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
     vehicle = world.vehicle.feedback(t)
+    shape = surface(world.surface)
     outputs = world.arm.digital_outputs
     return {
         "seed": scene.seed,
@@ -32,7 +33,7 @@ def truth(world: World) -> dict[str, Any]:
         "speed": world.clock.speed,
         "time": t,
         "assumed_noise": scene.deviations.assumed_noise(),
-        "surface": {"name": world.surface, "half_x": HALF_X, "half_y": HALF_Y, "unit": "m"},
+        "surface": {"name": world.surface, "half_x": shape.half_x, "half_y": shape.half_y, "unit": "m"},
         "poses": {
             name: _nested(pose)
             for name, pose in {
