@@ -1,7 +1,8 @@
 """The campaign behind `cell bench inversion`: starts from near and far on every part, ours beside the peers.
 
-A task is one part and one seed; cloud and starts are the same for every method. Times are CPU times of one thread, so
-that a busy machine changes them little.
+A task is one part and one seed; cloud and starts are the same for every method, and the peers, which take most of the
+time, get every second round of the settings. Times are CPU times of one thread, so that a busy machine changes them
+little.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from functools import cache
 
 import numpy as np
 
-from cell.bench.inversion_methods import Method, methods
+from cell.bench.inversion_methods import OURS, Method, methods
 from cell.bench.inversion_parts import PARTS, nominal
 from cell.bench.inversion_scenes import SETTINGS, TRUE, scan, start_away
 from cell.inversion import Prior
@@ -32,6 +33,7 @@ class Outcome:
     """One registration: `error` in m and rad of what the part determines (infinite if it gave up), CPU time in s."""
 
     part: str
+    seed: int
     setting: str
     start: str
     method: str
@@ -63,43 +65,58 @@ def ready(part: str, peers: bool) -> dict[str, Method | str]:
     return found
 
 
+def not_run(peers: bool) -> dict[str, str]:
+    """Why a method is not shown, by its name."""
+    return {name: run for name, run in ready("cap", peers).items() if isinstance(run, str)}
+
+
 def task(part: str, seed: int, peers: bool) -> list[Outcome]:
     """Both starts and every method on one part; the setting goes round with the seed."""
-    label = list(SETTINGS)[seed % len(SETTINGS)]
+    rounds, turn = divmod(seed, len(SETTINGS))
+    label = list(SETTINGS)[turn]
     rng = np.random.default_rng(seed)
     cloud = Scan.of(scan(PARTS[part], rng, SETTINGS[label]))
     outcomes = []
     for kind in STARTS:
         begin = prior(kind, rng)
         for method, run in ready(part, peers).items():
-            if isinstance(run, str):
+            if isinstance(run, str) or (method != OURS and rounds % 2):
                 continue
             started = time.process_time()
             try:
                 error = PARTS[part].error(run(cloud, begin), TRUE)
             except (RefusedError, RuntimeError, ValueError):
                 error = (float("inf"), float("inf"))
-            outcomes.append(Outcome(part, label, kind, method, error, time.process_time() - started))
+            outcomes.append(Outcome(part, seed, label, kind, method, error, time.process_time() - started))
     return outcomes
 
 
 def table(outcomes: Iterable[Outcome]) -> list[dict[str, object]]:
-    """One row for each part, start and method: share converged (%), errors of those (mm, mrad), median time (ms) and
-    its ratio to ours.
-    """
+    """One row for each part, start and method, and for all parts together."""
     groups: dict[tuple[str, str, str], list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
-        groups[outcome.part, outcome.start, outcome.method].append(outcome)
-    rows: list[dict[str, object]] = []
-    for (part, start, method), group in groups.items():
-        good = np.array([o.error for o in group if o.converged]) if any(o.converged for o in group) else None
-        ms = 1e3 * float(np.median([o.seconds for o in group]))
-        ours = 1e3 * float(np.median([o.seconds for o in groups[part, start, "ours"]]))
-        row: dict[str, object] = {"part": PARTS[part].title, "start": start, "method": method, "starts": len(group)}
-        row["converged_percent"] = round(100 * sum(o.converged for o in group) / len(group), 1)
-        for column, unit in enumerate(("mm", "mrad")):
-            values = None if good is None else 1e3 * good[:, column]
-            row[f"mean_{unit}"] = None if values is None else round(float(values.mean()), 4)
-            row[f"p95_{unit}"] = None if values is None else round(float(np.percentile(values, 95)), 4)
-        rows.append(row | {"ms": round(ms, 1), "ratio": round(ms / ours, 2)})
-    return rows
+        groups[PARTS[outcome.part].title, outcome.start, outcome.method].append(outcome)
+    for (_, start, method), group in list(groups.items()):
+        groups["all parts", start, method] += group
+    return [
+        {"part": part, "start": start, "method": method, **_figures(group, groups[part, start, OURS])}
+        for (part, start, method), group in groups.items()
+    ]
+
+
+def _figures(group: list[Outcome], ours: list[Outcome]) -> dict[str, object]:
+    """Share converged (%), errors of those (mm, mrad), median time (ms) and its ratio to ours in the same tasks."""
+    found = 1e3 * np.array([o.error for o in group if o.converged]).reshape(-1, 2)
+    row: dict[str, object] = {"starts": len(group), "converged_percent": _percent(group)}
+    for column, unit in enumerate(("mm", "mrad")):
+        for name, share in (("median", 50), ("p95", 95)):
+            row[f"{name}_{unit}"] = round(float(np.percentile(found[:, column], share)), 4) if len(found) else None
+    beside = {(o.part, o.seed): o.seconds for o in ours}
+    ratio = np.median([o.seconds / beside[o.part, o.seed] for o in group])
+    row |= {"ms": round(1e3 * float(np.median([o.seconds for o in group])), 1), "ratio": round(float(ratio), 2)}
+    settings = {label: [o for o in group if o.setting == label] for label in SETTINGS}
+    return row | {"converged_percent_by_setting": {k: _percent(some) for k, some in settings.items() if some}}
+
+
+def _percent(group: list[Outcome]) -> float:
+    return round(100 * sum(o.converged for o in group) / len(group), 1)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from cell.bench import inversion_refusals as refusals
-from cell.bench.inversion import Outcome, ready, table, task
+from cell.bench.inversion import Outcome, not_run, table, task
 from cell.bench.inversion_parts import PARTS
 from cell.bench.inversion_scenes import RAIL_SIGMA, STRIPE_SIGMA
 from cell.inversion.closest import Array
@@ -29,34 +29,34 @@ def campaign(starts: int, cases: int, peers: bool, progress: Callable[[int, int]
     outcomes: list[Outcome] = []
     judged: list[refusals.Judged] = []
     scores: list[tuple[Array, float]] = []
+    pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn"))
     try:
-        with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-            running: list[Future[Any]] = []
-            for part in PARTS:
-                running += [pool.submit(task, part, seed, peers) for seed in range(starts)]
-            for case in refusals.CASES:
-                running += [pool.submit(refusals.judge_case, case, seed) for seed in range(cases)]
-            running += [pool.submit(refusals.coverage, seed) for seed in range(5 * cases)]
-            for done, future in enumerate(as_completed(running), 1):
-                result = future.result()
-                if isinstance(result, list):
-                    outcomes += result
-                elif isinstance(result, refusals.Judged):
-                    judged.append(result)
-                elif isinstance(result, tuple):
-                    scores.append(result)
-                progress(done, len(running))
+        absent = pool.submit(not_run, peers)
+        running: list[Future[Any]] = [pool.submit(task, part, seed, peers) for seed in range(starts) for part in PARTS]
+        for case in refusals.CASES:
+            running += [pool.submit(refusals.judge_case, case, seed) for seed in range(cases)]
+        running += [pool.submit(refusals.coverage, seed) for seed in range(5 * cases)]
+        for done, future in enumerate(as_completed(running), 1):
+            result = future.result()
+            if isinstance(result, list):
+                outcomes += result
+            elif isinstance(result, refusals.Judged):
+                judged.append(result)
+            elif isinstance(result, tuple):
+                scores.append(result)
+            progress(done, len(running))
     finally:
+        pool.shutdown(wait=True, cancel_futures=True)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
     order = {part: k for k, part in enumerate(PARTS)}
-    outcomes.sort(key=lambda outcome: (order[outcome.part], outcome.start))
+    outcomes.sort(key=lambda outcome: (order[outcome.part], outcome.start, outcome.seed))
     return {
         "registration": table(outcomes),
-        "not_run": {name: run for name, run in ready("cap", peers).items() if isinstance(run, str)},
+        "not_run": absent.result(),
         "refusals": [_case_row(case, [j for j in judged if j.case == case]) for case in refusals.CASES],
         "coverage": _coverage(scores),
         "assumed_noise": {"stripe_mm": 1e3 * STRIPE_SIGMA, "rail_mm": 1e3 * RAIL_SIGMA, "wild_points_percent": 1.0},

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cell.geometry.poses import difference
 from cell.inversion.closest import Array
+from cell.inversion.dissent import Dissent, dissent
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, judge
 from cell.inversion.registration import Prior, Registration, Scan, register
@@ -32,13 +33,15 @@ class Demands:
     """What a scan has to be like to be believed.
 
     coverage: share of the surface that has points; share: points over the surface that fit it; rms: of those, m;
-    departed: share of the scanned area that may lie off the surface by more than `departure` allows.
+    departed: share of the scanned area that may lie off the surface by more than `departure` allows; dissent: how far
+    from the whole's place a quarter of the surface may put it, beyond three standard deviations, in tolerances.
     """
 
     coverage: float = 0.35
     share: float = 0.6
     rms: float = 0.0003
     departed: float = 0.22
+    dissent: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,7 @@ class PlacePose:
     verdict: is every direction known well enough; its words are in the surface frame.
     rms: of the accepted points' distances, m; chi2_per_dof: the same in units of their noise; n_points: accepted;
     share: accepted among those over the surface; coverage: share of the surface that was seen.
+    parts_differ: how far from this place a quarter of the surface puts it, beyond three sigma, in tolerances.
     correction: (6,) from the board's pose to this one, base axes, m and rad; disagreement: squared Mahalanobis distance
     between the two.
     """
@@ -65,6 +69,7 @@ class PlacePose:
     n_points: int
     share: float
     coverage: float
+    parts_differ: float
     correction: Array
     disagreement: float
 
@@ -81,6 +86,7 @@ class PlacePose:
             "chi2_per_dof": round(self.chi2_per_dof, 3),
             "share": round(self.share, 4),
             "coverage": round(self.coverage, 3),
+            "parts_differ": round(self.parts_differ, 3),
             "correction_mm": [round(1e3 * float(v), 3) for v in self.correction[:3]],
             "correction_mrad": [round(1e3 * float(v), 3) for v in self.correction[3:]],
             "sigma_mm": [round(1e3 * float(v), 4) for v in self.sigma[:3]],
@@ -126,14 +132,16 @@ def invert_pose(
     coverage = nominal.coverage(local, 0.0025)
     _demand(found, coverage, demands)
     _demand_whole(scan, pose, nominal, tolerance, demands)
-    lines, rows = (index[found.used] for index in cloud.subsample(most_points))
+    lines, rows = cloud.subsample(most_points)
     displaced = [resolve(lines, rows) for resolve in (calibration, sweeps) if resolve is not None]
     if sweeps is not None:
-        found = balance(found, scan, displaced[-1], prior)
+        found = balance(found, scan, displaced[-1][found.used], prior)
         pose = found.base_from_surface
+    explained = np.concatenate(displaced, axis=2) if displaced else None
+    parts_differ = _demand_agreement(dissent(scan, pose, nominal, tolerance, explained), tolerance, demands)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     for moved in displaced:
-        by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved)
+        by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
     covariance = found.covariance + shared
     correction = difference(pose, prior.base_from_surface)
@@ -159,6 +167,7 @@ def invert_pose(
         n_points=len(found.used),
         share=found.share,
         coverage=coverage,
+        parts_differ=parts_differ,
         correction=correction,
         disagreement=disagreement,
     )
@@ -198,6 +207,20 @@ def _demand_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
             f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
             "or covered, is it another one, or is the calibration disturbed?"
         )
+
+
+def _demand_agreement(found: Dissent, tolerance: Tolerance, demands: Demands) -> float:
+    """Refuse a surface of which a quarter by itself puts the place elsewhere; else how far beyond noise it does."""
+    if found.excess > demands.dissent:
+        x, y, z = 1e3 * found.middle
+        shift, turn = 1e3 * demands.dissent * tolerance.translation, 1e3 * demands.dissent * tolerance.rotation
+        raise RefusedError(
+            f"the parts of the surface do not agree: the quarter around ({x:.0f}, {y:.0f}, {z:.0f}) mm by itself puts "
+            f"the place {1e3 * found.shift:.2f} mm and {1e3 * found.turn:.1f} mrad elsewhere, allowed beyond its noise "
+            f"are {shift:.2f} mm and {turn:.1f} mrad. Which part is right cannot be told: is the surface worn, bent or "
+            "broken, does something lie on it, or is the calibration disturbed?"
+        )
+    return max(0.0, found.excess)
 
 
 def departure(tolerance: Tolerance, nominal: NominalSurface) -> float:

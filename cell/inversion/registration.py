@@ -32,6 +32,13 @@ CHI_GATE = 3.5
 MOST_CANDIDATES = 6
 SEARCH_GATE = 0.003
 """How far points may lie from the surface at a pose that the search proposes, m."""
+POLISHED = 3
+"""How many of the poses found are looked at with more points."""
+LIKELY = 0.35
+"""Share of the scan on the surface from which on a pose is believed to be near the right one; below it, the search
+begins anew from other starts."""
+OTHER_START = (0.006, float(np.radians(12.0)))
+"""How far the other starts lie from the given one: height (m) and tilt (rad)."""
 LEAST_POINTS = 100
 
 
@@ -115,7 +122,7 @@ class Registration:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Rows:
     """Linearised correspondences: indices of the points, heights (m), normals, arms and Jacobian (n, 6)."""
 
     index: NDArray[np.intp]
@@ -130,16 +137,41 @@ def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 |
 
     Raises `RefusedError` when too few points lie over the surface.
     """
-    thin, sparse = scan.thinned(COARSE_POINTS), scan.thinned(OTHER_POINTS)
     begin = prior.base_from_surface if start is None else start
+    pose, fit = _search(begin, scan, nominal, prior, begin)
+    for other in _beside(begin, nominal, prior):
+        if fit >= LIKELY:
+            break
+        pose, fit = max((pose, fit), _search(other, scan, nominal, prior, begin), key=lambda each: each[1])
+    return _fine(pose, scan, nominal, prior)
+
+
+def _search(
+    attempt: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, begin: pin.SE3
+) -> tuple[pin.SE3, float]:
+    """The best pose found from `attempt`, and how well it fits. How far to look follows from `begin`, the start."""
+    thin, sparse = scan.thinned(COARSE_POINTS), scan.thinned(OTHER_POINTS)
     first = _first_gate(nominal, prior, begin)
-    tried = [_tried(_coarse(begin, sparse, nominal, prior, first), thin, nominal)]
+    tried = [_tried(_coarse(attempt, sparse, nominal, prior, first), thin, nominal)]
     spread = _prior_spread(nominal, prior, begin)
-    level = _levelled(begin, sparse, nominal, first)
-    for attempt in candidates(level, sparse.points, nominal, *spread, MOST_CANDIDATES):
-        tried.append(_tried(_coarse(attempt, sparse, nominal, prior, SEARCH_GATE), thin, nominal))
+    level = _levelled(attempt, sparse, nominal, first)
+    for candidate in candidates(level, sparse.points, nominal, *spread, MOST_CANDIDATES):
+        tried.append(_tried(_coarse(candidate, sparse, nominal, prior, SEARCH_GATE), thin, nominal))
     tried.sort(key=lambda each: -each[1])
-    return _fine(tried[0][0], scan, nominal, prior)
+    # Few points see little of an edge: more of them settle which pose is best, and bring it where the last steps hold.
+    polished = [_coarse(pose, thin, nominal, prior, 2 * FINE_GATE) for pose, _ in tried[:POLISHED]]
+    return max((_tried(pose, thin, nominal) for pose in polished), key=lambda each: each[1])
+
+
+def _beside(begin: pin.SE3, nominal: NominalSurface, prior: Prior) -> list[pin.SE3]:
+    """Other starts: raised, lowered and tilted either way, where the prior leaves it open."""
+    normal, sides = across(nominal)
+    shift, turn = _prior_spread(nominal, prior, begin)
+    pivot = pin.SE3(np.eye(3), nominal.centre)
+    ways = [pin.SE3(np.eye(3), sign * min(shift, OTHER_START[0]) * normal) for sign in (1.0, -1.0)]
+    tilts = [sign * min(turn, OTHER_START[1]) * side for side in sides for sign in (1.0, -1.0)]
+    ways += [pin.SE3(pin.exp3(tilt), np.zeros(3)) for tilt in tilts]
+    return [begin * pivot * way * pivot.inverse() for way in ways]
 
 
 def _tried(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> tuple[pin.SE3, float]:
@@ -166,7 +198,7 @@ def _levelled(pose: pin.SE3, scan: Scan, nominal: NominalSurface, first: float) 
     gate = first
     while gate > 0.001:
         for _ in range(4):
-            rows = _correspondences(pose, scan, nominal, gate)
+            rows = correspondences(pose, scan, nominal, gate)
             if len(rows.index) < LEAST_POINTS / 2:
                 break
             turn = pose.rotation
@@ -195,7 +227,7 @@ def _coarse(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, fi
     while gate > 0.6 * FINE_GATE:
         scale = gate / 2.5
         for _ in range(4):
-            rows = _correspondences(pose, scan, nominal, gate)
+            rows = correspondences(pose, scan, nominal, gate)
             if len(rows.index) < LEAST_POINTS / 2:
                 break
             weights = (scale**2 / (scale**2 + rows.heights**2)) ** 2 / (0.5 * scale) ** 2
@@ -208,48 +240,48 @@ def _coarse(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, fi
 
 def _fit(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> float:
     """How well a pose explains the scan: share of all points that lie on the surface to within their noise."""
-    rows = _correspondences(pose, scan, nominal, 0.003)
+    rows = correspondences(pose, scan, nominal, 0.003)
     if len(rows.index) < LEAST_POINTS / 2:
         return 0.0
-    fitting = np.abs(rows.heights) < np.maximum(4 * _sigmas(scan, rows), 1e-4)
+    fitting = np.abs(rows.heights) < np.maximum(4 * sigmas_along(scan, rows), 1e-4)
     return float(fitting.sum() / len(scan.points))
 
 
 def _fine(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:
     """All points: first with a weight that rejects far ones, then with those that pass the χ² gate."""
     for _ in range(3):
-        rows = _correspondences(pose, scan, nominal, FINE_GATE)
+        rows = correspondences(pose, scan, nominal, FINE_GATE)
         _require_points(rows, scan)
-        sigmas = _sigmas(scan, rows)
-        ratio = rows.heights / (4.7 * _scale(rows.heights / sigmas) * sigmas)
+        sigmas = sigmas_along(scan, rows)
+        ratio = rows.heights / (4.7 * robust_scale(rows.heights / sigmas) * sigmas)
         pose, step = _update(pose, rows, np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0) / sigmas**2, prior)
         if step < 2e-7:
             break
     for _ in range(8):
-        rows = _correspondences(pose, scan, nominal, FINE_GATE)
-        sigmas = _sigmas(scan, rows)
-        scale = _scale(rows.heights / sigmas)
+        rows = correspondences(pose, scan, nominal, FINE_GATE)
+        sigmas = sigmas_along(scan, rows)
+        scale = robust_scale(rows.heights / sigmas)
         accepted = np.abs(rows.heights) < CHI_GATE * scale * sigmas
         # Where the fit is worse than the noise says, the scan is believed less.
         pose, step = _update(pose, rows, accepted / (scale * sigmas) ** 2, prior)
         if step < 2e-8:
             break
-    rows = _correspondences(pose, scan, nominal, FINE_GATE)
+    rows = correspondences(pose, scan, nominal, FINE_GATE)
     _require_points(rows, scan)
-    sigmas = _sigmas(scan, rows)
-    scale = _scale(rows.heights / sigmas)
+    sigmas = sigmas_along(scan, rows)
+    scale = robust_scale(rows.heights / sigmas)
     return _result(pose, scan, nominal, prior, rows, sigmas * scale, CHI_GATE)
 
 
 def _result(
-    pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, rows: _Rows, sigmas: Array, gate: float
+    pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior, rows: Rows, sigmas: Array, gate: float
 ) -> Registration:
     """Collect the outcome and propagate the noise: each point's own, and the rail's, common to a line."""
     keep = np.flatnonzero(np.abs(rows.heights) < gate * sigmas)
     weighted = rows.jacobian[keep] / sigmas[keep, None] ** 2
     information = weighted.T @ rows.jacobian[keep]
     total = np.linalg.inv(information + prior.information())
-    over = _correspondences(pose, scan, nominal, 0.003)
+    over = correspondences(pose, scan, nominal, 0.003)
     found = Registration(
         base_from_surface=pose,
         scan_information=information,
@@ -276,7 +308,7 @@ def by_lines(follow: Array, scan: Scan, found: Registration) -> Array:
     return made.T
 
 
-def _correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> _Rows:
+def correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> Rows:
     """Points within `gate` m of the surface and over it, with the derivative of their heights by the pose."""
     local = (scan.points - pose.translation) @ pose.rotation
     index, feet = nominal.feet(local, gate)
@@ -285,21 +317,21 @@ def _correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: f
     normals = feet.normals[keep] @ pose.rotation.T
     arms = scan.points[index] - pose.translation
     jacobian = -np.concatenate([normals, np.cross(arms, normals)], axis=1)
-    return _Rows(index, feet.heights[keep], normals, arms, jacobian)
+    return Rows(index, feet.heights[keep], normals, arms, jacobian)
 
 
-def _sigmas(scan: Scan, rows: _Rows) -> Array:
+def sigmas_along(scan: Scan, rows: Rows) -> Array:
     """Standard deviations along the normals from the stripe's noise, m."""
     along = np.einsum("ni,ni->n", scan.stripe_spread[rows.index], rows.normals)
     return np.asarray(np.hypot(along, SIGMA_FLOOR))
 
 
-def _scale(ratios: Array) -> float:
+def robust_scale(ratios: Array) -> float:
     """How many times larger the deviations are than their σ says, at least 1, from their median absolute value."""
     return max(1.0, float(np.median(np.abs(ratios))) / 0.6745) if len(ratios) else 1.0
 
 
-def _update(pose: pin.SE3, rows: _Rows, weights: Array, prior: Prior) -> tuple[pin.SE3, float]:
+def _update(pose: pin.SE3, rows: Rows, weights: Array, prior: Prior) -> tuple[pin.SE3, float]:
     """One Gauss–Newton step with weights 1/σ²; also the largest displacement at the surface that it makes, m."""
     off = difference(pose, prior.base_from_surface)
     by_pose = np.eye(6)
@@ -312,7 +344,7 @@ def _update(pose: pin.SE3, rows: _Rows, weights: Array, prior: Prior) -> tuple[p
     return perturbed(pose, step), float(np.abs(step[:3]).max() + np.abs(step[3:]).max() * reach)
 
 
-def _require_points(rows: _Rows, scan: Scan) -> None:
+def _require_points(rows: Rows, scan: Scan) -> None:
     if len(rows.index) < LEAST_POINTS:
         raise RefusedError(
             f"{len(rows.index)} of {len(scan.points)} scanned points lie within {1e3 * FINE_GATE:.1f} mm of the "

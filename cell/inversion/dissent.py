@@ -1,0 +1,129 @@
+"""Do the parts of the surface agree about where it lies?
+
+A robust fit follows whatever most of the surface says, and a surface that is worn like a ramp says that it is tilted.
+So each quarter of it is asked by itself: if that quarter alone were as drawn, where would the place be? Quarters that
+differ by more than noise and calibration explain leave two answers, and the scan cannot tell which is the right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.inversion.closest import Array
+from cell.inversion.nominal import NominalSurface
+from cell.inversion.observability import Tolerance
+from cell.inversion.registration import Scan, correspondences, robust_scale, sigmas_along
+from cell.inversion.search import across
+
+QUARTER = 0.25
+"""Share of the scanned area that is asked by itself."""
+STEP = 0.125
+"""Share of the area from one quarter to the next, so that they overlap."""
+DIRECTIONS = 4
+"""The quarters are bands across the surface, in so many directions."""
+REACH = 0.006
+"""Points farther than this from the surface are foreign objects, m."""
+TUKEY = 4.7
+"""Standard deviations from which on a point counts nothing."""
+MOST_STEPS = 15
+RIDGE = 3e-6
+"""A motion that moves a quarter by less than this within the tolerance cannot be told from none, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dissent:
+    """The quarter of the surface that differs most from the whole.
+
+    `shift` (m) and `turn` (rad) from the whole's place to the quarter's own; `excess` the larger of them beyond three
+    standard deviations, in tolerances. `middle` (3,) m is where the quarter lies, surface frame.
+    """
+
+    shift: float
+    turn: float
+    excess: float
+    middle: Array
+
+
+def dissent(
+    scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance: Tolerance, moved: Array | None = None
+) -> Dissent:
+    """The quarter that differs most from base_from_surface `pose`, in height and tilt.
+
+    `moved` (n, 3, m) m, base axes, says what one standard deviation of each parameter of the calibration, or of a
+    sweep's pose, does to each point of the scan: what that explains is no dissent. `pose` comes from a registration,
+    which saw enough points.
+    """
+    rows = correspondences(pose, scan, nominal, REACH)
+    ways = _ways(pose, nominal, tolerance)
+    slopes, noise = rows.jacobian @ ways, sigmas_along(scan, rows)
+    local = (scan.points[rows.index] - pose.translation) @ pose.rotation
+    by_calibration = np.zeros((len(rows.index), 0))
+    if moved is not None:
+        by_calibration = np.einsum("ni,nim->nm", rows.normals, moved[rows.index])
+        # What the whole follows, its parts follow with it.
+        by_calibration = by_calibration - slopes @ np.linalg.lstsq(slopes, by_calibration, rcond=None)[0]
+    found = []
+    for mine in _quarters(local @ across(nominal)[1].T):
+        own, spread = _own_place(rows.heights[mine], slopes[mine], noise[mine], by_calibration[mine])
+        motion = ways @ own
+        shift, turn = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
+        excess = _beyond_noise(motion, ways @ spread, tolerance)
+        found.append(Dissent(shift, turn, excess, np.median(local[mine], axis=0)))
+    return max(found, key=lambda each: each.excess)
+
+
+def _beyond_noise(motion: Array, spread: Array, tolerance: Tolerance) -> float:
+    """How far a motion (6,) with a root (6, m) of its covariance goes beyond three sigma, in tolerances."""
+    excesses = []
+    for part, allowed in ((slice(0, 3), tolerance.translation), (slice(3, 6), tolerance.rotation)):
+        size = float(np.linalg.norm(motion[part]))
+        sigma = float(np.linalg.norm(motion[part] @ spread[part])) / max(size, 1e-12)
+        excesses.append((size - 3.0 * sigma) / allowed)
+    return max(excesses)
+
+
+def _ways(pose: pin.SE3, nominal: NominalSurface, tolerance: Tolerance) -> Array:
+    """Motions (6, 3) of the surface by one tolerance each: along its mean normal, and two tilts about its middle.
+
+    Sliding and turning across the surface are left out: a quarter alone often does not determine them.
+    """
+    normal, sides = across(nominal)
+    turn, middle = pose.rotation, pose.rotation @ nominal.centre
+    ways = np.zeros((6, 3))
+    ways[:3, 0] = tolerance.translation * (turn @ normal)
+    ways[3:, 1:] = tolerance.rotation * (turn @ sides.T)
+    ways[:3, 1:] = -np.cross(ways[3:, 1:].T, middle).T
+    return ways
+
+
+def _quarters(places: Array) -> Iterator[NDArray[np.intp]]:
+    """Indices of the points (n, 2), across the surface, in bands that hold a quarter of them each."""
+    centred = places - places.mean(axis=0)
+    values, axes = np.linalg.eigh(centred.T @ centred)
+    scaled = centred @ axes / np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    for angle in np.pi / DIRECTIONS * np.arange(DIRECTIONS):
+        order = np.argsort(scaled @ np.array([np.cos(angle), np.sin(angle)]), kind="stable")
+        for begin in np.arange(0.0, 1.0 - QUARTER + 1e-9, STEP):
+            yield order[int(begin * len(order)) : int((begin + QUARTER) * len(order))]
+
+
+def _own_place(heights: Array, slopes: Array, sigmas: Array, by_calibration: Array) -> tuple[Array, Array]:
+    """Where points alone put the surface (3,), in tolerances, and a root (3, m) of its covariance."""
+    found, gain, scale = np.zeros(3), np.zeros((3, len(heights))), 1.0
+    for _ in range(MOST_STEPS):
+        left = heights + slopes @ found
+        scale = robust_scale(left / sigmas)
+        ratio = left / (TUKEY * scale * sigmas)
+        weights = np.where(np.abs(ratio) < 1.0, (1.0 - ratio**2) ** 2, 0.0) / sigmas**2
+        weighted = slopes.T * (weights / weights.sum())
+        gain = np.linalg.solve(weighted @ slopes + RIDGE**2 * np.eye(3), weighted)
+        step = -gain @ heights - found
+        found = found + step
+        if np.abs(step).max() < 1e-3:
+            break
+    return found, np.concatenate([gain * (scale * sigmas), gain @ by_calibration], axis=1)
