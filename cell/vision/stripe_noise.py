@@ -25,9 +25,9 @@ def pixel_noise(image: Any, gain_dn: float, declared_dn2: float) -> tuple[float,
     total, pairs = 0, 0
     for r in range(0, lines, max(1, lines // SAMPLED_LINES)):
         for i in range(0, n - 1, 2):
-            one, other = int(image[r, i]), int(image[r, i + 1])
+            one, other = np.int64(image[r, i]), np.int64(image[r, i + 1])
             counts[abs(one - other)] += 1
-            total += one + other
+            total += int(one + other)
         pairs += n // 2
     # Structure makes large steps and is trimmed away.
     median, below = 0, int(counts[0])
