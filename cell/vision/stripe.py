@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
+from math import sqrt
 from typing import Any, Literal
 
 import cv2
@@ -21,6 +22,7 @@ from cell.vision import compiled, stripe_numpy
 from cell.vision import stripe_find as find
 from cell.vision import stripe_fit as fit
 from cell.vision.pictures import PictureRefused, Reason
+from cell.vision.stripe_belief import believe
 from cell.vision.stripe_methods import METHODS
 from cell.vision.stripe_noise import pixel_noise
 from cell.vision.stripe_rivals import choose, smooth_widths
@@ -32,13 +34,11 @@ Axis = Literal["rows", "columns"]
 
 ASSUMED_CONTRAST = 0.15
 """Of the speckle where a picture shows too few lines to measure it."""
-SPECKLE_PAIRS = 128
+SPECKLE_PAIRS = 64
 NO_LAGS = np.zeros(0, np.float32)
 # Propagation is linear in the speckle's contrast C; what it leaves out grows as C⁴, and was taken from simulation.
 SECOND_ORDER = 3.0
 BLINDED_SHARE = 0.6
-# A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
-MISFIT_SIGMAS = 3.0
 
 
 class Method(StrEnum):
@@ -129,60 +129,56 @@ def extract(
     work, shade = (_lines(part, axis) for part in (image, dark))
     seen = work if dark is None else _above(work, shade)
     noise2, whole = pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
-    least = max(settings.least_peak_dn, 5 * np.sqrt(whole))
+    least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
-    finder = find.find_lines if quick else stripe_numpy.find_lines
-    finder(work, seen, shade, dark is not None, settings.saturation_dn, least, 0, len(work), start)
-    found = np.flatnonzero(start[:, 0, find.ENERGY] > 0)
+    (find if quick else stripe_numpy).find_lines(work, seen, shade, settings.saturation_dn, least, start)
+    found = np.flatnonzero(start[:, 0, find.ENERGY])
     _refuse_blinded(image, start, found, settings.saturation_dn)
     double = choose(start)
-    noise = _Noise(noise2, settings, dark is not None)
     fitted = np.full((fit.FITTED, len(work)), np.nan)
-    fitter = fit.fit_lines if quick else stripe_numpy.fit_lines
     widths = smooth_widths(start, settings.width_range_px)
+    gain, frames = settings.gain_dn, settings.dark_frames
+    of_dark = (0.0, 0.0) if dark is None else (noise2 / frames, gain * (1 + 1 / frames))
 
-    def run(which: NDArray[np.intp], widths: Array, contrast: float, rho: Any) -> None:
-        fitter(
-            work, shade, dark is not None, start, widths, which, settings.saturation_dn, noise.pixel, settings.gain_dn,
-            contrast, rho, *noise.of_dark, settings.steps, fitted,
+    def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
+        (fit if quick else stripe_numpy).fit_lines(
+            work, shade, start, widths, which, settings.saturation_dn, (noise2, gain, contrast), of_dark, rho,
+            settings.steps, fitted,
         )  # fmt: skip
 
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
     if contrast is None or (contrast > 0 and grain is None):
-        clear = (start[:, 0, find.ENERGY] > 0) & (start[:, 0, find.CORE] == 0) & ~double
-        pairs = np.flatnonzero(clear[:-1] & clear[1:])
+        clear = found[(start[found, 0, find.CORE] == 0) & ~double[found]]
+        pairs = clear[:-1][np.diff(clear) == 1]
         pairs = pairs[:: max(1, len(pairs) // SPECKLE_PAIRS)]
-        sample = np.union1d(pairs, pairs + 1)
-        run(sample, widths, ASSUMED_CONTRAST, NO_LAGS)
-        measured = measure_speckle(
-            work, shade, dark is not None, pairs, fitted, noise.pixel, settings.gain_dn, ASSUMED_CONTRAST
-        )
-        measured = measured or (ASSUMED_CONTRAST, ASSUMED_GRAIN)
-        contrast = measured[0] if contrast is None else contrast
-        grain = measured[1] if grain is None else grain
-        if len(sample):
+        run(np.concatenate([pairs, pairs + 1]), ASSUMED_CONTRAST, NO_LAGS)
+        measured = measure_speckle(work, shade, pairs, fitted, noise2, gain, ASSUMED_CONTRAST)
+        if measured is not None:
             # Peaks are chosen for being bright, so that speckle makes their start widths too small.
-            ratio = np.nanmedian(fitted[fit.WIDTH, sample] / widths[sample])
-            if np.isfinite(ratio):
-                widths = np.clip(widths * np.clip(ratio, 0.5, 2.0), *settings.width_range_px)
+            ratio = measured[2] / np.mean(widths[pairs])
+            np.clip(widths * min(max(ratio, 0.5), 2.0), *settings.width_range_px, out=widths)
+        seen_contrast, seen_grain = (ASSUMED_CONTRAST, ASSUMED_GRAIN) if measured is None else measured[:2]
+        contrast = seen_contrast if contrast is None else contrast
+        grain = seen_grain if grain is None else grain
     rho = correlation(grain) if contrast > 0 and grain else NO_LAGS
     if method is Method.MAXIMUM_LIKELIHOOD:
-        run(found, widths, contrast, rho)
+        run(found, contrast, rho)
     else:
-        frames = settings.dark_frames if dark is not None else 0
-        variance = noise.pixel, settings.gain_dn, frames
+        variance = noise2, gain, frames if dark is not None else 0
         fitted = METHODS[method](work, shade, start, found, variance, (contrast, rho), settings)
-    fitted[fit.SIGMA] *= np.sqrt(1 + SECOND_ORDER * contrast**2)
-    return _profile(fitted, start, double, work.shape[1], axis, settings, least)
-
-
-class _Noise:
-    """Variance of a pixel without its photons, DN², and (constant, per DN) what the dark frame adds to it."""
-
-    def __init__(self, pixel: float, settings: StripeSettings, with_dark: bool) -> None:
-        self.pixel = pixel
-        frames = settings.dark_frames
-        self.of_dark = (pixel / frames, settings.gain_dn * (1 + 1 / frames)) if with_dark else (0.0, 0.0)
+    low, high = settings.width_range_px
+    believe(fitted, start, work.shape[1], low, high, 0.5 * least, 1 + SECOND_ORDER * contrast**2)
+    centres = fitted[fit.FIT_CENTRE]
+    there = centres == centres
+    return StripeProfile(
+        axis=axis,
+        centres=centres,
+        sigma=fitted[fit.SIGMA],
+        amplitude=fitted[fit.AMPLITUDE],
+        width=fitted[fit.WIDTH],
+        saturated=there & (start[:, 0, find.CORE] > 0),
+        double=there & double,
+    )
 
 
 def extract_all(
@@ -241,37 +237,3 @@ def _refuse_blinded(image: Image, start: Array, found: NDArray[np.intp], saturat
             f"the stripe's picture is saturated: {share:.0%} of it at {saturation} DN or more, allowed "
             f"{BLINDED_SHARE:.0%}; shorten the exposure or keep the ambient light off",
         )
-
-
-def _profile(
-    fitted: Array,
-    start: Array,
-    double: NDArray[np.bool_],
-    length: int,
-    axis: Axis,
-    settings: StripeSettings,
-    least: float,
-) -> StripeProfile:
-    """The fitted lines that are believable stripes, with their standard deviations."""
-    centre, width, fisher = fitted[fit.FIT_CENTRE], fitted[fit.WIDTH], fitted[fit.FISHER]
-    low, high = settings.width_range_px
-    with np.errstate(invalid="ignore"):
-        keep = (width > low) & (width < high) & (fitted[fit.AMPLITUDE] > 0.5 * least)
-        keep &= (centre > 1.5 * width) & (centre < length - 1 - 1.5 * width)
-        keep &= np.abs(centre - start[:, 0, find.CENTRE]) < np.maximum(3.0, 2 * width)
-        keep &= fisher < np.maximum(1.0, 0.5 * width)
-        pixels = 8 * width + 2
-        allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / pixels)
-        sigma = fitted[fit.SIGMA] * np.sqrt(np.maximum(1.0, fitted[fit.CHI2] / allowed))
-    nothing = ~keep
-    for column in (centre, sigma, fitted[fit.AMPLITUDE], width):
-        column[nothing] = np.nan
-    return StripeProfile(
-        axis=axis,
-        centres=centre,
-        sigma=sigma,
-        amplitude=fitted[fit.AMPLITUDE],
-        width=width,
-        saturated=keep & (start[:, 0, find.CORE] > 0),
-        double=keep & double,
-    )

@@ -22,35 +22,40 @@ SEARCH = 12
 # What is elsewhere in the line competes for being the stripe from this share of the first peak's height on.
 RIVAL = 0.15
 TRIES = 3
+# Windows are padded to a multiple of this, which the vector unit takes without a remainder.
+PADDED = 32
 
 
 @compiled_fast
-def _largest(row: Any, low: int, high: int) -> int:
-    """Largest value of row[low:high], 0 when that is empty."""
-    if low >= high:
-        return 0
-    part = row[low:high]
-    top = part[0]
-    for i in range(len(part)):
-        if part[i] > top:
-            top = part[i]
+def _largest(row: Any) -> int:
+    """Largest value of some pixels, 0 when there are none."""
+    top = np.uint8(0)
+    for i in range(len(row)):
+        top = row[i] if row[i] > top else top
     return int(top)
 
 
 @compiled_fast
-def _elsewhere(row: Any, tops: Any, low: int, high: int) -> int:
-    """Largest value of a line outside low … high, from the maxima of its blocks where they lie outside."""
+def _first(row: Any, begin: int, top: int, marks: Any) -> int:
+    """Where row[begin : begin + BLOCK] first reaches `top`; `marks` is overwritten."""
+    part = row[begin : min(len(row), begin + BLOCK)]
+    limit = np.uint8(top)
+    for i in range(len(part)):
+        marks[i] = BLOCK - i if part[i] >= limit else 0
+    first: int = begin + BLOCK - _largest(marks[: len(part)])
+    return first
+
+
+@compiled_fast
+def _reached_elsewhere(row: Any, tops: Any, low: int, high: int, limit: float) -> bool:
+    """Whether a pixel outside low … high reaches `limit`: by the blocks' maxima, beside the window pixel by pixel."""
     n = len(row)
-    top = 0
     for b in range(len(tops)):
-        begin, end = b * BLOCK, min(n, (b + 1) * BLOCK)
-        if tops[b] <= top:
-            continue
-        if end <= low or begin > high:
-            top = int(tops[b])
-        else:
-            top = max(top, _largest(row, begin, min(end, low)), _largest(row, max(begin, high + 1), end))
-    return top
+        if tops[b] >= limit and ((b + 1) * BLOCK <= low or b * BLOCK > high):
+            return True
+    below = _largest(row[max(0, low - BLOCK) : max(0, low)])
+    above = _largest(row[min(n, high + 1) : min(n, high + 1 + BLOCK)])
+    return bool(max(below, above) >= limit)
 
 
 @compiled_fast
@@ -64,7 +69,7 @@ def _rises(row: Any, begin: int, end: int, rises: Any) -> int:
     for i in range(size):
         beside = left[i] if left[i] > right[i] else right[i]
         rises[i] = here[i] - beside if here[i] > beside else 0
-    top: int = _largest(rises, 0, size)
+    top: int = _largest(rises[:size])
     return top
 
 
@@ -86,120 +91,101 @@ def _prominent(row: Any, low: int, high: int, rises: Any) -> int:
     return place
 
 
-@compiled
+@compiled_fast
 def _measure(
-    row: Any, dark: Any, with_dark: bool, place: int, saturation: int, least_peak: float, scratch: Any, out: Any
+    image: Any, dark: Any, r: int, place: int, saturation: int, least_peak: float, window: Any, start: Any, k: int
 ) -> bool:
-    """Start values of the peak at `place`; False when it does not stand `least_peak` above both its sides."""
-    n = len(row)
+    """Start values of the peak at `place` in line `r` into start[r, k]; False when it does not stand `least_peak` above
+    both its sides. Without views of the arrays, whose bookkeeping would cost as much as the sums.
+    """
+    n = image.shape[1]
     # A wide saturated core pushes the search window out, so that its ends still see the background.
     core_low, core_high = place, place
     core = 0
-    if row[place] >= saturation:
-        while core_low > 0 and row[core_low - 1] >= saturation:
+    if image[r, place] >= saturation:
+        while core_low > 0 and image[r, core_low - 1] >= saturation:
             core_low -= 1
-        while core_high < n - 1 and row[core_high + 1] >= saturation:
+        while core_high < n - 1 and image[r, core_high + 1] >= saturation:
             core_high += 1
         core = core_high - core_low + 1
     low, high = max(0, core_low - SEARCH), min(n - 1, core_high + SEARCH)
     size = high - low + 1
     for i in range(size):
-        scratch[i] = row[low + i]
-    if with_dark:
+        window[i] = image[r, low + i]
+    if len(dark) > 1:
         for i in range(size):
-            scratch[i] -= dark[low + i]
-    left = 0.25 * (scratch[0] + scratch[1] + scratch[2] + scratch[3])
-    right = 0.25 * (scratch[size - 1] + scratch[size - 2] + scratch[size - 3] + scratch[size - 4])
-    peak = scratch[place - low]
+            window[i] -= dark[r, low + i]
+    left = np.float32(0.25) * (window[0] + window[1] + window[2] + window[3])
+    right = np.float32(0.25) * (window[size - 1] + window[size - 2] + window[size - 3] + window[size - 4])
+    peak = window[place - low]
     if peak - max(left, right) < least_peak:
         return False
-    background = 0.5 * (left + right)
-    _sums(scratch, size, low, background, peak, core, out)
+    background = np.float32(0.5) * (left + right)
+    half = background + np.float32(0.5) * (peak - background)
+    floor = background + np.float32(0.2) * (peak - background)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    above, energy, moment, total = zero, zero, zero, zero
+    for i in range(size):
+        value = window[i]
+        over = max(value - floor, zero)
+        total += value - background
+        energy += over
+        moment += np.float32(i) * over
+        above += one if value > half else zero
+    if core > 1:
+        # Gaussian flanks: the core is the width at saturation, `above` the width at half of the clipped height.
+        width = (max(float(above * above - core * core), 2.0) / 5.545) ** 0.5
+    else:
+        width = max(float(above), 1.0) / 2.355
+    start[r, k, CENTRE] = low + moment / energy
+    start[r, k, WIDTH] = width
+    start[r, k, HEIGHT] = peak - background
+    start[r, k, BACKGROUND] = background
+    start[r, k, ENERGY] = max(total, 1e-6)
+    start[r, k, CORE] = core
     return True
 
 
-@compiled_fast
-def _sums(scratch: Any, size: int, low: int, background: float, peak: float, core: int, out: Any) -> None:
-    """The box sum's centre and width of the window in `scratch`."""
-    half = background + 0.5 * (peak - background)
-    floor = background + 0.2 * (peak - background)
-    above, energy, moment, total = 0.0, 0.0, 0.0, 0.0
-    for i in range(size):
-        value = scratch[i]
-        over = max(value - floor, 0.0)
-        total += value - background
-        energy += over
-        moment += i * over
-        above += 1.0 if value > half else 0.0
-    if core > 1:
-        # Gaussian flanks: the core is the width at saturation, `above` the width at half of the clipped height.
-        width = (max(above * above - core * core, 2.0) / 5.545) ** 0.5
-    else:
-        width = max(above, 1.0) / 2.355
-    out[CENTRE] = low + moment / energy
-    out[WIDTH] = width
-    out[HEIGHT] = peak - background
-    out[BACKGROUND] = background
-    out[ENERGY] = max(total, 1e-6)
-    out[CORE] = core
-
-
 @compiled
-def find_lines(
-    image: Any,
-    seen: Any,
-    dark: Any,
-    with_dark: bool,
-    saturation: int,
-    least_peak: float,
-    first: int,
-    last: int,
-    start: Any,
-) -> None:
-    """Start values of the lines first … last − 1 of `image` (lines, n) into `start` (lines, CANDIDATES, START).
+def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> None:
+    """Start values of the lines of `image` (lines, n) into `start` (lines, CANDIDATES, START), which is 0 before.
 
-    `seen` is what lies above the dark frame. The brightest peak comes first; where it is none (bright scenery), the
-    one that stands out most. Of two peaks the one with more energy stays first.
+    `dark` has one pixel where there is no dark frame, `seen` is what lies above it. The brightest peak comes first;
+    where it is none (bright scenery), the one that stands out most. Of two peaks the one with more energy stays first.
     """
     n = image.shape[1]
-    scratch = np.empty(n, np.float64)
-    rises = np.empty(n, np.uint8)
+    window = np.empty(n, np.float32)
+    rises = np.empty(n + BLOCK, np.uint8)
     tops = np.empty((n + BLOCK - 1) // BLOCK, np.int64)
-    for r in range(first, last):
-        start[r] = 0.0
+    for r in range(len(image)):
         row = seen[r]
         block = 0
         for b in range(len(tops)):
-            tops[b] = _largest(row, b * BLOCK, min(n, (b + 1) * BLOCK))
-            if tops[b] > tops[block]:
-                block = b
+            tops[b] = _largest(row[b * BLOCK : min(n, (b + 1) * BLOCK)])
+            block = b if tops[b] > tops[block] else block
         if tops[block] < least_peak:
             continue
-        place = block * BLOCK
-        while row[place] < tops[block]:
-            place += 1
-        shade = dark[r] if with_dark else dark[0]
-        best = start[r, 0]
-        found = _measure(image[r], shade, with_dark, place, saturation, least_peak, scratch, best)
-        low = high_end = place
+        place = _first(row, block * BLOCK, tops[block], rises)
+        found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
+        low = high = place
         for _ in range(TRIES - 1):
             if found:
                 break
-            low, high_end = min(low, place - 4), max(high_end, place + 4)
-            place = _prominent(row, low, high_end, rises)
+            low, high = min(low, place - 4), max(high, place + 4)
+            place = _prominent(row, low, high, rises)
             if place < 0:
                 break
-            found = _measure(image[r], shade, with_dark, place, saturation, least_peak, scratch, best)
+            found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
         if not found:
             continue
-        reach = int(max(4.0, 4.0 * best[WIDTH])) + 1 + int(best[CORE])
-        low, high_end = place - reach, place + reach
-        if _elsewhere(row, tops, low, high_end) < best[BACKGROUND] + max(least_peak, RIVAL * best[HEIGHT]):
+        reach = int(max(4.0, 4.0 * start[r, 0, WIDTH])) + 1 + int(start[r, 0, CORE])
+        low, high = place - reach, place + reach
+        limit = start[r, 0, BACKGROUND] + max(least_peak, RIVAL * start[r, 0, HEIGHT])
+        if not _reached_elsewhere(row, tops, low, high, limit):
             continue
-        place = _prominent(row, low, high_end, rises)
-        rival = start[r, 1]
-        if place < 0 or not _measure(image[r], shade, with_dark, place, saturation, least_peak, scratch, rival):
+        place = _prominent(row, low, high, rises)
+        if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, 1):
             continue
-        if rival[ENERGY] > best[ENERGY]:
+        if start[r, 1, ENERGY] > start[r, 0, ENERGY]:
             for k in range(START):
-                best[k], rival[k] = rival[k], best[k]
+                start[r, 0, k], start[r, 1, k] = start[r, 1, k], start[r, 0, k]

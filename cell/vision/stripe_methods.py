@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cell.vision import stripe_find as find
 from cell.vision import stripe_fit as fit
+from cell.vision.stripe_lanes import HALF
 
 if TYPE_CHECKING:
     from cell.vision.stripe import StripeSettings
@@ -74,7 +75,7 @@ def _windows(
     width = np.clip(_smooth(best[:, find.WIDTH]), *settings.width_range_px)
     origin = np.floor(best[:, find.CENTRE] + 0.5).astype(np.intp)
     reach = np.ceil(REACH * width + 0.5 * best[:, find.CORE]).astype(int)
-    half = int(np.clip(reach.max(initial=2), 2, fit.HALF))
+    half = int(np.clip(reach.max(initial=2), 2, HALF))
     x = np.arange(-half, half + 1)
     column = origin[:, None] + x
     usable = (column >= 0) & (column < image.shape[1]) & (np.abs(x) <= reach[:, None])

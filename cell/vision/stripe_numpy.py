@@ -11,25 +11,15 @@ import numpy as np
 
 from cell.vision import stripe_find as find
 from cell.vision import stripe_fit as fit
+from cell.vision import stripe_lanes as lane
 
 CHUNK = 256
 
 
-def find_lines(
-    image: Any,
-    seen: Any,
-    dark: Any,
-    with_dark: bool,
-    saturation: int,
-    least_peak: float,
-    first: int,
-    last: int,
-    start: Any,
-) -> None:
+def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> None:
     """As `stripe_find.find_lines`."""
-    start[first:last] = 0.0
-    lines = np.arange(first, last)
-    place = seen[first:last].argmax(axis=1)
+    lines = np.arange(len(image))
+    place = seen.argmax(axis=1)
     lines, place = _with(seen[lines, place] >= least_peak, lines, place)
     low, high = place.copy(), place.copy()
     peak = place.copy()
@@ -44,7 +34,7 @@ def find_lines(
             peak[here] = _prominent(seen[lines[here]], low[here], high[here])
             open_[here[peak[here] < 0]] = False
             here = here[peak[here] >= 0]
-        record, good = _measure(image, dark, with_dark, lines[here], peak[here], saturation, least_peak)
+        record, good = _measure(image, dark, lines[here], peak[here], saturation, least_peak)
         start[lines[here[good]], 0] = record[good]
         open_[here[good]] = False
     there = start[lines, 0, find.ENERGY] > 0
@@ -59,7 +49,7 @@ def find_lines(
     lines, low, high = _with(rival, lines, low, high)
     place = _prominent(seen[lines], low, high)
     lines, place = _with(place >= 0, lines, place)
-    record, good = _measure(image, dark, with_dark, lines, place, saturation, least_peak)
+    record, good = _measure(image, dark, lines, place, saturation, least_peak)
     lines, record = lines[good], record[good]
     start[lines, 1] = record
     more = lines[record[:, find.ENERGY] > start[lines, 0, find.ENERGY]]
@@ -83,9 +73,7 @@ def _prominent(rows: Any, low: Any, high: Any) -> Any:
     return np.where(rise[np.arange(len(rows)), place] > 0, place + s, -1)
 
 
-def _measure(
-    image: Any, dark: Any, with_dark: bool, lines: Any, place: Any, saturation: int, least_peak: float
-) -> tuple[Any, Any]:
+def _measure(image: Any, dark: Any, lines: Any, place: Any, saturation: int, least_peak: float) -> tuple[Any, Any]:
     """Start values (m, START) of the peaks at `place` and whether each stands out from both its sides."""
     n = image.shape[1]
     core_low, core_high = place.copy(), place.copy()
@@ -102,7 +90,7 @@ def _measure(
     inside = column <= high[:, None]
     column = np.minimum(column, n - 1)
     value = image[lines[:, None], column].astype(np.float64)
-    if with_dark:
+    if len(dark) > 1:
         value -= dark[lines[:, None], column]
     row = np.arange(len(lines))
     left = value[:, :4].mean(axis=1)
@@ -127,50 +115,27 @@ def _measure(
 
 
 def fit_lines(
-    image: Any,
-    dark: Any,
-    with_dark: bool,
-    start: Any,
-    widths: Any,
-    which: Any,
-    saturation: int,
-    noise2: float,
-    gain: float,
-    contrast: float,
-    rho: Any,
-    dark_noise2: float,
-    dark_gain: float,
-    steps: int,
-    out: Any,
-) -> None:
+    image: Any, dark: Any, start: Any, widths: Any, which: Any, saturation: int, noise: Any, dark_noise: Any, rho: Any,
+    steps: int, out: Any,
+) -> None:  # fmt: skip
     """As `stripe_fit.fit_lines`."""
     for k in range(0, len(which), CHUNK):
         lines = which[k : k + CHUNK]
-        shade = dark[lines] if with_dark else None
-        _fit(
-            image[lines], shade, start[lines, 0], widths[lines], lines, saturation, (noise2, gain, contrast**2),
-            rho, (dark_noise2, dark_gain), steps, out,
-        )  # fmt: skip
+        shade = dark[lines] if len(dark) > 1 else None
+        variances = noise[0], noise[1], noise[2] ** 2
+        one = start[lines, 0], widths[lines], lines
+        _fit(image[lines], shade, *one, saturation, variances, rho, dark_noise, steps, out)
 
 
 def _fit(
-    image: Any,
-    shade: Any,
-    start: Any,
-    widths: Any,
-    lines: Any,
-    saturation: int,
-    noise: tuple[float, float, float],
-    rho: Any,
-    dark_noise: tuple[float, float],
-    steps: int,
-    out: Any,
-) -> None:
+    image: Any, shade: Any, start: Any, widths: Any, lines: Any, saturation: int, noise: Any, rho: Any,
+    dark_noise: Any, steps: int, out: Any,
+) -> None:  # fmt: skip
     """The lines of one chunk."""
     core = start[:, find.CORE]
     clipped = core > 1
-    origin = np.floor(start[:, find.CENTRE] + 0.5).astype(int)
-    reach = np.minimum(fit.HALF, 0.5 * core + 4.0 * widths + 3.0).astype(int)
+    origin = np.floor(start[:, find.CENTRE] + fit.NEAREST).astype(int)
+    reach = np.minimum(lane.HALF, 0.5 * core + 4.0 * widths + 3.0).astype(int)
     x = np.arange(-int(reach.max()), int(reach.max()) + 1)
     column = origin[:, None] + x
     usable = (np.abs(x) <= reach[:, None]) & (column >= 0) & (column < image.shape[1])
@@ -209,12 +174,12 @@ def _fit(
         row += active[:, None] * (inverse[:, 0] - row)
         chi2 += active * (np.sum(weight * residual**2, axis=1) - np.sum(step * right, axis=1) - chi2)
         changed = np.clip(at[:, 1] + step[:, 1], 0.3 * at[:, 1], 3.0 * at[:, 1])
-        at[:, 0] += active * np.clip(step[:, 0], -fit.LARGEST_STEP, fit.LARGEST_STEP)
+        at[:, 0] += active * np.clip(step[:, 0], -lane.LARGEST_STEP, lane.LARGEST_STEP)
         at[:, 1] += active * (changed - at[:, 1])
-        at[:, 2] += active * np.clip(step[:, 2], -fit.LARGEST_WIDTH_STEP, fit.LARGEST_WIDTH_STEP)
+        at[:, 2] += active * np.clip(step[:, 2], -lane.LARGEST_WIDTH_STEP, lane.LARGEST_WIDTH_STEP)
         at[:, 3:] += active[:, None] * step[:, 3:]
-        short = np.maximum(fit.CONVERGED**2, fit.CONVERGED_SIGMAS**2 * inverse[:, 0, 0])
-        active[(step[:, 0] ** 2 < short) & (np.abs(step[:, 2]) < fit.CONVERGED_WIDTH)] = 0.0
+        short = np.maximum(lane.CONVERGED**2, lane.CONVERGED_SIGMAS**2 * inverse[:, 0, 0])
+        active[(step[:, 0] ** 2 < short) & (np.abs(step[:, 2]) < lane.CONVERGED_WIDTH)] = 0.0
         if not active[good].any():
             break
     variance = row[:, 0]
@@ -224,7 +189,7 @@ def _fit(
         share = np.einsum("lxp,lp->lx", jacobian, row)
         variance = row[:, 2] ** 2 * prior + np.sum(weight * share**2, axis=1)
         moved = weight * share * stripe
-        for lag, correlated in enumerate(rho[: fit.LAGS], start=1):
+        for lag, correlated in enumerate(rho[: lane.LAGS], start=1):
             variance = variance + 2 * noise[2] * correlated * np.sum(moved[:, lag:] * moved[:, :-lag], axis=1)
     done = lines[good]
     out[fit.FIT_CENTRE, done] = (origin + at[:, 0])[good]
@@ -232,7 +197,7 @@ def _fit(
     out[fit.AMPLITUDE, done] = at[good, 1]
     out[fit.WIDTH, done] = np.exp(at[good, 2])
     out[fit.LEVEL, done] = at[good, 3]
-    out[fit.SLOPE, done] = at[good, 4] / fit.UNIT
+    out[fit.SLOPE, done] = at[good, 4] / lane.UNIT
     out[fit.CHI2, done] = chi2[good] / (usable.sum(axis=1)[good] - fit.PARAMETERS)
     out[fit.FISHER, done] = np.sqrt(row[good, 0])
 
@@ -243,6 +208,6 @@ def _model(at: Any, x: Any) -> tuple[Any, Any, Any]:
     z = (x - at[:, :1]) * inverse
     g = np.exp(-0.5 * z * z)
     stripe = at[:, 1:2] * g
-    slope = np.broadcast_to(x / fit.UNIT, z.shape)
+    slope = np.broadcast_to(x / lane.UNIT, z.shape)
     mean = stripe + at[:, 3:4] + at[:, 4:] * slope
     return mean, stripe, np.stack([stripe * z * inverse, g, stripe * z * z, np.ones_like(z), slope], axis=2)

@@ -10,19 +10,22 @@ part 3).
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from math import exp, log, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cell.vision.compiled import compiled
 from cell.vision.stripe_fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
+from cell.vision.stripe_lanes import LAGS
 
 # Correlation of two pixels at distance r is exp(−r²/4 grain²); a lens at f/4 to f/8 with pixels of 5 µm gives .3 to 1.
 GRAINS = np.array([0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3])
+LEAST_CORRELATED, MOST_CORRELATED = (exp(-0.25 / grain**2) for grain in (0.3, 1.3))
 CORE = 2.0
 """Residuals within this many stripe widths of the centre count: farther out there is no speckle to see."""
-LEAST_LINES = 12
+LEAST_PAIRS = 8
 PHASES = 8
 ASSUMED_GRAIN = 0.7
 """Grain in px where no speckle shows."""
@@ -30,51 +33,93 @@ ASSUMED_GRAIN = 0.7
 NEGLIGIBLE, SIGNIFICANT = 0.05, 3.0
 
 
-@compiled
-def residual_moments(
-    image: Any, dark: Any, with_dark: bool, which: Any, fitted: Any, noise2: float, gain: float, contrast2: float
-) -> Any:
-    """Sums (lines, 3) over the cores of the lines `which`: e e of the line; e e' with the next line's residuals e', and
-    (e e + e' e') / 2, both over the columns that the two cores share. e are whitened residuals.
+class _Seen(NamedTuple):
+    """Of the pairs of neighbouring lines that were kept: their number; means of the power, a line's sum of e e over its
+    core, e the whitened residuals, of e e' with the other line's over the columns that both cores share, and of the
+    power there; the standard deviation of the first; medians of the fit, the level with the dark frame."""
 
-    NaN where a core leaves the picture. `fitted` is from `fit_lines`, made with the same noise, for these lines and the
-    next ones.
-    """
+    pairs: int
+    power: float
+    product: float
+    shared: float
+    scatter: float
+    width: float
+    amplitude: float
+    level: float
+
+
+@compiled
+def _whitened(
+    image: Any, dark: Any, r: int, fitted: Any, noise2: float, gain: float, contrast2: float, errors: Any
+) -> tuple[int, int]:
+    """Residuals of line r into `errors` (n,) where its core is; first and last column + 1 of it, 0, 0 if it leaves."""
     n = image.shape[1]
-    out = np.full((len(which), 3), np.nan)
-    errors = np.zeros((2, n))
-    for k in range(len(which)):
-        low, high = np.zeros(2, np.int64), np.zeros(2, np.int64)
-        for j in range(2):
-            r = which[k] + j
-            centre, width, amplitude = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[AMPLITUDE, r]
-            if not (centre > CORE * width + 1.0 and centre < n - 2.0 - CORE * width):
-                continue
-            origin = np.floor(centre + 0.5)
-            low[j], high[j] = int(np.ceil(centre - CORE * width)), int(np.floor(centre + CORE * width)) + 1
-            for i in range(low[j], high[j]):
-                stripe = amplitude * np.exp(-0.5 * ((i - centre) / width) ** 2)
-                shade = float(dark[r, i]) if with_dark else 0.0
-                mean = stripe + fitted[LEVEL, r] + fitted[SLOPE, r] * (i - origin)
-                variance = noise2 + gain * max(mean + shade, 0.0) + contrast2 * stripe * stripe
-                errors[j, i] = (image[r, i] - shade - mean) / np.sqrt(variance)
-        if high[0] == 0 or high[1] == 0:
+    centre, width, amplitude = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[AMPLITUDE, r]
+    if not (centre > CORE * width + 1.0 and centre < n - 2.0 - CORE * width):
+        return 0, 0
+    origin = int(np.floor(centre + 0.5))
+    level, slope = fitted[LEVEL, r], fitted[SLOPE, r]
+    low, high = int(np.ceil(centre - CORE * width)), int(np.floor(centre + CORE * width)) + 1
+    for i in range(low, high):
+        z = (i - centre) / width
+        stripe = amplitude * np.exp(-0.5 * z * z)
+        shade = float(dark[r, i]) if len(dark) > 1 else 0.0
+        mean = stripe + level + slope * (i - origin)
+        variance = noise2 + gain * max(mean + shade, 0.0) + contrast2 * stripe * stripe
+        errors[i] = (image[r, i] - shade - mean) / np.sqrt(variance)
+    return low, high
+
+
+@compiled
+def _residuals(
+    image: Any, dark: Any, pairs: Any, fitted: Any, noise2: float, gain: float, contrast2: float, table: Any
+) -> int:
+    """Power, product, shared power, width, amplitude and level of each pair r, r + 1 in the picture, into `table`."""
+    errors = np.zeros((2, image.shape[1]))
+    used = 0
+    for r in pairs:
+        low, high = _whitened(image, dark, r, fitted, noise2, gain, contrast2, errors[0])
+        low1, high1 = _whitened(image, dark, r + 1, fitted, noise2, gain, contrast2, errors[1])
+        if high == 0 or high1 == 0:
             continue
-        own, cross, shared = 0.0, 0.0, 0.0
-        for i in range(low[0], high[0]):
-            own += errors[0, i] ** 2
-        for i in range(max(low[0], low[1]), min(high[0], high[1])):
-            cross += errors[0, i] * errors[1, i]
+        power, product, shared = 0.0, 0.0, 0.0
+        for i in range(low, high):
+            power += 0.5 * errors[0, i] ** 2
+        for i in range(low1, high1):
+            power += 0.5 * errors[1, i] ** 2
+        for i in range(max(low, low1), min(high, high1)):
+            product += errors[0, i] * errors[1, i]
             shared += 0.5 * (errors[0, i] ** 2 + errors[1, i] ** 2)
-        out[k, 0], out[k, 1], out[k, 2] = own, cross, shared
+        table[0, used], table[1, used], table[2, used] = power, product, shared
+        table[3, used] = 0.5 * (fitted[WIDTH, r] + fitted[WIDTH, r + 1])
+        table[4, used] = 0.5 * (fitted[AMPLITUDE, r] + fitted[AMPLITUDE, r + 1])
+        table[5, used] = fitted[LEVEL, r]
+        if len(dark) > 1:
+            table[5, used] += float(dark[r, int(np.floor(fitted[FIT_CENTRE, r] + 0.5))])
+        used += 1
+    return used
+
+
+@compiled
+def _typical(table: Any) -> Any:
+    """The numbers of `_Seen` from `table` (6, pairs); pairs that differ most are left out."""
+    out = np.zeros(8)
+    power = table[0]
+    # A line with an edge of the scene or a second stripe in it says nothing on speckle.
+    kept = power < 8 * max(float(np.median(power)), 0.1)
+    out[0] = np.count_nonzero(kept)
+    for k in range(3):
+        out[1 + k] = np.mean(table[k][kept])
+        out[5 + k] = np.median(table[3 + k][kept])
+    out[4] = np.std(power[kept])
     return out
 
 
-@lru_cache(maxsize=256)
-def expected_energy(
+@lru_cache(maxsize=4096)
+def _expected(
     width: float, amplitude: float, level: float, noise2: float, gain: float, contrast2: float
 ) -> NDArray[np.float64]:
-    """What e e of a line is on average, (1 + grains,): of photon noise, then of speckle of contrast 1 of each grain."""
+    """Power of a line on average, (1 + grains,): of photon noise, then of speckle of contrast 1 of each of `GRAINS`."""
     half = int(4.0 * width + 3.0)
     out = np.zeros(1 + len(GRAINS))
     # Much of what is left lies at the core's ends: how many pixels it holds depends on where in a pixel the centre is.
@@ -99,55 +144,43 @@ def expected_energy(
 
 
 def _rounded(value: float, step: float) -> float:
-    """To a geometric grid, so that a stream of like pictures asks for the same energies."""
-    return float(np.exp(step * np.round(np.log(max(value, 0.1)) / step)))
+    """To a geometric grid, so that a stream of like pictures asks for the same powers."""
+    return exp(step * round(log(max(value, 0.1)) / step))
 
 
 def measure_speckle(
-    image: Any,
-    dark: Any,
-    with_dark: bool,
-    which: Any,
-    fitted: Any,
-    noise2: float,
-    gain: float,
-    contrast: float,
-) -> tuple[float, float] | None:
-    """Contrast and grain (px) of the speckle in the lines `which`; None when they are too few.
+    image: Any, dark: Any, pairs: Any, fitted: Any, noise2: float, gain: float, contrast: float
+) -> tuple[float, float, float] | None:
+    """Contrast and grain (px) of the speckle in the lines `pairs` and the ones after them, and their width in px.
 
-    These and the lines after them are `fitted` with `contrast`. Anything else that the model does not explain, such as
-    the texture of the surface, counts as speckle.
+    All of them are `fitted` with `contrast`. None when they are too few. Anything else that the model does not explain,
+    such as the texture of the surface, counts as speckle.
     """
-    moments = residual_moments(image, dark, with_dark, which, fitted, noise2, gain, contrast**2)
-    # A line with an edge of the scene or a second stripe in it says nothing on speckle.
-    with np.errstate(invalid="ignore"):
-        kept = moments[:, 0] < 8 * max(float(np.nanmedian(moments[:, 0])), 0.1) if len(which) else np.zeros(0, bool)
-    if np.count_nonzero(kept) < LEAST_LINES:
+    table = np.empty((6, len(pairs)))
+    used = _residuals(image, dark, pairs, fitted, noise2, gain, contrast**2, table)
+    if used < LEAST_PAIRS:
         return None
-    lines = which[kept]
-    own, cross, shared = moments[kept].mean(axis=0)
-    middle = np.median(fitted[:, lines], axis=1)
-    width, amplitude, level = float(middle[WIDTH]), float(middle[AMPLITUDE]), float(middle[LEVEL])
-    if with_dark:
-        level += float(np.median(dark[lines]))
-    typical = _rounded(width, 0.03), _rounded(amplitude, 0.04), _rounded(level, 0.1), _rounded(noise2, 0.1)
-    expected = expected_energy(*typical, gain, contrast**2)
-    excess = own - expected[0]
-    doubt = SIGNIFICANT * float(moments[kept, 0].std()) / np.sqrt(len(lines))
-    if excess < doubt:
-        return 0.0, ASSUMED_GRAIN
-    # Of what both lines' residuals hold in the columns that they share, the speckle has the share that it has in all.
-    correlated = cross / max(shared * excess / own, 1e-9)
-    grain = float(np.sqrt(-0.25 / np.log(np.clip(correlated, *np.exp(-0.25 / GRAINS[[0, -1]] ** 2)))))
+    numbers = _typical(table[:, :used]).tolist()
+    seen = _Seen(*numbers)
+    if seen.pairs < LEAST_PAIRS:
+        return None
+    typical = _rounded(seen.width, 0.03), _rounded(seen.amplitude, 0.04), _rounded(seen.level, 0.1)
+    expected = _expected(*typical, _rounded(noise2, 0.1), gain, contrast**2)
+    excess = seen.power - float(expected[0])
+    if excess < SIGNIFICANT * seen.scatter / sqrt(seen.pairs):
+        return 0.0, ASSUMED_GRAIN, seen.width
+    # Of the power in the columns that both lines share, speckle has the share that it has of all.
+    correlated = min(max(seen.product * seen.power / (seen.shared * excess), LEAST_CORRELATED), MOST_CORRELATED)
+    grain = sqrt(-0.25 / log(correlated))
     contrast2 = excess / float(np.interp(grain, GRAINS, expected[1:]))
-    peak_noise = noise2 + gain * (amplitude + max(level, 0.0))
-    if contrast2 * amplitude**2 < NEGLIGIBLE * peak_noise:
-        return 0.0, grain
+    peak_noise = noise2 + gain * (seen.amplitude + max(seen.level, 0.0))
+    if contrast2 * seen.amplitude**2 < NEGLIGIBLE * peak_noise:
+        return 0.0, grain, seen.width
     # Developed speckle has contrast 1; more is a misfit.
-    return float(np.sqrt(min(contrast2, 1.0))), grain
+    return sqrt(min(contrast2, 1.0)), grain, seen.width
 
 
+@lru_cache(maxsize=256)
 def correlation(grain: float) -> Any:
-    """Correlations (m,) of speckle at lags 1 … m px, as far as they matter."""
-    rho = np.exp(-(np.arange(1, 7) ** 2) / (4 * grain**2))
-    return rho[rho > 0.01].astype(np.float32)
+    """Correlations (LAGS,) of speckle at lags 1, 2, … px."""
+    return np.exp(-(np.arange(1, LAGS + 1) ** 2) / (4 * grain**2)).astype(np.float32)
