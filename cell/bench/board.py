@@ -1,8 +1,8 @@
 """The board campaign: random views under each condition, what the detection says of them, and how far it is off.
 
 Counts what was found, refused and wrong, compares points and poses with the truth, and holds the stated covariance to
-the errors: z is the RMS of the whitened pose errors, z_axes each component's over its own σ (x, y, z, then the rotations about
-them, in the camera), coverage the share of errors inside the stated 95 % ellipsoid.
+the errors: z is the RMS of the whitened pose errors, z_axes each component's over its own σ (x, y, z, then the
+rotations about them, in the camera), coverage the share of errors inside the stated 95 % ellipsoid.
 """
 
 from __future__ import annotations
