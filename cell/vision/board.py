@@ -24,6 +24,7 @@ from cell.vision.outliers import without_outliers
 from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30
+SETTLED = 1e-7
 # The second pose that a flat board allows must fit worse by this much in χ².
 CLEAR_CHI2 = 16.0
 # Deviations from which a point counts less, and the median of the squared length of two Gaussian variables.
@@ -195,7 +196,7 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
             gain = squares - new_squares
             pose, residual, squares = candidate, new_residual, new_squares
             damping = max(1e-9, 0.1 * damping)
-            if gain <= 1e-10 * squares:
+            if gain <= SETTLED * squares:
                 break
         else:
             damping *= 10
