@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from cell.cli.options import wide_console
 from cell.paper.campaign import Progress as Report
 
 WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
@@ -137,7 +138,7 @@ def print_table1(result: Mapping[str, Any]) -> None:
 
 def print_systems(result: Mapping[str, Any]) -> None:
     """A row for each system, then the head that was assumed for it."""
-    console = Console()
+    console = wide_console(150)
     table = _table(f"other systems: theirs on hardware, ours simulated over {result['seeds']} heads each", "system",
                    "<theirs", "<our task", "ours in mm: mean", "95 % below", "worst 95 %", "expected mean",
                    "points/s")  # fmt: skip
