@@ -1,7 +1,8 @@
 """The board campaign: random views under each condition, what the detection says of them, and how far it is off.
 
 Counts what was found, refused and wrong, compares points and poses with the truth, and holds the stated covariance to
-the errors: z is the RMS of the whitened pose errors, coverage the share of errors inside the stated 95 % ellipsoid.
+the errors: z is the RMS of the whitened pose errors, z_axes each component's over its own σ (x, y, z, then the
+rotations about them, in the camera), coverage the share of errors inside the stated 95 % ellipsoid.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.stats import chi2
 
 from cell.bench.board_conditions import CONDITIONS, Condition, View, draw_view
 from cell.bench.board_render import Lens
-from cell.geometry.camera import CameraModel
+from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import difference
 from cell.vision.board import board_pose, find_board
 from cell.vision.board_spec import KINDS, BoardSpec, Kind
@@ -30,7 +31,7 @@ STRAY = 0.25
 
 @dataclass
 class Tally:
-    """What a condition gave: counts, errors of points in px, of poses in m and rad, squared whitened errors, times."""
+    """What a condition gave: counts, errors of points in px, of poses in m and rad, these over their σ, times."""
 
     views: int = 0
     found: int = 0
@@ -40,6 +41,7 @@ class Tally:
     places: list[float] = field(default_factory=list)
     turns: list[float] = field(default_factory=list)
     whitened: list[float] = field(default_factory=list)
+    scores: list[Array] = field(default_factory=list)
     found_s: list[float] = field(default_factory=list)
     refused_s: list[float] = field(default_factory=list)
     reasons: dict[str, int] = field(default_factory=dict)
@@ -63,6 +65,7 @@ class Tally:
             "pose_mm": rms(self.places, 1e3),
             "pose_mrad": rms(self.turns, 1e3),
             "z": round(float(np.sqrt(squares.mean() / 6)), 3) if len(squares) else None,
+            "z_axes": np.sqrt(np.mean(np.square(self.scores), axis=0)).round(3).tolist() if self.scores else None,
             "coverage_95": round(float((squares < chi2.ppf(0.95, 6)).mean()), 3) if len(squares) else None,
             "found_ms": middle(self.found_s),
             "refused_ms": middle(self.refused_s),
@@ -120,6 +123,7 @@ def judge(view: View, expect: str, tally: Tally) -> None:
     error = difference(pose.camera_from_board, truth)
     tally.places.append(float(np.linalg.norm(error[:3])))
     tally.turns.append(float(np.linalg.norm(error[3:])))
+    tally.scores.append(error / np.sqrt(np.diag(pose.covariance)))
     tally.whitened.append(float(error @ np.linalg.solve(pose.covariance, error)))
 
 

@@ -123,10 +123,16 @@ COLUMNS = (
     ("pose mm", "pose_mm", "{:.3f}"),
     ("mrad", "pose_mrad", "{:.3f}"),
     ("z", "z", "{:.2f}"),
+    ("z of the axes", "z_axes", "{}"),
     ("in 95 %", "coverage_95", "{:.1%}"),
     ("found ms", "found_ms", "{:.0f}"),
     ("refused ms", "refused_ms", "{:.0f}"),
 )
+
+
+def _text(value: Any) -> Any:
+    """The smallest and the largest of a list, anything else as it is."""
+    return f"{min(value):.2f}-{max(value):.2f}" if isinstance(value, list) else value
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -145,7 +151,7 @@ def _print(report: dict[str, Any]) -> None:
         for heading, _, _ in COLUMNS:
             table.add_column(heading, justify="right")
         for name, expect, row in rows:
-            shown = ["" if row[key] is None else form.format(row[key]) for _, key, form in COLUMNS]
+            shown = ["" if row[key] is None else form.format(_text(row[key])) for _, key, form in COLUMNS]
             table.add_row(name, expect, *shown)
         console.print(table)
     console.print(

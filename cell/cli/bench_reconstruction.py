@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from cell.cli.options import JsonOption, SeedOption, print_json
+from cell.cli.options import JsonOption, SeedOption, print_json, wide_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,7 +31,7 @@ def reconstruction(seed: SeedOption = 1, json: JsonOption = False) -> None:
     if json:
         print_json(report)
         return
-    _show(Console(), report)
+    _show(wide_console(), report)
 
 
 def _show(console: Console, report: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from cell.cli.options import wide_console
 from cell.paper.campaign import Progress as Report
 
 WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
@@ -70,6 +71,10 @@ def print_figure2(result: Mapping[str, Any]) -> None:
     _say(console, f"{result['choice']['rule']}: {result['choice']['chosen_mm']:g} mm, for every δ from {low:.3f} to "
          f"{high:.3f} µm. Light in the middle from 30 to 35 mm: "
          f"{100 * result['energy']['change_from_30_to_35']:.1f} %.")  # fmt: skip
+    given = result["assumed"]
+    _say(console, f"Assumed: f = {given['focal_mm']:g} mm, light plane and axis meet at {given['stand_off_mm']:g} mm, "
+         f"pixels of {given['pixel_um']:g} µm; light: {given['laser_mw']:g} mW over {given['fan_deg']:g}°, "
+         f"f/{given['f_number']:g}, albedo {given['albedo']:g}, transmission {given['transmission']:g}.")  # fmt: skip
     verdicts = _table("what the paper says", "", "<statement", "<verdict", "<why")
     for number, row in enumerate(result["statements"], 1):
         verdicts.add_row(str(number), row["paper"], row["verdict"], row["why"])
@@ -133,7 +138,7 @@ def print_table1(result: Mapping[str, Any]) -> None:
 
 def print_systems(result: Mapping[str, Any]) -> None:
     """A row for each system, then the head that was assumed for it."""
-    console = Console()
+    console = wide_console(150)
     table = _table(f"other systems: theirs on hardware, ours simulated over {result['seeds']} heads each", "system",
                    "<theirs", "<our task", "ours in mm: mean", "95 % below", "worst 95 %", "expected mean",
                    "points/s")  # fmt: skip

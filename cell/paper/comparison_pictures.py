@@ -36,9 +36,16 @@ def draw_table1(result: Mapping[str, Any], path: Path) -> Path:
     bound = result["bound_arm_base_mm"]
     axes.hlines(bound, 2.5, 3.5, color="tab:green", linestyle="--", label=f"expected mean D, {bound:.3f} mm")
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(places, ["X", "Y", "Z", "D"])
     axes.set_ylabel("deviation in mm (log): mean, whisker to the largest")
-    axes.set_title(f"45 points in 5 segments, arm base, {result['seeds']} simulated heads beside the paper's Table 1")
+    noise = result["assumed_noise"]
+    axes.set_title(
+        f"45 points in 5 segments, arm base, {result['seeds']} simulated heads beside the paper's Table 1\n"
+        f"assumed noise, 1σ: stripe {noise['stripe_px']:g} px, dots {noise['dots_px']:g} px, rail {noise['rail_mm']:g} "
+        f"mm, arm {noise['arm_mm_radial']:g} mm and {noise['arm_mrad_per_axis']:g} mrad",
+        fontsize=10,
+    )
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
     figure.savefig(path)
     return path
@@ -62,6 +69,7 @@ def draw_systems(result: Mapping[str, Any], path: Path) -> Path:
     axes.plot(places + 0.27, expected, "_", color="tab:green", markersize=26, markeredgewidth=2,
               label="expected mean for the assumed noise")  # fmt: skip
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(places, [f"{row['system']} {row['reference']}\n{row['theirs']['headline']}" for row in rows],
                     fontsize=7.5)  # fmt: skip
     axes.set_ylabel("error in mm (log)")

@@ -107,11 +107,11 @@ def _oblique() -> list[dict[str, Any]]:
         given = (THETA_1, THETA_2, L1, L2, tilt)
         right = _largest_height(eq.eq4_corrected(image, *given), heights)
         compared = f"height X, detector {name}, β = {np.degrees(tilt):.2f}°"
-        rows.append(
-            _row("(3)", compared + ", solved for X", _largest_height(eq.eq3_solved(image, *given), heights), right,
-                 "the axial term needs the sine of the tilt, with its sign")
-        )  # fmt: skip
-        verdict = "exact only for β = −45°" if tilt == EXACT_TILT else "follows exactly from (3), and shares its fault"
+        exact = "exact only for β = −45°"
+        verdict = exact if tilt == EXACT_TILT else "the axial term needs the sine of the tilt, with its sign"
+        printed = _largest_height(eq.eq3_solved(image, *given), heights)
+        rows.append(_row("(3)", compared + ", solved for X", printed, right, verdict))
+        verdict = exact if tilt == EXACT_TILT else "follows exactly from (3), and shares its fault"
         rows.append(_row("(4)", compared, _largest_height(eq.eq4_printed(image, *given), heights), right, verdict))
     return rows
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cell.paper.design import HALF_SENSOR, PIXEL, Head, Light, errors, largest_dz, peak_power, uniformity
 from cell.paper.figure2 import BASELINES, DELTA, DEMAND, FOCAL, GRID
 
-LEVELS_MM = (0.02, 0.05, 0.1, 0.2, 0.3)
+LEVELS_MM = (0.02, 0.05, 0.1, 0.2)
 
 
 def draw(folder: Path) -> list[Path]:
@@ -50,7 +50,9 @@ def _error_maps(path: Path) -> Path:
             if column == 0:
                 place.set_ylabel("y' along the stripe in mm")
     assert shown is not None
-    figure.colorbar(shown, ax=axes, label="largest error in mm for stripe errors of ±δ (log)", shrink=0.85)
+    ticks = [t for t in (0.002, 0.005, 0.01, *LEVELS_MM, 0.5) if t <= top]
+    bar = figure.colorbar(shown, ax=axes, label="largest error in mm for stripe errors of ±δ (log)", shrink=0.85)
+    bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
     figure.savefig(path)
     return path
 
@@ -86,6 +88,7 @@ def _errors_by_baseline(axes: Axes) -> None:
     axes.axvline(35, color="gray", linestyle=":", linewidth=1)
     axes.set_yscale("log")
     axes.set_ylim(0.03, 3)
+    axes.set_yticks([0.05, 0.1, 0.2, 0.5, 1, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])
     axes.set_title("largest |dZ|: 35 mm is the first of the 5 mm grid below 0.2 mm at 0.1 px", fontsize=9)
     axes.set_xlabel("baseline in mm (dots: 5 mm grid)")
     axes.set_ylabel("largest |dZ| in mm (log)")
@@ -102,7 +105,11 @@ def _light(axes: Axes) -> None:
             1e12 * peak_power(head, x, light),
             label=f"l = {1e3 * baseline:g} mm: min/max {uniformity(head, light):.2f}",
         )
-    axes.set_title("energy on the sensor: nearly the same in the middle, less even for short baselines", fontsize=9)
+    axes.set_title(
+        f"energy on the sensor: nearly the same in the middle, less even for short baselines\n(laser "
+        f"{1e3 * light.power:g} mW over {np.degrees(light.fan):.0f}°, f/{light.f_number:g}, albedo {light.albedo:g})",
+        fontsize=9,
+    )
     axes.set_xlabel("x' across the stripe in mm")
     axes.set_ylabel("power in the brightest pixel of a row in pW")
     axes.set_ylim(bottom=0)

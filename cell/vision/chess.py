@@ -22,7 +22,7 @@ from cell.vision.plane_map import PlaneMap
 
 LEAST_CORNERS = 6
 LEAST_SHARE = 0.5
-LEAST_SIGMA_PX = 0.004
+LEAST_SIGMA_PX = 0.0025
 LEAST_COLOURS = 0.85
 # The picture is searched at half its size first, where noise and blur are less.
 SCALES = (0.5, 1.0, 0.25)

@@ -1,7 +1,8 @@
 """Places of chessboard corners to some hundredths of a pixel, each with its own standard deviation.
 
-A corner is two crossing edges of a blurred, unevenly lit picture: m + g·p + c·erf(d₁)·erf(d₂). Least squares on all
-pixels around it, with what does not fit (a laser line, a finger) left out; this attains the bound for white noise.
+A corner is two crossing edges of a blurred, unevenly lit picture: (1 + g·p)·(m + c·erf(d₁)·erf(d₂)). Least squares on
+all pixels around it, with what does not fit (a laser line, a finger) left out; this attains the bound for white noise.
+The deviation comes from what each pixel leaves, as bright ones are noisier than dark ones.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ STEPS = 30
 WINDOW_SHARE = 0.42
 WINDOW_PX = (3.2, 13.0)
 OUTLYING = 4.5
-# What leaving out at that many deviations takes from the variance of white noise.
-TRIMMED = 1.137
+# Largest change of the light, from the corner to the window's rim.
+LIGHT_CHANGE = 0.7
 WHITE_DN = 253
 
 
@@ -117,24 +118,13 @@ def _one(
         new_normal = np.zeros((PARAMETERS, PARAMETERS))
         right = np.zeros(PARAMETERS)
         squares, mass = 0.0, 0.0
-        c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
         for k in range(count):
-            x, y = du[k] - p[0], dv[k] - p[1]
-            d1, d2 = x * -s1 + y * c1, x * -s2 + y * c2
-            e1, e2 = math.erf(d1 / (1.41421356 * p[4])), math.erf(d2 / (1.41421356 * p[5]))
-            g1 = 0.79788456 / p[4] * math.exp(-0.5 * (d1 / p[4]) ** 2)
-            g2 = 0.79788456 / p[5] * math.exp(-0.5 * (d2 / p[5]) ** 2)
-            modelled = p[6] + p[7] * e1 * e2 + p[8] * du[k] + p[9] * dv[k]
+            modelled = _model(p, du[k], dv[k], row)
             residual[k] = grey[k] - modelled
             if grey[k] >= WHITE_DN and modelled > grey[k]:
                 # A saturated pixel only says that the light was at least that.
                 residual[k] = 0.0
                 continue
-            a, b = p[7] * g1 * e2, p[7] * e1 * g2
-            row[0], row[1] = a * s1 + b * s2, -a * c1 - b * c2
-            row[2], row[3] = a * (-x * c1 - y * s1), b * (-x * c2 - y * s2)
-            row[4], row[5] = -a * d1 / p[4], -b * d2 / p[5]
-            row[6], row[7], row[8], row[9] = 1.0, e1 * e2, du[k], dv[k]
             w = weight[k]
             squares += w * residual[k] ** 2
             mass += w
@@ -182,6 +172,8 @@ def _one(
             p = best + move if total < 1e300 else p + move
             p[6], p[7] = min(max(p[6], -300.0), 900.0), min(max(p[7], -900.0), 900.0)
             p[4], p[5] = min(max(p[4], 0.25), 0.8 * reach), min(max(p[5], 0.25), 0.8 * reach)
+            steepest = LIGHT_CHANGE / reach
+            p[8], p[9] = min(max(p[8], -steepest), steepest), min(max(p[9], -steepest), steepest)
     moved = math.hypot(best[0] + u0 - start[0], best[1] + v0 - start[1])
     crossing = abs(math.sin(best[3] - best[2]))
     if moved > 0.75 * reach or crossing < 0.17 or best[7] * sign <= 0 or total >= 1e300:
@@ -189,15 +181,64 @@ def _one(
     for angle, begin in ((best[2], angle_1), (best[3], angle_2)):
         if abs(math.sin(angle - begin)) > 0.35:
             return
-    variance = TRIMMED * total * count / max(count - PARAMETERS, 1)
+    variance = total * count / max(count - PARAMETERS, 1)
     if abs(best[7]) < 1.2 * math.sqrt(variance) or abs(best[7]) < 2.0:
         return
     # What the model leaves must be noise: a corner half hidden keeps a residual of the size of its contrast.
     if math.sqrt(variance) > 0.3 * abs(best[7]) + 1.0 and scale > 0.3 * abs(best[7]) + 1.0:
         return
-    for i in range(PARAMETERS):
-        normal[i, i] += 1e-9
-    inverse = np.linalg.inv(normal)
     places[n, 0], places[n, 1] = best[0] + u0, best[1] + v0
-    sigma[n] = math.sqrt(max(0.5 * variance * (inverse[0, 0] + inverse[1, 1]), 0.0))
+    sigma[n] = _deviation(best, du[:count], dv[:count], grey[:count], weight > 0, OUTLYING * scale)
     contrast[n] = 2 * abs(best[7])
+
+
+@numba.njit(cache=True)
+def _model(p: Array, u: float, v: float, row: Array) -> float:  # pragma: no cover
+    """Grey value at (u, v) px from the middle of the window; its derivatives by the parameters go into `row`."""
+    c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
+    x, y = u - p[0], v - p[1]
+    d1, d2 = x * -s1 + y * c1, x * -s2 + y * c2
+    e1, e2 = math.erf(d1 / (1.41421356 * p[4])), math.erf(d2 / (1.41421356 * p[5]))
+    light = 1.0 + p[8] * u + p[9] * v
+    a = light * p[7] * e2 * 0.79788456 / p[4] * math.exp(-0.5 * (d1 / p[4]) ** 2)
+    b = light * p[7] * e1 * 0.79788456 / p[5] * math.exp(-0.5 * (d2 / p[5]) ** 2)
+    pattern = p[6] + p[7] * e1 * e2
+    row[0], row[1] = a * s1 + b * s2, -a * c1 - b * c2
+    row[2], row[3] = a * (-x * c1 - y * s1), b * (-x * c2 - y * s2)
+    row[4], row[5] = -a * d1 / p[4], -b * d2 / p[5]
+    row[6], row[7], row[8], row[9] = light, light * e1 * e2, u * pattern, v * pattern
+    return float(light * pattern)
+
+
+@numba.njit(cache=True)
+def _deviation(
+    p: Array, du: Array, dv: Array, grey: Array, used: NDArray[np.bool_], limit: float
+) -> float:  # pragma: no cover
+    """One standard deviation of the corner's coordinates in px: that of an M-estimator whose pixels differ in noise.
+
+    `used` are the pixels (n,) that count, those beyond `limit` DN do not.
+    """
+    slope = np.zeros((PARAMETERS, PARAMETERS))
+    spread = np.zeros((PARAMETERS, PARAMETERS))
+    row = np.empty(PARAMETERS)
+    count = 0
+    for k in range(len(grey)):
+        modelled = _model(p, du[k], dv[k], row)
+        z = (grey[k] - modelled) / limit
+        if not used[k] or abs(z) >= 1 or (grey[k] >= WHITE_DN and modelled > grey[k]):
+            continue
+        count += 1
+        bend = (1 - z * z) * (1 - 5 * z * z)
+        square = (z * limit * (1 - z * z) ** 2) ** 2
+        for i in range(PARAMETERS):
+            for j in range(PARAMETERS):
+                slope[i, j] += bend * row[i] * row[j]
+                spread[i, j] += square * row[i] * row[j]
+    if count <= PARAMETERS:
+        return np.nan
+    for i in range(PARAMETERS):
+        slope[i, i] += 1e-9
+    inverse = np.linalg.inv(slope)
+    covariance = inverse @ spread @ inverse.T
+    share = count / (count - PARAMETERS)
+    return math.sqrt(0.5 * share * max(covariance[0, 0] + covariance[1, 1], 0.0))

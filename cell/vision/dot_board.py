@@ -18,7 +18,7 @@ from cell.vision.lattice import Blobs, Places, dot_lattices
 from cell.vision.pictures import Image, PictureRefused, Reason, only_one
 from cell.vision.plane_map import PlaneMap
 
-LEAST_SIGMA_PX = 0.01
+LEAST_SIGMA_PX = 0.004
 LEAST_DOTS = 12
 SMALL_PX = 400_000
 AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
@@ -141,7 +141,9 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
     # Pixel (0, 0) is the middle of the upper left pixel at either scale.
     pixels = (measured.centres[good] + 0.5) / scale - 0.5
     size = (width // scale, height // scale)
-    deviation = np.maximum(sigma[good] / scale, LEAST_SIGMA_PX)
+    # One dot's rays are few: half of its variance is what the board's other dots say.
+    own = np.square(sigma[good] / scale)
+    deviation = np.sqrt(0.5 * (own + np.median(own)) + LEAST_SIGMA_PX**2)
     return BoardView(spec, size, ids[good], pixels, deviation, assumed, spec.dot_radius or radius * spec.pitch)
 
 

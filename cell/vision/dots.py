@@ -21,6 +21,13 @@ SAMPLES = 33
 REACH = (0.15, 1.75)
 LEAST_AREA_PX = 9.0
 ROUNDS = 4
+UNIT = np.column_stack([f(np.arange(RAYS) * 2 * np.pi / RAYS) for f in (np.cos, np.sin)])
+# Share of the step from dot to board by which light that falls off evenly may depart from a plane.
+MOST_UNEVEN = 0.06
+MOST_SLOPE = 0.3
+WHITE_DN = 253
+# Of the edge, in radii: less is not told from none.
+LEAST_SCATTER = 1e-3
 
 
 def find_blobs(image: Image, window: int, offset: float) -> Blobs:
@@ -92,14 +99,13 @@ def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blob
     """
     picture = image.astype(np.float32)
     centres, shapes = start.centres.copy(), start.shapes.copy()
-    angles = np.arange(RAYS) * 2 * np.pi / RAYS
-    unit = np.column_stack([np.cos(angles), np.sin(angles)])
     rho = np.linspace(*REACH, SAMPLES)
-    design = np.column_stack([np.ones(RAYS), unit, np.cos(2 * angles), np.sin(2 * angles)])
+    twice = UNIT[:, :1] ** 2 - UNIT[:, 1:] ** 2
+    design = np.column_stack([np.ones(RAYS), UNIT, twice, 2 * UNIT[:, :1] * UNIT[:, 1:]])
     sigma = np.full(len(centres), np.nan)
     profiles = np.empty((len(centres), RAYS, SAMPLES))
     for _ in range(rounds):
-        profiles = _sample(picture, centres, shapes, unit, rho)
+        profiles = _sample(picture, centres, shapes, rho)
         edge, good = _edges(profiles, rho)
         coefficients, sigma, kept = _harmonics(edge, good, design)
         moved = np.clip(coefficients, -0.5, 0.5)
@@ -118,24 +124,25 @@ def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blob
     return Blobs(centres, shapes), sigma, _ring_scores(profiles, rho)
 
 
-def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, unit: Array, rho: Array) -> Array:
+def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, rho: Array) -> Array:
     """Grey values (n, rays, samples) along rays in the dots' normalised coordinates."""
-    directions = np.einsum("nij,kj->nki", shapes, unit)
+    directions = np.einsum("nij,kj->nki", shapes, UNIT)
     places = centres[:, None, None, :] + directions[:, :, None, :] * rho[None, None, :, None]
-    flat = places.reshape(len(centres) * len(unit), len(rho), 2).astype(np.float32)
+    flat = places.reshape(len(centres) * RAYS, len(rho), 2).astype(np.float32)
     sampled = cv2.remap(picture, flat[:, :, 0], flat[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled.reshape(len(centres), len(unit), len(rho)).astype(np.float64)
+    return sampled.reshape(len(centres), RAYS, len(rho)).astype(np.float64)
 
 
 def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Where each ray (n, rays) leaves the dark, at half of the step, and whether it clearly does."""
     inside = (rho > 0.55) & (rho < 0.8)
     outside = (rho > 1.2) & (rho < 1.6)
-    dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
     bright = profiles[:, :, outside].mean(axis=2)
     # Neighbouring rays see the same board; a laser line or a neighbour dot does not move their median.
-    ring = np.stack([np.roll(bright, k, axis=1) for k in range(-3, 4)])
-    bright = np.median(ring, axis=0)
+    ring = np.median(np.stack([np.roll(bright, k, axis=1) for k in range(-3, 4)]), axis=0)
+    dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
+    slope, even = _light(profiles[:, :, inside].mean(axis=2), rho[inside].mean(), ring, rho[outside].mean())
+    dark, bright = dark * (1 + slope), np.where(even, ring.mean(axis=1, keepdims=True) * (1 + slope), ring)
     step = bright - dark
     level = dark + 0.5 * step
     start = int(np.searchsorted(rho, 0.5))
@@ -151,25 +158,50 @@ def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.where(good, edge, 1.0), good & (step > 4.0)
 
 
+def _light(dot: Array, within: float, ring: Array, beyond: float) -> tuple[Array, NDArray[np.bool_]]:
+    """By how much more light than its middle a dot's edge gets, a share (n, rays), and whether light falls off evenly.
+
+    `dot` and `ring` (n, rays) are the levels at `within` and `beyond` radii. The ring has the light of its own place,
+    not that of the edge: taken as it is, it moves every dot of a board the same way, which no residual shows.
+    """
+    mean = ring.mean(axis=1, keepdims=True)
+    side = 2 / RAYS * (ring @ UNIT) @ UNIT.T
+    uneven = np.sqrt(np.mean((ring - mean - side) ** 2, axis=1, keepdims=True))
+    even = uneven < MOST_UNEVEN * (mean - dot.mean(axis=1, keepdims=True))
+    # White that saturates tells nothing of the light; the dot, which reflects a little of it, does.
+    saturated = ring.max(axis=1, keepdims=True) >= WHITE_DN
+    level = np.maximum(dot.mean(axis=1, keepdims=True), 1.0)
+    slope = np.where(
+        saturated, 2 / RAYS * (dot @ UNIT) @ UNIT.T / (within * level), side / (beyond * np.maximum(mean, 1.0))
+    )
+    return np.where(even, np.clip(slope, -MOST_SLOPE, MOST_SLOPE), 0.0), even
+
+
 def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Robust Fourier coefficients (n, 5) of the edge, the deviation (n,) of the centre, and which dots are whole."""
     weight = good.astype(np.float64)
     coefficients = np.zeros((len(edge), design.shape[1]))
-    scatter = np.ones(len(edge))
+    scatter, residual, z = np.ones(len(edge)), edge, edge
     for _ in range(4):
         normal = np.einsum("nk,ki,kj->nij", weight, design, design) + 1e-9 * np.eye(design.shape[1])
         right = np.einsum("nk,ki,nk->ni", weight, design, edge)
         coefficients = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
         residual = edge - coefficients @ design.T
         scatter = 1.4826 * np.median(np.where(good, np.abs(residual), np.inf), axis=1)
-        scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), 2e-3, None)
+        scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), LEAST_SCATTER, None)
         z = residual / (4.0 * scatter[:, None])
         weight = np.where(good & (np.abs(z) < 1), (1 - z * z) ** 2, 0.0)
     used = (weight > 0.2).sum(axis=1)
     # The rays that count must surround the dot: no gap of a third of the circle.
     gap = _widest_gaps(weight > 0.2)
     kept = (used >= RAYS // 2) & (gap <= RAYS // 3) & (scatter < 0.15)
-    return coefficients, scatter * np.sqrt(2.0 / np.maximum(used, 1)), kept
+    # The variance of an M-estimator: the mean square of what each ray pulls over the square of how stiffly it holds.
+    within = weight > 0
+    pull = np.where(within, weight * residual, 0.0)
+    hold = np.where(within, (1 - z * z) * (1 - 5 * z * z), 0.0).sum(axis=1)
+    freedom = np.maximum(within.sum(axis=1) - design.shape[1], 1) / np.maximum(within.sum(axis=1), 1)
+    variance = 2 * np.square(pull).sum(axis=1) / np.maximum(hold, 1.0) ** 2 / freedom
+    return coefficients, np.sqrt(variance), kept
 
 
 def _widest_gaps(used: NDArray[np.bool_]) -> NDArray[np.intp]:
