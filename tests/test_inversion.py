@@ -18,9 +18,10 @@ from cell.bench.inversion_refusals import judge_case
 from cell.bench.inversion_scenes import Setting, scan
 from cell.geometry.poses import difference, perturbed
 from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.inversion.correspondences import Scan
 from cell.inversion.motions import name as motion_name
 from cell.inversion.motions import sorted_out
-from cell.inversion.registration import Scan, register
+from cell.inversion.registration import register
 from cell.reconstruction import Cloud
 from drivers.errors import ConfigError, NotObservable, RefusedError
 

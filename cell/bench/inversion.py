@@ -19,7 +19,7 @@ from cell.bench.inversion_methods import OURS, Method, methods
 from cell.bench.inversion_parts import PARTS, nominal
 from cell.bench.inversion_scenes import SETTINGS, TRUE, scan, start_away
 from cell.inversion import Prior
-from cell.inversion.registration import Scan
+from cell.inversion.correspondences import Scan
 from drivers.errors import RefusedError
 
 STARTS = {"far": (0.008, 20.0), "near": (0.003, 0.8)}

@@ -17,7 +17,8 @@ import pinocchio as pin
 from cell.geometry.poses import from_matrix
 from cell.inversion import NominalSurface, Prior
 from cell.inversion.closest import Array
-from cell.inversion.registration import COARSE_POINTS, Scan, register
+from cell.inversion.correspondences import Scan
+from cell.inversion.registration import COARSE_POINTS, register
 
 Method = Callable[[Scan, Prior], pin.SE3]
 """From a scan and the prior, whose pose is the start, to base_from_surface."""

@@ -15,9 +15,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.inversion.closest import Array
+from cell.inversion.correspondences import Scan, correspondences, robust_scale, sigmas_along
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance
-from cell.inversion.registration import Scan, correspondences, robust_scale, sigmas_along
 from cell.inversion.search import across
 
 QUARTER = 0.25
@@ -66,7 +66,8 @@ def dissent(
     if moved is not None:
         by_calibration = np.einsum("ni,nim->nm", rows.normals, moved[rows.index])
         # What the whole follows, its parts follow with it.
-        by_calibration = by_calibration - slopes @ np.linalg.lstsq(slopes, by_calibration, rcond=None)[0]
+        follows = np.linalg.lstsq(rows.jacobian, by_calibration, rcond=None)[0]
+        by_calibration = by_calibration - rows.jacobian @ follows
     found = []
     for mine in _quarters(local @ across(nominal)[1].T):
         own, spread = _own_place(rows.heights[mine], slopes[mine], noise[mine], by_calibration[mine])

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from cell.geometry.poses import difference
 from cell.inversion.closest import Array
+from cell.inversion.correspondences import Scan
 from cell.inversion.dissent import Dissent, dissent
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, judge
-from cell.inversion.registration import Prior, Registration, Scan, register
+from cell.inversion.registration import Prior, Registration, register
 from cell.inversion.search import across
 from cell.inversion.sweeps import balance
 from cell.reconstruction.cloud import Cloud

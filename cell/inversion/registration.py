@@ -1,6 +1,6 @@
 """Where the nominal surface lies in the scan: robust point-to-plane Gauss–Newton with the board's pose as a prior.
 
-Distances and normals are the model's own. The prior is anchored: its gradient pulls to the board's pose, so that a
+The prior is anchored: its gradient pulls to the board's pose, so that a
 direction that the scan does not determine stays where the board put it (theory sheet, part 5). Correspondences are
 gated from coarse to fine. What the uncertainty means for the job is judged in `observability`.
 """
@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 
 from cell.geometry.poses import difference, perturbed
 from cell.inversion.closest import Array
+from cell.inversion.correspondences import Rows, Scan, correspondences, robust_scale, sigmas_along
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.search import across, candidates
-from cell.reconstruction.cloud import Cloud
 from drivers.errors import RefusedError
 
-SIGMA_FLOOR = 3e-6
-"""Smallest standard deviation of a point along a normal, m: what a tessellation leaves."""
 COARSE_POINTS = 1200
 """Points of the search from the start, and of the searches from other starts."""
 OTHER_POINTS = 400
@@ -39,35 +37,9 @@ LIKELY = 0.35
 begins anew from other starts."""
 OTHER_START = (0.006, float(np.radians(12.0)))
 """How far the other starts lie from the given one: height (m) and tilt (rad)."""
+WELL_LEVELLED = float(np.radians(3.0))
+"""A start turned by less than this against the pose found, rad, need not be searched from twice."""
 LEAST_POINTS = 100
-
-
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """Points (n, 3) of a scan in the arm base, m.
-
-    `stripe_spread` and `rail_spread` (n, 3) m: what one standard deviation of the stripe centre and of the rail moves
-    each point by. The rail's error is common to the points with the same number in `lines` (n,).
-    """
-
-    points: Array
-    stripe_spread: Array
-    rail_spread: Array
-    lines: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, cloud: Cloud, most: int = 10_000) -> Scan:
-        """At most `most` points, spread evenly over the cloud."""
-        lines, rows = cloud.subsample(most)
-        spread = cloud.stripe_spread[lines, rows].astype(np.float64)
-        return cls(cloud.points[lines, rows], spread, cloud.rail_spread[lines], lines)
-
-    def thinned(self, most: int) -> Scan:
-        """At most `most` points, drawn evenly: a regular stride would fall into step with the rows of the cloud."""
-        if len(self.points) <= most:
-            return self
-        k = np.sort(np.random.default_rng(0).permutation(len(self.points))[:most])
-        return Scan(self.points[k], self.stripe_spread[k], self.rail_spread[k], self.lines[k])
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,17 +93,6 @@ class Registration:
         return float(np.sum((self.heights / self.sigmas) ** 2) / max(1, len(self.heights) - 6))
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Linearised correspondences: indices of the points, heights (m), normals, arms and Jacobian (n, 6)."""
-
-    index: NDArray[np.intp]
-    heights: Array
-    normals: Array
-    arms: Array
-    jacobian: Array
-
-
 def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 | None = None) -> Registration:
     """Find base_from_surface from `start` (the prior's pose unless given) in the light of scan and prior.
 
@@ -143,6 +104,9 @@ def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 |
         if fit >= LIKELY:
             break
         pose, fit = max((pose, fit), _search(other, scan, nominal, prior, begin), key=lambda each: each[1])
+    if np.linalg.norm(pin.log3(begin.rotation.T @ pose.rotation)) > WELL_LEVELLED:
+        # The search across the surface saw it tilted; from the pose found it sees it as it lies.
+        pose, fit = max((pose, fit), _search(pose, scan, nominal, prior, begin), key=lambda each: each[1])
     return _fine(pose, scan, nominal, prior)
 
 
@@ -306,29 +270,6 @@ def by_lines(follow: Array, scan: Scan, found: Registration) -> Array:
     made = np.zeros((int(line.max()) + 1, 6))
     np.add.at(made, line, (follow * along).T)
     return made.T
-
-
-def correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> Rows:
-    """Points within `gate` m of the surface and over it, with the derivative of their heights by the pose."""
-    local = (scan.points - pose.translation) @ pose.rotation
-    index, feet = nominal.feet(local, gate)
-    keep = feet.inner & (np.abs(feet.heights) < gate)
-    index = index[keep]
-    normals = feet.normals[keep] @ pose.rotation.T
-    arms = scan.points[index] - pose.translation
-    jacobian = -np.concatenate([normals, np.cross(arms, normals)], axis=1)
-    return Rows(index, feet.heights[keep], normals, arms, jacobian)
-
-
-def sigmas_along(scan: Scan, rows: Rows) -> Array:
-    """Standard deviations along the normals from the stripe's noise, m."""
-    along = np.einsum("ni,ni->n", scan.stripe_spread[rows.index], rows.normals)
-    return np.asarray(np.hypot(along, SIGMA_FLOOR))
-
-
-def robust_scale(ratios: Array) -> float:
-    """How many times larger the deviations are than their σ says, at least 1, from their median absolute value."""
-    return max(1.0, float(np.median(np.abs(ratios))) / 0.6745) if len(ratios) else 1.0
 
 
 def _update(pose: pin.SE3, rows: Rows, weights: Array, prior: Prior) -> tuple[pin.SE3, float]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from cell.geometry.poses import from_parts, perturbed, transform
 from cell.inversion import NominalSurface, Prior
-from cell.inversion.registration import Scan, register
+from cell.inversion.correspondences import Scan
+from cell.inversion.registration import register
 from cell.paper.rig import RigSpec, Sweep, TrueHead, sweep
 from cell.paper.spoiled import reconstruct
 from cell.reconstruction import Cloud, ScanGeometry

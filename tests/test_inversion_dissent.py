@@ -1,0 +1,83 @@
+"""A surface whose parts do not agree about its place is refused; noise, clutter and calibration are no disagreement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cell.bench.inversion import task
+from cell.bench.inversion_parts import PARTS, nominal
+from cell.bench.inversion_refusals import BOARD, TOLERANCE, judge_case
+from cell.bench.inversion_scenes import TRUE, Setting, scan
+from cell.inversion import Prior
+from cell.inversion.correspondences import Scan
+from cell.inversion.dissent import Dissent, dissent
+from cell.inversion.registration import register
+from cell.reconstruction import Cloud
+
+Array = NDArray[np.float64]
+POT = PARTS["pot"].height
+EDGE = -0.0175
+"""A quarter of the pot lies at smaller x, m."""
+
+
+def asked(deformed: Callable[[Array], Array]) -> Dissent:
+    """Dissent at the true pose of a pot whose height has changed by a function of x."""
+    cloud = scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + deformed(x))
+    return dissent(Scan.of(cloud), TRUE, nominal("pot"), TOLERANCE)
+
+
+def test_a_quarter_that_has_sunk_is_found_with_its_depth() -> None:
+    found = asked(lambda x: -0.0004 * (x < EDGE))
+    assert found.shift == pytest.approx(0.0004, abs=1e-4)
+    assert found.middle[0] < -0.015
+    assert found.excess > 0.5
+
+
+def test_a_quarter_that_is_tilted_is_found_with_its_angle() -> None:
+    found = asked(lambda x: 0.006 * np.minimum(x - EDGE, 0.0))
+    assert found.turn == pytest.approx(0.006, rel=0.1)
+    assert found.shift == pytest.approx(0.006 * -EDGE, rel=0.15)
+    assert found.middle[0] < EDGE
+
+
+def test_noise_alone_is_no_dissent() -> None:
+    assert asked(lambda x: 0.0 * x).excess < 0.05
+
+
+@pytest.mark.parametrize("part", list(PARTS))
+def test_foreign_objects_and_missing_data_are_no_dissent(part: str) -> None:
+    rng = np.random.default_rng(8)
+    for setting in (Setting(clutter=0.2), Setting(clutter=0.2, missing=0.4)):
+        seen = Scan.of(scan(PARTS[part], rng, setting))
+        pose = register(seen, nominal(part), Prior(TRUE, BOARD)).base_from_surface
+        assert dissent(seen, pose, nominal(part), TOLERANCE).excess < 0.25
+
+
+def test_what_the_calibration_explains_is_no_dissent() -> None:
+    plain = scan(PARTS["pot"], np.random.default_rng(3))
+    along = plain.points[:, :, 0] - TRUE.translation[0]
+    bow = 0.0002 * (along[..., None] / 0.035) ** 2 * TRUE.rotation[:, 2]
+    bent: Cloud = replace(plain, points=plain.points + bow)
+    seen, moved = Scan.of(bent), bow[bent.subsample(10_000)][:, :, None]
+    pose = register(seen, nominal("pot"), Prior(TRUE, BOARD)).base_from_surface
+    assert dissent(seen, pose, nominal("pot"), TOLERANCE).excess > 0.5
+    assert dissent(seen, pose, nominal("pot"), TOLERANCE, moved).excess < 0.05
+
+
+def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:
+    for seed in (0, 2, 4, 12):
+        judged = judge_case("worn 0.3 to 2 mm on one side", seed)
+        assert judged.ended == "refused"
+        assert "the parts of the surface do not agree" in judged.reason
+
+
+@pytest.mark.parametrize(("part", "seed"), [("seat", 1), ("seat", 30), ("pot", 6)])
+def test_starts_that_mislead_a_search_with_few_points_lead_to_the_true_pose(part: str, seed: int) -> None:
+    for outcome in task(part, seed, peers=False):
+        assert outcome.error[0] < 5e-5, outcome
+        assert outcome.error[1] < 2e-3, outcome
