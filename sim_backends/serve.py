@@ -17,6 +17,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sim_backends.faults import (
     ARM_FAULTS,
     CAMERA_FAULTS,
@@ -27,7 +30,7 @@ from sim_backends.faults import (
 )
 from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
-from sim_backends.peers.rtde import RtdePeer
+from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
 from sim_backends.world.hardware import camera_spec
@@ -48,6 +51,22 @@ class _Peer(Protocol):
 
 P = TypeVar("P", bound=_Peer)
 
+ARM_LAG = 0.2
+"""Seconds on the wall that a picture waits for the arm's model at most."""
+
+
+def picture(world: World, camera: str, t_mid: float, exposure: float) -> NDArray[np.uint8]:
+    """As `World.render`, once the arm's model has come to `t_mid`.
+
+    On a busy machine it lags behind the clock by some ticks, and a moving camera would be shown where it was before. An
+    arm that does not come is not waited for longer than `ARM_LAG`.
+    """
+    clock, waited = world.clock, 0.0
+    while world.arm.time < t_mid and waited < ARM_LAG:
+        clock.sleep(PERIOD * clock.speed)
+        waited += PERIOD
+    return world.render(camera, t_mid, exposure)
+
 
 class ServedCell:
     """A world and its peers; use it as a context manager, or call `start` and `stop`."""
@@ -63,7 +82,7 @@ class ServedCell:
             self._cameras = {
                 name: _bound(
                     bound,
-                    FramePeer(f"{name}_camera", clock, partial(world.render, name), camera_spec(world.scene, name)),
+                    FramePeer(f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)),
                 )
                 for name in ("scan", "target")
             }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -22,10 +23,11 @@ from cell.inversion.correspondences import Scan
 from cell.inversion.motions import name as motion_name
 from cell.inversion.motions import sorted_out
 from cell.inversion.registration import register
-from cell.reconstruction import Cloud
+from cell.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Height = Callable[[Array, Array], Array]
 
 SIGMA = 40e-6
@@ -260,6 +262,35 @@ def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
         seen += np.outer(step, step)
     unit = np.sqrt(np.maximum(np.diag(seen), 1e-14))
     assert np.abs((stated.systematic - seen) / np.outer(unit, unit))[:3, :3].max() < 0.1
+
+
+def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
+    """Two strips that overlap by 8 mm, the second one 35 µm too high and 20 µm aside, as the arm's rest leaves them."""
+    error, sigma = np.array([2e-5, -1.5e-5, 3.5e-5]), 3e-5
+    strips = []
+    for seed, side in ((2, 1.0), (3, -1.0)):
+        strip = scanned(freeform, seed, outliers=0.0, sigma=1e-5)
+        across = ((strip.points - TRUE.translation) @ TRUE.rotation)[:, :, 1]
+        strip.points[side * across > 0.004] = np.nan
+        strips.append(replace(strip, flanges=np.tile(np.eye(4), (len(strip.points), 1, 1))))
+    strips[1].points[:] += error
+    cloud, prior = merge(strips), Prior(TRUE, BOARD)
+
+    def sweeps(lines: Indices, rows: Indices) -> Array:
+        moved = np.zeros((len(lines), 3, 6))
+        for k in range(2):
+            moved[cloud.sweeps[lines] == k, :, 3 * k : 3 * k + 3] = sigma * np.eye(3)
+        return moved
+
+    as_they_lie = inverted(freeform, cloud, prior)
+    told_apart = inverted(freeform, cloud, prior, sweeps=sweeps)
+    assert np.linalg.norm(difference(as_they_lie.base_from_surface, TRUE)[3:]) > 5e-4
+    off = difference(told_apart.base_from_surface, TRUE)
+    assert np.abs(off[:3] - error / 2).max() < 8e-6
+    assert np.abs(off[3:]).max() < 1.6e-4
+    # The mean of two independent errors is what remains.
+    assert told_apart.sigma[:3] == pytest.approx([sigma / np.sqrt(2)] * 3, rel=0.05)
+    assert told_apart.sigma[3:].max() < 1e-4
 
 
 # --- what cannot be known ---

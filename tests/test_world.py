@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sim_backends import serve
 from sim_backends.clock import WorldClock
 from sim_backends.history import History, interpolate
 from sim_backends.world import nominal
@@ -179,7 +181,7 @@ def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
     return made
 
 
-@pytest.mark.parametrize("name", ["pot", "seat"])
+@pytest.mark.parametrize("name", ["pot", "seat", "panel"])
 def test_no_force_before_contact_and_stiffness_times_depth_after(name: str) -> None:
     part, target = contact(name, lean=(0.0, 0.0, 0.0))
     assert not part.wrench(flange_for(raised(target, dz=1e-4))).any()
@@ -391,3 +393,30 @@ def test_truth_is_complete_json_and_consistent() -> None:
     assert told["part"]["held"]
     assert not told["laser_on"]
     assert told["vehicle"]["stopped"]
+
+
+# --- a picture of a moving camera ---
+
+
+class Late:
+    """As much of a world as serving a picture takes: its arm's model lags behind and comes on while one waits."""
+
+    def __init__(self, time: float, gain: float) -> None:
+        self.arm = SimpleNamespace(time=time)
+        self.clock = SimpleNamespace(speed=2.0, sleep=self._sleep)
+        self._gain = gain
+
+    def _sleep(self, seconds: float) -> None:
+        self.arm.time += self._gain * seconds
+
+    def render(self, camera: str, t_mid: float, exposure: float) -> float:
+        return float(self.arm.time)
+
+
+def test_a_picture_waits_for_the_arm_to_come_to_its_exposure() -> None:
+    shown = serve.picture(Late(0.985, 1.0), "scan", 1.0, 0.002)
+    assert 1.0 <= shown < 1.0 + 2 * serve.PERIOD * 2.0
+
+
+def test_a_picture_does_not_wait_for_ever() -> None:
+    assert serve.picture(Late(0.5, 0.0), "scan", 1.0, 0.002) == 0.5

@@ -105,6 +105,7 @@ def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSur
     scan = scan_errors(record, nominal, record.kinematic)
     assert scan is not None
     expected = expect(record, config, job, nominal)
+    made["seams"] = [seam.as_dict() for seam in record.results["reconstruct"].seams]
     made |= {name: _mm(getattr(scan, name)) for name in ("scan", "aligned", "own", "absolute")}
     made["bound"] = {
         "sensor": 1e3 * expected.sensor_m,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -83,10 +83,24 @@ def print_report(report: Mapping[str, Any], folder: str) -> None:
         shown = "" if duration is None else f"{duration:.2f}"
         steps.add_row(row["name"], row["state"], shown, str(row.get("retries", "")))
     console.print(steps)
+    if seams := (report.get("scan") or {}).get("seams"):
+        _print_seams(console, seams)
     if (truth := report.get("truth")) is not None:
         _print_error(console, truth)
         _print_noise(console, report["assumed_noise"])
     console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+
+
+def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
+    table = Table(title="how far sweeps lie apart where they overlap, in mm")
+    table.add_column("sweeps")
+    for name in ("points", "mean", "expected ±", "rms", "expected", "95 % below"):
+        table.add_column(name, justify="right")
+    for seam in seams:
+        values = (seam[f"{key}_mm"] for key in ("mean", "expected_mean", "rms", "expected_rms", "p95"))
+        first, second = (str(number + 1) for number in seam["sweeps"])
+        table.add_row(f"{first} and {second}", str(seam["points"]), *(f"{value:.4f}" for value in values))
+    console.print(table)
 
 
 def _print_error(console: Console, truth: Mapping[str, Any]) -> None:

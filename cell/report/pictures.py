@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,19 @@ def run_picture(
     cloud: tuple[Vector, Vector] | None,
     truth: dict[str, Any] | None,
     title: str,
+    seams: Sequence[dict[str, Any]] = (),
 ) -> None:
     """Draw what a run has: parts that it did not get to are left out, with a word in their place.
 
     `stripe` is a frame with the rows and the centres in px of its stripe; `cloud` is points (n, 3) in the surface's
-    frame in m with their signed deviations (n,) from the nominal surface in m; `truth` is the report's part of that
-    name.
+    frame in m with their signed deviations (n,) from the nominal surface in m; `truth` and `seams` are the report's
+    parts of these names.
     """
     figure = Figure(figsize=(16, 5.2), dpi=110, layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(1, 3, width_ratios=[1.15, 1.25, 1.0])
     _stripe(axes[0], stripe)
-    _cloud(figure, axes[1], cloud)
+    _cloud(figure, axes[1], cloud, seams)
     _bars(axes[2], truth)
     figure.savefig(path)
 
@@ -50,8 +52,9 @@ def _stripe(axes: Axes, stripe: tuple[Image, Vector, Vector] | None) -> None:
     axes.set_ylabel("row in px")
 
 
-def _cloud(figure: Figure, axes: Axes, cloud: tuple[Vector, Vector] | None) -> None:
-    axes.set_title("cloud, coloured by its deviation from the nominal surface")
+def _cloud(figure: Figure, axes: Axes, cloud: tuple[Vector, Vector] | None, seams: Sequence[dict[str, Any]]) -> None:
+    told = [seam_words(seam) for seam in seams]
+    axes.set_title("\n".join(["cloud, coloured by its deviation from the nominal surface", *told]), fontsize="medium")
     if cloud is None or len(cloud[0]) == 0:
         _empty(axes, "no cloud")
         return
@@ -66,6 +69,15 @@ def _cloud(figure: Figure, axes: Axes, cloud: tuple[Vector, Vector] | None) -> N
     axes.set_xlabel("x along the sweep in mm")
     axes.set_ylabel("y in mm")
     figure.colorbar(shown, ax=axes, label="deviation in mm", shrink=0.8)
+
+
+def seam_words(seam: dict[str, Any]) -> str:
+    """One of the report's seams in a line."""
+    first, second = (number + 1 for number in seam["sweeps"])
+    return (
+        f"sweep {second} on sweep {first}: mean {seam['mean_mm']:+.3f} mm (expected ± {seam['expected_mean_mm']:.3f}), "
+        f"rms {seam['rms_mm']:.3f} mm (expected {seam['expected_rms_mm']:.3f})"
+    )
 
 
 def _bars(axes: Axes, truth: dict[str, Any] | None) -> None:

@@ -129,7 +129,9 @@ def _add_truth(
         return
     report["truth"] = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
-    report["truth"]["bound_mm"] = expected_error(job, nominal, pose, sweep.base_from_flange, repeatability, now)
+    report["truth"]["bound_mm"] = expected_error(
+        job, nominal, pose, sweep.base_from_flange, len(sweep.swaths), repeatability, now
+    )
     if isinstance(made, Reconstruction) and witness.at_sweep is not None:
         report["truth"]["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
 
@@ -150,4 +152,5 @@ def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, re
     title = f"run {report['run']}: job {job.job.name}, {report['outcome']}"
     if report["simulated"]:
         title += f" · simulated, seed {report['seed']}, level {report['level']}"
-    run_picture(folder / "picture.png", stripe=stripe, cloud=cloud, truth=report["truth"], title=title)
+    seams = (report["scan"] or {}).get("seams", ())
+    run_picture(folder / "picture.png", stripe=stripe, cloud=cloud, truth=report["truth"], title=title, seams=seams)

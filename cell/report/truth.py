@@ -106,14 +106,16 @@ def expected_error(
     nominal: NominalSurface,
     pose: PlacePose,
     base_from_sweep_flange: pin.SE3,
+    sweeps: int,
     configured: Vector,
     truth: dict[str, Any],
 ) -> float:
     """Mean D in mm over the 45 points to expect from the world's assumed noise.
 
-    Stripe, rail and calibration as the pose's covariance states them; the arm's repeatability, once for the sweep and
-    once for placing, as the world assumes it instead of the `configured` (6, 6) that the covariance was stated with.
-    The arm's kinematic error is in it as configured, which is part of the pose's covariance.
+    Stripe, rail and calibration as the pose's covariance states them; the arm's repeatability, once for each of the
+    `sweeps`, whose mean counts, and once for placing, as the world assumes it instead of the `configured` (6, 6) that
+    the covariance was stated with. The arm's kinematic error is in it as configured, which is part of the pose's
+    covariance.
     """
     sigma = {
         name: truth["assumed_noise"][name]["sigma"] for name in ("arm_repeatability", "arm_repeatability_rotation")
@@ -126,7 +128,7 @@ def expected_error(
     by_pose = _jacobians(points - pose.base_from_surface.translation)
     by_sweep = _jacobians(points - base_from_sweep_flange.translation)
     by_placing = _jacobians(points - place_flange.translation)
-    covariance = _through(by_pose, pose.covariance) + _through(by_sweep, assumed - configured)
+    covariance = _through(by_pose, pose.covariance) + _through(by_sweep, (assumed - configured) / sweeps)
     values, vectors = np.linalg.eigh(covariance + _through(by_placing, assumed))
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     draws = np.random.default_rng(0).standard_normal((2000, 1, 3, 1))

@@ -114,8 +114,9 @@ def _panel(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     gy = 4.8 * y + 1.2 * x - 0.015
     for nx, ny, offset, rise, width in _BEADS:
         along = (nx * x + ny * y - offset) / width
-        up = rise / np.cosh(along) ** 2
-        slope = -2.0 * up * np.tanh(along) / width
+        s = np.tanh(along)
+        up = rise * (1.0 - s * s)
+        slope = -2.0 * up * s / width
         h, gx, gy = h + up, gx + slope * nx, gy + slope * ny
     return h, gx, gy
 
