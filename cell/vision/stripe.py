@@ -34,7 +34,7 @@ Axis = Literal["rows", "columns"]
 
 ASSUMED_SPECKLE = 0.15, 0.7
 """Contrast and grain in px where a picture shows too few lines to measure them."""
-SPECKLE_LINES = 128
+SPECKLE_LINES = 64
 NO_LAGS = np.zeros(0, np.float32)
 # Propagation is linear in the speckle's contrast C; what it leaves out grows as C⁴, and was taken from simulation.
 SECOND_ORDER = 3.0
