@@ -13,7 +13,8 @@ import numpy as np
 
 from cell.geometry.poses import difference, perturbed
 from cell.inversion.closest import Array
-from cell.inversion.registration import Prior, Registration, Scan, by_lines
+from cell.inversion.correspondences import Scan
+from cell.inversion.registration import Prior, Registration, by_lines
 
 
 def balance(found: Registration, scan: Scan, moved: Array, prior: Prior) -> Registration:
