@@ -34,7 +34,7 @@ Axis = Literal["rows", "columns"]
 
 ASSUMED_CONTRAST = 0.15
 """Of the speckle where a picture shows too few lines to measure it."""
-SPECKLE_PAIRS = 48
+SPECKLE_PAIRS = 128
 NO_LAGS = np.zeros(0, np.float32)
 # Propagation is linear in the speckle's contrast C; what it leaves out grows as C⁴, and was taken from simulation.
 SECOND_ORDER = 3.0

@@ -22,8 +22,6 @@ SEARCH = 12
 # What is elsewhere in the line competes for being the stripe from this share of the first peak's height on.
 RIVAL = 0.15
 TRIES = 3
-# Windows are padded to a multiple of this, which the vector unit takes without a remainder.
-PADDED = 32
 
 
 @compiled_fast
