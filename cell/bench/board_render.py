@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.compiled import compiled
 from cell.geometry.camera import Array
 from cell.vision.board_spec import BoardSpec
 
@@ -124,7 +124,7 @@ def _markers(spec: BoardSpec) -> NDArray[np.uint8]:
     return np.array([cv2.aruco.generateImageMarker(dictionary, k, cells) // 255 for k in range(count)], dtype=np.uint8)
 
 
-@numba.njit(cache=True)
+@compiled
 def _shade(
     x: float, y: float, shape: NDArray[np.int64], size: Array, markers: NDArray[np.uint8]
 ) -> float:  # pragma: no cover
@@ -172,7 +172,7 @@ def _shade(
     return float(black)
 
 
-@numba.njit(cache=True)
+@compiled
 def _paint(
     image: NDArray[np.float32],
     ray_x: Array,

@@ -5,10 +5,11 @@ A look-up and a few triangles replace a tree search for every point. The grid al
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from cell.compiled import compiled
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -58,7 +59,7 @@ class Walk:
         self.start = np.searchsorted(self.corner_of.ravel()[order], np.arange(merged.max() + 2)).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def closest(
     points: Array,
     low: Array,
@@ -99,7 +100,7 @@ def closest(
     return feet, hit
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def to_triangle(p: Array, corners: Array, t: int, foot: Array, weights: Array) -> float:
     """Squared distance (m²) of `p` from triangle `t`; fills `foot` (3,) and its barycentric `weights` (3,).
 

@@ -6,11 +6,11 @@ of such shifts and turns; all of them are tried against the coarse distance fiel
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from cell.compiled import compiled_fast
 from cell.inversion.closest import Array
 from cell.inversion.nominal import NominalSurface
 
@@ -60,7 +60,7 @@ def candidates(
     return poses
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@compiled_fast
 def _scores(
     points: Array, turns: Array, steps: Array, sides: Array, offset: Array, cell: float, distance: NDArray[np.float32]
 ) -> Array:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from cell.compiled import compiled
 from cell.reconstruction.cloud import Array, Cloud, Filled, Indices
 
 LARGEST = 0.0015
@@ -91,7 +91,7 @@ def _cells(measured: NDArray[np.bool_], steps: tuple[float, float], largest: flo
     return np.asarray(np.column_stack([lines, rows, half[label - 1]])[fits], dtype=np.intp)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _interpolate(
     points: Array, spread: NDArray[np.float32], measured: NDArray[np.bool_], cells: Indices
 ) -> tuple[Array, Array, Array]:
@@ -167,13 +167,13 @@ def _interpolate(
     return made, variances, ways
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _along(point: Array, origin: Array, way: Array) -> float:
     """How far `point` lies from `origin` along `way`."""
     return float((point[0] - origin[0]) * way[0] + (point[1] - origin[1]) * way[1] + (point[2] - origin[2]) * way[2])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _weigh(spread: NDArray[np.float32], u: float, v: float, basis: Array) -> float:
     """1/σ² of a point, σ at least a nanometre, and in `basis` (6,) the quadratic's terms at its place."""
     basis[0], basis[1], basis[2], basis[3], basis[4], basis[5] = 1.0, u, v, u * u, u * v, v * v

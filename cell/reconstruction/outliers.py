@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import threading
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from cell.compiled import compiled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,7 +78,7 @@ def _level(values: Array, noise: Array) -> float:
     return max(LEAST_LEVEL, float(np.median(np.abs(found)))) if len(found) else 1.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sort(buffer: Array, count: int) -> None:
     """Sort the first `count` values of `buffer` in place, by insertion: they are few."""
     for i in range(1, count):
@@ -88,14 +89,14 @@ def _sort(buffer: Array, count: int) -> None:
         buffer[j + 1] = value
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _median(buffer: Array, count: int) -> float:
     """Median of the first `count` values of `buffer`, which are sorted in place."""
     _sort(buffer, count)
     return float(0.5 * (buffer[(count - 1) // 2] + buffer[count // 2]))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _gather(values: Array, line: int, row: int, buffer: Array) -> int:
     """The finite values of the 5×5 window around (line, row), without its middle, into `buffer`; their number."""
     count = 0
@@ -108,7 +109,7 @@ def _gather(values: Array, line: int, row: int, buffer: Array) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _gather_pairs(values: Array, line: int, row: int, buffer: Array) -> int:
     """What a slope through the neighbours says of (line, row), into `buffer`; the number of such values.
 
@@ -138,7 +139,7 @@ def _gather_pairs(values: Array, line: int, row: int, buffer: Array) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _at(values: Array, line: int, row: int) -> float:
     """The value there, NaN beyond the border."""
     if 0 <= line < values.shape[0] and 0 <= row < values.shape[1]:
@@ -146,7 +147,7 @@ def _at(values: Array, line: int, row: int) -> float:
     return np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _deviation(values: Array, kept: Array, noise: Array, line: int, row: int, buffer: Array) -> float:
     """How far a value lies off the kept ones around it, in units of its noise; NaN where too few are around.
 
@@ -166,7 +167,7 @@ def _deviation(values: Array, kept: Array, noise: Array, line: int, row: int, bu
     return float(off / noise[line, row])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sampled(values: Array, noise: Array, stride: int) -> Array:
     """Deviations of every `stride`-th place."""
     result = np.full((values.shape[0] // stride + 1, values.shape[1] // stride + 1), np.nan)
@@ -178,7 +179,7 @@ def _sampled(values: Array, noise: Array, stride: int) -> Array:
     return result
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _supported(values: Array, kept: Array, reach: float, line: int, row: int, buffer: Array) -> bool:
     """True when over half of the neighbours, or of their pairs, lie within `reach`: then so does their median."""
     value = values[line, row]
@@ -193,10 +194,10 @@ def _supported(values: Array, kept: Array, reach: float, line: int, row: int, bu
     near = 0
     for k in range(count):
         near += abs(buffer[k] - value) <= reach
-    return count >= LEAST_NEIGHBOURS and 2 * near > count
+    return bool(count >= LEAST_NEIGHBOURS and 2 * near > count)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _quiet_around(values: Array, kept: Array, noise: Array, most: float, line: int, row: int, buffer: Array) -> bool:
     """True when the lower quartile of the deviations around is surely less than `most`: counted without a sort."""
     present, near = 0, 0
@@ -212,7 +213,7 @@ def _quiet_around(values: Array, kept: Array, noise: Array, most: float, line: i
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _judge(
     values: Array, kept: Array, noise: Array, level: float, first: int, last: int, supported: Mask, outliers: Mask
 ) -> None:

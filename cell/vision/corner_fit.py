@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.compiled import compiled
 from cell.geometry.camera import Array
 from cell.vision.pictures import Image
 
@@ -52,7 +52,7 @@ def fit_corners(
     return places, sigma, contrast
 
 
-@numba.njit(cache=True)
+@compiled
 def _fit(
     image: Image,
     starts: Array,
@@ -75,7 +75,7 @@ def _fit(
         _one(image, starts[n], reach, angle_1, angle_2, dark_first[n], n, places, sigma, contrast)
 
 
-@numba.njit(cache=True)
+@compiled
 def _one(
     image: Image,
     start: Array,
@@ -192,7 +192,7 @@ def _one(
     contrast[n] = 2 * abs(best[7])
 
 
-@numba.njit(cache=True)
+@compiled
 def _model(p: Array, u: float, v: float, row: Array) -> float:  # pragma: no cover
     """Grey value at (u, v) px from the middle of the window; its derivatives by the parameters go into `row`."""
     c1, s1, c2, s2 = math.cos(p[2]), math.sin(p[2]), math.cos(p[3]), math.sin(p[3])
@@ -210,7 +210,7 @@ def _model(p: Array, u: float, v: float, row: Array) -> float:  # pragma: no cov
     return float(light * pattern)
 
 
-@numba.njit(cache=True)
+@compiled
 def _deviation(
     p: Array, du: Array, dv: Array, grey: Array, used: NDArray[np.bool_], limit: float
 ) -> float:  # pragma: no cover

@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision import compiled, stripe_numpy
+from cell import compiled
 from cell.vision import stripe_find as find
 from cell.vision import stripe_fit as fit
+from cell.vision import stripe_numpy
 from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe_belief import believe
 from cell.vision.stripe_methods import METHODS

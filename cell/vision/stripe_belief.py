@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.vision.compiled import compiled
+from cell.compiled import compiled
 from cell.vision.stripe_find import CENTRE
 from cell.vision.stripe_fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, WIDTH
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from cell.compiled import compiled, compiled_fast
 from cell.vision import stripe_lanes as lane
-from cell.vision.compiled import compiled, compiled_fast
 from cell.vision.stripe_find import BACKGROUND, CENTRE, CORE, HEIGHT
 from cell.vision.stripe_lanes import HALF, LANES, MIDDLE, ROWS
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.compiled import compiled
+from cell.compiled import compiled
 from cell.vision.stripe_find import CENTRE, ENERGY, WIDTH
 
 Array = NDArray[np.float64]

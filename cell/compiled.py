@@ -1,7 +1,7 @@
-"""How the hot loops of this package are compiled, and whether they can be.
+"""How the hot loops of the cell are compiled, and whether they can be.
 
 Where numba is missing, broken or switched off, `AVAILABLE` is False, `compiled` leaves functions as they are, and
-`stripe.py` takes the numpy way, which is said once.
+`cell.vision.stripe` takes the numpy way. That is enough to look at pictures, not to run a job, and is said once.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ except Exception as error:  # A numba that does not fit the installed numpy or L
     _reason = f"{type(error).__name__}: {error}"
 if not AVAILABLE:
     warnings.warn(
-        f"numba cannot compile here ({_reason}): stripes are extracted about ten times slower, and a sweep may lose "
-        "frames. Reinstall numba, or lower scan.frame_rate",
+        f"numba cannot compile here ({_reason}): stripes are extracted some twenty times slower and clouds are made "
+        "some hundred times slower, so that a job's steps run past their deadlines. Reinstall numba",
         RuntimeWarning,
         stacklevel=2,
     )
