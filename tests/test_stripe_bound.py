@@ -89,6 +89,18 @@ def test_where_a_reflection_is_brighter_the_neighbours_say_which_is_the_stripe()
     assert profile.double[20:240:12].all()
 
 
+def test_peaks_that_jump_from_line_to_line_have_a_centre_and_a_deviation():
+    rng = np.random.default_rng(0)
+    column = np.arange(640)
+    centres = 20.0 + (97 * np.arange(400)) % 600
+    light = 8 + 120 * np.exp(-0.5 * ((column - centres[:, None]) / 1.3) ** 2)
+    image = np.clip(rng.normal(light * rng.lognormal(0, 0.2, light.shape), 1), 0, 255).astype(np.uint8)
+    profile = extract(image)
+    assert profile.valid.mean() > 0.9
+    assert np.sqrt(np.nanmean((profile.centres - centres) ** 2)) < 0.2
+    assert np.nanmin(profile.sigma) > 0.01
+
+
 def test_a_blinded_picture_is_refused():
     with pytest.raises(PictureRefused, match="saturated"):
         extract(np.full((480, 640), 255, np.uint8))

@@ -28,7 +28,7 @@ CORE = 2.0
 LEAST_PAIRS = 8
 PHASES = 8
 ASSUMED_GRAIN = 0.7
-"""Grain in px where no speckle shows."""
+"""Grain in px where none shows: no speckle, or lines that have no column in common."""
 # Speckle below this share of the photon noise's variance at the peak, or not above its own uncertainty, is none.
 NEGLIGIBLE, SIGNIFICANT = 0.05, 3.0
 
@@ -169,9 +169,11 @@ def measure_speckle(
     excess = seen.power - float(expected[0])
     if excess < SIGNIFICANT * seen.scatter / sqrt(seen.pairs):
         return 0.0, ASSUMED_GRAIN, seen.width
-    # Of the power in the columns that both lines share, speckle has the share that it has of all.
-    correlated = min(max(seen.product * seen.power / (seen.shared * excess), LEAST_CORRELATED), MOST_CORRELATED)
-    grain = sqrt(-0.25 / log(correlated))
+    grain = ASSUMED_GRAIN
+    if seen.shared > 0:
+        # Of the power in the columns that both lines share, speckle has the share that it has of all.
+        correlated = seen.product * seen.power / (seen.shared * excess)
+        grain = sqrt(-0.25 / log(min(max(correlated, LEAST_CORRELATED), MOST_CORRELATED)))
     contrast2 = excess / float(np.interp(grain, GRAINS, expected[1:]))
     peak_noise = noise2 + gain * (seen.amplitude + max(seen.level, 0.0))
     if contrast2 * seen.amplitude**2 < NEGLIGIBLE * peak_noise:
