@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sim_backends import serve
-from sim_backends.clock import WorldClock
+from sim_backends.clock import SteppedClock, WorldClock
 from sim_backends.history import History, interpolate
 from sim_backends.world import nominal
 from sim_backends.world.contact import STIFFNESS, PartContact
@@ -398,25 +397,33 @@ def test_truth_is_complete_json_and_consistent() -> None:
 # --- a picture of a moving camera ---
 
 
-class Late:
-    """As much of a world as serving a picture takes: its arm's model lags behind and comes on while one waits."""
+class LaggingClock(SteppedClock):
+    """World time that passes while somebody sleeps; the arm's model of `world` follows it by `lag` s."""
 
-    def __init__(self, time: float, gain: float) -> None:
-        self.arm = SimpleNamespace(time=time)
-        self.clock = SimpleNamespace(speed=2.0, sleep=self._sleep)
-        self._gain = gain
+    world: World | None = None
+    lag = 0.0
 
-    def _sleep(self, seconds: float) -> None:
-        self.arm.time += self._gain * seconds
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        assert self.world is not None
+        self.world.arm.tick(self.now() - self.lag)
 
-    def render(self, camera: str, t_mid: float, exposure: float) -> float:
-        return float(self.arm.time)
+
+def lagging(lag: float) -> World:
+    clock = LaggingClock()
+    world = World(seed=1, level="nominal", clock=clock)
+    clock.world, clock.lag = world, lag
+    clock.step_to(1.0)
+    return world
 
 
 def test_a_picture_waits_for_the_arm_to_come_to_its_exposure() -> None:
-    shown = serve.picture(Late(0.985, 1.0), "scan", 1.0, 0.002)
-    assert 1.0 <= shown < 1.0 + 2 * serve.PERIOD * 2.0
+    world = lagging(0.015)
+    assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
+    assert 1.0 <= world.arm.time < 1.0 + 2 * serve.PERIOD
 
 
 def test_a_picture_does_not_wait_for_ever() -> None:
-    assert serve.picture(Late(0.5, 0.0), "scan", 1.0, 0.002) == 0.5
+    world = lagging(5.0)
+    assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
+    assert world.clock.now() == pytest.approx(1.0 + serve.ARM_LAG, abs=2 * serve.PERIOD)
