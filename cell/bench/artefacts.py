@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cell.geometry.poses import from_axes, from_parts
 from cell.paper.rig import RigSpec, TrueHead
 from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry
-from cell.vision import extract
+from cell.vision import StripeStream
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, SceneObject, render
 
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ def _scan(
     readings: Array,
     rng: np.random.Generator,
 ) -> Cloud:
-    builder = ProfileBuilder(geometry, len(readings))
+    builder, stripes = ProfileBuilder(geometry, len(readings)), StripeStream()
     for reading in readings:
         scene: list[SceneObject] = []
         for pose, mesh in objects:
@@ -135,5 +135,5 @@ def _scan(
             scene.append(PlaneInstance(seen, FLAT, ALBEDO) if mesh is None else MeshInstance(seen, mesh, ALBEDO))
         frame = render(head.optics, scene, head.laser, EXPOSURE, rng)
         measured = float(reading + spec.noise.rail * rng.standard_normal())
-        builder.add(extract(frame), measured, spec.noise.rail)
+        builder.add(stripes.extract(frame), measured, spec.noise.rail)
     return builder.finish(from_axes((0, 0, 0), x=(1, 0, 0), z=(0, 0, 1)), least_points=100)

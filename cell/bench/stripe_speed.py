@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -15,13 +14,15 @@ from numpy.typing import NDArray
 from cell.bench.stripe_truth import Cell, draw
 from cell.vision.stripe import Method, StripeSettings, extract
 from cell.vision.stripe_methods import gaussian_derivatives
+from cell.vision.stripe_stream import StripeStream, extract_all
 
 SHAPE = (1024, 1280)
-FRAMES = 24
+FRAMES = 32
 CONDITION = Cell(2.0, 150.0)
 SPECKLED = Cell(2.0, 120.0, 0.2)
 
 Image = NDArray[np.uint8]
+Run = Callable[[list[Image]], Any]
 
 
 def compare(progress: Callable[[float, str], None], repeats: int = 5) -> dict[str, Any]:
@@ -34,57 +35,74 @@ def compare(progress: Callable[[float, str], None], repeats: int = 5) -> dict[st
     speckled = [draw(SPECKLED, SHAPE, seed)[0] for seed in range(FRAMES)]
     turned = [np.ascontiguousarray(image.T) for image in plain]
     known = StripeSettings(speckle_contrast=0.0)
-    candidates: list[tuple[str, Callable[[Image], Any], list[Image], int]] = [
-        ("reading each pixel once", lambda image: np.max(image), plain, 1),
-        ("ours, one core", extract, plain, 1),
-        ("ours, one core, speckle declared absent", lambda i: extract(i, settings=known), plain, 1),
-        ("ours, one core, speckle contrast 0.2", extract, speckled, 1),
-        ("ours, one core, along columns", lambda i: extract(i, axis="columns"), turned, 1),
-        ("ours, two cores", extract, plain, 2),
-        ("ours, two cores, speckle contrast 0.2", extract, speckled, 2),
-        ("ours, numpy engine", lambda i: extract(i, engine="numpy"), plain[:3], 1),
-        ("numpy centre of gravity", centre_of_gravity, plain[:8], 1),
-        ("OpenCV separable Steger", opencv_steger, plain[:3], 1),
-        ("our Steger, with peaks and sigmas", lambda i: extract(i, method=Method.STEGER), plain[:3], 1),
+    candidates: list[tuple[str, Run, list[Image]]] = [
+        ("reading each pixel once", _each(np.max), plain),
+        ("ours, a stream, one core", _stream, plain),
+        ("ours, a stream with speckle contrast 0.2, one core", _stream, speckled),
+        ("ours, a stream, two cores", _two_cores, plain),
+        ("ours, a stream with speckle contrast 0.2, two cores", _two_cores, speckled),
+        ("ours, single pictures", _each(extract), plain),
+        ("ours, single pictures with speckle contrast 0.2", _each(extract), speckled),
+        ("ours, single pictures, speckle declared absent", _each(lambda i: extract(i, settings=known)), plain),
+        ("ours, single pictures, along columns", _each(lambda i: extract(i, axis="columns")), turned),
+        ("ours, numpy engine", _each(lambda i: extract(i, engine="numpy")), plain[:3]),
+        ("numpy centre of gravity", _each(centre_of_gravity), plain[:8]),
+        ("OpenCV separable Steger", _each(opencv_steger), plain[:3]),
+        ("our Steger, with peaks and sigmas", _each(lambda i: extract(i, method=Method.STEGER)), plain[:3]),
     ]
     ridge = ridge_detector()
     if ridge is not None:
-        candidates.append(("ridge-detector", ridge, plain[:1], 1))
+        candidates.append(("ridge-detector", _each(ridge), plain[:1]))
     rows = []
     cv2_threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)
-        for k, (name, run, images, threads) in enumerate(candidates):
+        for k, (name, run, images) in enumerate(candidates):
             progress(k / len(candidates), name)
-            slow = len(images) < 4
-            seconds = _best(run, images, threads, 1 if slow else repeats)
+            seconds = _best(run, images, 1 if len(images) < 4 else repeats)
             lines = images[0].shape[1] if "columns" in name else images[0].shape[0]
             rows.append({"name": name, "ms_per_frame": 1e3 * seconds, "points_per_s": lines / seconds})
     finally:
         cv2.setNumThreads(cv2_threads)
     if ridge is None:
         rows.append({"name": "ridge-detector", "ms_per_frame": None, "points_per_s": None})
-    own = rows[1]["ms_per_frame"]
+    reading, own = rows[0]["ms_per_frame"], rows[1]["ms_per_frame"]
     for row in rows:
         row["times_ours"] = None if row["ms_per_frame"] is None else row["ms_per_frame"] / own
+        row["times_reading"] = None if row["ms_per_frame"] is None else row["ms_per_frame"] / reading
     progress(1.0, "speed done")
     return {"shape": list(SHAPE), "frames": FRAMES, "rows": rows}
 
 
-def _best(run: Callable[[Image], Any], images: list[Image], threads: int, repeats: int) -> float:
-    """Seconds a frame, best of some rounds after one to warm up."""
-    run(images[0])
+def _each(run: Callable[[Image], Any]) -> Run:
+    """One picture after the other, each by itself."""
+
+    def through(images: list[Image]) -> None:
+        for image in images:
+            run(image)
+
+    return through
+
+
+def _stream(images: list[Image]) -> None:
+    stream = StripeStream()
+    for image in images:
+        stream.extract(image)
+
+
+def _two_cores(images: list[Image]) -> None:
+    for _ in extract_all(images, threads=2):
+        pass
+
+
+def _best(run: Run, images: list[Image], repeats: int) -> float:
+    """Seconds a frame, best of some rounds after one picture to warm up."""
+    run(images[:1])
     best = np.inf
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in range(repeats):
-            begin = time.perf_counter()
-            if threads == 1:
-                for image in images:
-                    run(image)
-            else:
-                shares = [images[k::threads] for k in range(threads)]
-                list(pool.map(lambda share: [run(image) for image in share] and None, shares))
-            best = min(best, (time.perf_counter() - begin) / len(images))
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        run(images)
+        best = min(best, (time.perf_counter() - begin) / len(images))
     return float(best)
 
 

@@ -84,13 +84,14 @@ def _print(result: dict[str, Any]) -> None:
     if "speed" in result:
         height, width = result["speed"]["shape"]
         table = Table(title=f"speed at {width}×{height} px, {result['speed']['frames']} pictures streaming by")
-        for name in ("what", "ms/frame", "points/s", "times ours"):
+        for name in ("what", "ms/frame", "points/s", "times ours", "times reading"):
             table.add_column(name, justify="left" if name == "what" else "right")
         for row in result["speed"]["rows"]:
             if row["ms_per_frame"] is None:
-                table.add_row(row["name"], "not installed", "", "")
+                table.add_row(row["name"], "not installed", "", "", "")
                 continue
             table.add_row(
-                row["name"], f"{row['ms_per_frame']:.3f}", f"{row['points_per_s']:,.0f}", f"{row['times_ours']:.2f}"
-            )
+                row["name"], f"{row['ms_per_frame']:.3f}", f"{row['points_per_s']:,.0f}", f"{row['times_ours']:.2f}",
+                f"{row['times_reading']:.1f}",
+            )  # fmt: skip
         console.print(table)

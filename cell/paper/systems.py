@@ -22,7 +22,7 @@ from cell.paper.shapes import DENT_RADIUS, dented_plate, relief
 from cell.paper.solved import Solved, aligned, expected_length, in_scan_frame, point_covariances, solve
 from cell.paper.stitching import STATIONS, STEP, stitch
 from cell.reconstruction import ProfileBuilder
-from cell.vision import extract
+from cell.vision import StripeStream
 from sim_backends.optics import MeshInstance, render
 
 Array = NDArray[np.float64]
@@ -201,5 +201,5 @@ def points_per_second(spec: RigSpec) -> float:
 
 
 def _collect(spec: RigSpec, geometry: Any, frames: list[NDArray[np.uint8]]) -> int:
-    builder = ProfileBuilder(geometry, len(frames))
-    return sum(builder.add(extract(frame), 1e-3 * k, spec.noise.rail) for k, frame in enumerate(frames))
+    builder, stripes = ProfileBuilder(geometry, len(frames)), StripeStream()
+    return sum(builder.add(stripes.extract(frame), 1e-3 * k, spec.noise.rail) for k, frame in enumerate(frames))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cell.geometry.poses import from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
-from cell.vision import StripeProfile, extract
+from cell.vision import StripeProfile, StripeStream
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame, FrameStream, Vector
 
@@ -78,6 +78,7 @@ class Collector:
 
     def __post_init__(self) -> None:
         self.expected = self.scan.length / self.scan.speed * self.scan.frame_rate
+        self.stripes = StripeStream()
         self.builder = ProfileBuilder(self.geometry, int(1.3 * self.expected) + 32)
 
     def take(self, frames: FrameStream, ended: Callable[[], float | None]) -> None:
@@ -94,7 +95,7 @@ class Collector:
 
     def see(self, frame: Frame) -> None:
         """Triangulate the stripe of one frame."""
-        profile = extract(frame.image)
+        profile = self.stripes.extract(frame.image)
         if self.keep_profile is not None:
             self.keep_profile(profile)
         self.counts.append(self.builder.see(profile))

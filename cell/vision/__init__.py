@@ -5,6 +5,7 @@ from cell.vision.board_spec import BoardSpec, parse_board
 from cell.vision.board_view import BoardView
 from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
 from cell.vision.stripe import StripeProfile, StripeSettings, extract
+from cell.vision.stripe_stream import StripeStream
 
 __all__ = [
     "BoardPose",
@@ -14,6 +15,7 @@ __all__ = [
     "Reason",
     "StripeProfile",
     "StripeSettings",
+    "StripeStream",
     "board_pose",
     "check_picture",
     "extract",

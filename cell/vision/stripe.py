@@ -6,9 +6,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 from math import sqrt
@@ -21,13 +18,13 @@ from numpy.typing import NDArray
 from cell import compiled
 from cell.vision import stripe_find as find
 from cell.vision import stripe_fit as fit
-from cell.vision import stripe_numpy
+from cell.vision import stripe_numpy, stripe_search
 from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe_belief import believe
 from cell.vision.stripe_methods import METHODS
 from cell.vision.stripe_noise import pixel_noise
-from cell.vision.stripe_rivals import choose, smooth_widths
-from cell.vision.stripe_speckle import ASSUMED_GRAIN, correlation, measure_speckle
+from cell.vision.stripe_rivals import choose, survey
+from cell.vision.stripe_speckle import ASSUMED_GRAIN, Speckle, correlation, measure_speckle, neighbours
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -78,7 +75,8 @@ class StripeProfile:
 
     `centres` and `sigma` (one standard deviation of the centre) in px, `amplitude` in DN (of the fitted peak, above the
     sensor's range in `saturated` rows), `width` the stripe's σ in px. `double` marks rows with a second peak of
-    comparable energy: the one nearer to where the neighbours' stripe runs was taken, else the stronger.
+    comparable energy: the one nearer to where the neighbours' stripe runs was taken, else the stronger. `speckle` is
+    what the deviations were made with; None where it was assumed, for too few lines show any, or declared.
     """
 
     axis: Axis
@@ -88,6 +86,7 @@ class StripeProfile:
     width: Array
     saturated: NDArray[np.bool_]
     double: NDArray[np.bool_]
+    speckle: Speckle | None = None
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -114,12 +113,15 @@ def extract(
     *,
     method: Method | str = Method.MAXIMUM_LIKELIHOOD,
     engine: Literal["auto", "compiled", "numpy"] = "auto",
+    speckle: Speckle | None = None,
 ) -> StripeProfile:
     """Stripe centres of an 8-bit image (h, w), one per row (or per column with axis "columns").
 
     `dark` (h, w) is a frame of the same view without the laser and is subtracted; its noise counts. `engine` "numpy"
-    does without the compiler, as "auto" does where there is none. Raises ValueError for an image of another type, a
-    dark frame of another size or an unknown method, `PictureRefused` for a picture that is blinded.
+    does without the compiler, as "auto" does where there is none. `speckle` is what an earlier picture of the same
+    scene showed (its profile's); None: measured in this one, where the settings do not declare it. Raises ValueError
+    for an image of another type, a dark frame of another size or an unknown method, `PictureRefused` for a picture that
+    is blinded.
     """
     settings = settings or StripeSettings()
     method = Method(method)
@@ -127,38 +129,35 @@ def extract(
     if engine == "compiled" and not compiled.AVAILABLE:
         raise ValueError('engine "compiled": numba is missing or switched off here; take "numpy" or "auto"')
     quick = compiled.AVAILABLE and engine != "numpy"
-    work, shade = (_lines(part, axis) for part in (image, dark))
+    work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
     noise2, whole = pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
-    (find if quick else stripe_numpy).find_lines(work, seen, shade, settings.saturation_dn, least, start)
-    found = np.flatnonzero(start[:, 0, find.ENERGY])
+    search = (stripe_search if quick else stripe_numpy).find_lines
+    several = search(work, seen, shade, settings.saturation_dn, least, start)
+    double = choose(start) if several else np.zeros(len(start), np.bool_)
+    low, high = settings.width_range_px
+    found, widths = survey(start, low, high)
     _refuse_blinded(image, start, found, settings.saturation_dn)
-    double = choose(start)
     fitted = np.full((fit.FITTED, len(work)), np.nan)
-    widths = smooth_widths(start, settings.width_range_px)
     gain, frames = settings.gain_dn, settings.dark_frames
     of_dark = (0.0, 0.0) if dark is None else (noise2 / frames, gain * (1 + 1 / frames))
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
         (fit if quick else stripe_numpy).fit_lines(
-            work, shade, start, widths, which, settings.saturation_dn, (noise2, gain, contrast), of_dark, rho,
-            settings.steps, fitted,
+            work, shade, start, widths, np.log(widths), which, settings.saturation_dn, (noise2, gain, contrast),
+            of_dark, rho, settings.steps, fitted,
         )  # fmt: skip
 
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
     if contrast is None or (contrast > 0 and grain is None):
-        clear = found[(start[found, 0, find.CORE] == 0) & ~double[found]]
-        pairs = clear[:-1][np.diff(clear) == 1]
-        pairs = pairs[:: max(1, len(pairs) // SPECKLE_PAIRS)]
-        run(np.concatenate([pairs, pairs + 1]), ASSUMED_CONTRAST, NO_LAGS)
-        measured = measure_speckle(work, shade, pairs, fitted, noise2, gain, ASSUMED_CONTRAST)
-        if measured is not None:
-            # Peaks are chosen for being bright, so that speckle makes their start widths too small.
-            ratio = measured[2] / np.mean(widths[pairs])
-            np.clip(widths * min(max(ratio, 0.5), 2.0), *settings.width_range_px, out=widths)
-        seen_contrast, seen_grain = (ASSUMED_CONTRAST, ASSUMED_GRAIN) if measured is None else measured[:2]
+        if speckle is None:
+            pairs = neighbours(start, double, SPECKLE_PAIRS)
+            run(np.concatenate([pairs, pairs + 1]), ASSUMED_CONTRAST, NO_LAGS)
+            speckle = measure_speckle(work, shade, pairs, widths, fitted, noise2, gain, ASSUMED_CONTRAST)
+        seen_contrast, seen_grain, widening = speckle or (ASSUMED_CONTRAST, ASSUMED_GRAIN, 1.0)
+        widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
     rho = correlation(grain) if contrast > 0 and grain else NO_LAGS
@@ -167,7 +166,6 @@ def extract(
     else:
         variance = noise2, gain, frames if dark is not None else 0
         fitted = METHODS[method](work, shade, start, found, variance, (contrast, rho), settings)
-    low, high = settings.width_range_px
     believe(fitted, start, work.shape[1], low, high, 0.5 * least, 1 + SECOND_ORDER * contrast**2)
     centres = fitted[fit.FIT_CENTRE]
     there = centres == centres
@@ -179,28 +177,8 @@ def extract(
         width=fitted[fit.WIDTH],
         saturated=there & (start[:, 0, find.CORE] > 0),
         double=there & double,
+        speckle=speckle,
     )
-
-
-def extract_all(
-    images: Iterable[Image],
-    dark: NDArray[np.floating] | NDArray[np.uint8] | None = None,
-    axis: Axis = "rows",
-    settings: StripeSettings | None = None,
-    threads: int = 2,
-) -> Iterator[StripeProfile]:
-    """The profiles of a stream of images, in its order, with `threads` cores: a picture each, no more ahead than that.
-
-    Raises what `extract` raises, at the picture that it is about.
-    """
-    with ThreadPoolExecutor(threads, "stripe") as pool:
-        waiting: deque[Future[StripeProfile]] = deque()
-        for image in images:
-            waiting.append(pool.submit(extract, image, dark, axis, settings))
-            if len(waiting) > threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 def _check(image: Image, dark: Any) -> None:

@@ -1,7 +1,7 @@
-"""Where the stripe is in each line of the picture: the compiled search for peaks, and their start values.
+"""Where the stripe is in one line of the picture: the compiled search for its peaks, and their start values.
 
-A line is an image row, or a column for stripes along columns. Every pixel is read once, for the maxima of blocks; the
-rest looks only at what stands out. `stripe_numpy.py` says the same without a compiler.
+A line is an image row, or a column for stripes along columns. This search takes any line; `stripe_search.py` runs it
+where a line is not an ordinary one. `stripe_numpy.py` says the same without a compiler.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TRIES = 3
 
 
 @compiled_fast
-def _largest(row: Any) -> int:
+def largest(row: Any) -> int:
     """Largest value of some pixels, 0 when there are none."""
     top = np.uint8(0)
     for i in range(len(row)):
@@ -34,26 +34,20 @@ def _largest(row: Any) -> int:
 
 
 @compiled_fast
-def _first(row: Any, begin: int, top: int, marks: Any) -> int:
-    """Where row[begin : begin + BLOCK] first reaches `top`; `marks` is overwritten."""
-    part = row[begin : min(len(row), begin + BLOCK)]
-    limit = np.uint8(top)
-    for i in range(len(part)):
-        marks[i] = BLOCK - i if part[i] >= limit else 0
-    first: int = begin + BLOCK - _largest(marks[: len(part)])
-    return first
+def largest_outside(row: Any, low: int, high: int) -> int:
+    """Largest value of a line outside low … high."""
+    return int(max(largest(row[: max(0, low)]), largest(row[min(len(row), high + 1) :])))
 
 
-@compiled_fast
-def _reached_elsewhere(row: Any, tops: Any, low: int, high: int, limit: float) -> bool:
-    """Whether a pixel outside low … high reaches `limit`: by the blocks' maxima, beside the window pixel by pixel."""
-    n = len(row)
-    for b in range(len(tops)):
-        if tops[b] >= limit and ((b + 1) * BLOCK <= low or b * BLOCK > high):
-            return True
-    below = _largest(row[max(0, low - BLOCK) : max(0, low)])
-    above = _largest(row[min(n, high + 1) : min(n, high + 1 + BLOCK)])
-    return bool(max(below, above) >= limit)
+@compiled
+def first_at(row: Any, top: int) -> int:
+    """Where a line first reaches its largest value `top`: block by block, for a block's maximum is quickly had."""
+    begin = 0
+    while begin + BLOCK < len(row) and largest(row[begin : begin + BLOCK]) < top:
+        begin += BLOCK
+    while row[begin] < top:
+        begin += 1
+    return begin
 
 
 @compiled_fast
@@ -67,7 +61,7 @@ def _rises(row: Any, begin: int, end: int, rises: Any) -> int:
     for i in range(size):
         beside = left[i] if left[i] > right[i] else right[i]
         rises[i] = here[i] - beside if here[i] > beside else 0
-    top: int = _largest(rises[:size])
+    top: int = largest(rises[:size])
     return top
 
 
@@ -87,6 +81,12 @@ def _prominent(row: Any, low: int, high: int, rises: Any) -> int:
                 place += 1
             place += begin
     return place
+
+
+@compiled
+def width_of(above: float) -> float:
+    """The stripe's σ in px, of which this many pixels lie above half of the peak."""
+    return max(float(above), 1.0) / 2.355
 
 
 @compiled_fast
@@ -134,7 +134,7 @@ def _measure(
         # Gaussian flanks: the core is the width at saturation, `above` the width at half of the clipped height.
         width = (max(float(above * above - core * core), 2.0) / 5.545) ** 0.5
     else:
-        width = max(float(above), 1.0) / 2.355
+        width = width_of(above)
     start[r, k, CENTRE] = low + moment / energy
     start[r, k, WIDTH] = width
     start[r, k, HEIGHT] = peak - background
@@ -145,45 +145,50 @@ def _measure(
 
 
 @compiled
-def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> None:
-    """Start values of the lines of `image` (lines, n) into `start` (lines, CANDIDATES, START), which is 0 before.
+def reach_of(width: float, core: int) -> int:
+    """How far from its peak, in px, a line still belongs to a stripe of this width."""
+    return int(max(4.0, 4.0 * width)) + 1 + core
 
-    `dark` has one pixel where there is no dark frame, `seen` is what lies above it. The brightest peak comes first;
-    where it is none (bright scenery), the one that stands out most. Of two peaks the one with more energy stays first.
+
+@compiled
+def rival_limit(background: float, height: float, least_peak: float) -> float:
+    """What competes with a peak for being the stripe reaches this value."""
+    return float(background + max(least_peak, RIVAL * height))
+
+
+@compiled
+def find_line(
+    image: Any, seen: Any, dark: Any, r: int, saturation: int, least_peak: float, window: Any, rises: Any, start: Any
+) -> bool:
+    """Start values of line `r` into start[r] (CANDIDATES, START), which is 0 before, as `find_lines` says.
+
+    True when it has two peaks. `window` (n,) and `rises` (n,) are overwritten.
     """
-    n = image.shape[1]
-    window = np.empty(n, np.float32)
-    rises = np.empty(n + BLOCK, np.uint8)
-    tops = np.empty((n + BLOCK - 1) // BLOCK, np.int64)
-    for r in range(len(image)):
-        row = seen[r]
-        block = 0
-        for b in range(len(tops)):
-            tops[b] = _largest(row[b * BLOCK : min(n, (b + 1) * BLOCK)])
-            block = b if tops[b] > tops[block] else block
-        if tops[block] < least_peak:
-            continue
-        place = _first(row, block * BLOCK, tops[block], rises)
-        found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
-        low = high = place
-        for _ in range(TRIES - 1):
-            if found:
-                break
-            low, high = min(low, place - 4), max(high, place + 4)
-            place = _prominent(row, low, high, rises)
-            if place < 0:
-                break
-            found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
-        if not found:
-            continue
-        reach = int(max(4.0, 4.0 * start[r, 0, WIDTH])) + 1 + int(start[r, 0, CORE])
-        low, high = place - reach, place + reach
-        limit = start[r, 0, BACKGROUND] + max(least_peak, RIVAL * start[r, 0, HEIGHT])
-        if not _reached_elsewhere(row, tops, low, high, limit):
-            continue
+    row = seen[r]
+    top = largest(row)
+    if top < least_peak:
+        return False
+    place = first_at(row, top)
+    found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
+    low = high = place
+    for _ in range(TRIES - 1):
+        if found:
+            break
+        low, high = min(low, place - 4), max(high, place + 4)
         place = _prominent(row, low, high, rises)
-        if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, 1):
-            continue
-        if start[r, 1, ENERGY] > start[r, 0, ENERGY]:
-            for k in range(START):
-                start[r, 0, k], start[r, 1, k] = start[r, 1, k], start[r, 0, k]
+        if place < 0:
+            return False
+        found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
+    if not found:
+        return False
+    reach = reach_of(start[r, 0, WIDTH], int(start[r, 0, CORE]))
+    low, high = place - reach, place + reach
+    if largest_outside(row, low, high) < rival_limit(start[r, 0, BACKGROUND], start[r, 0, HEIGHT], least_peak):
+        return False
+    place = _prominent(row, low, high, rises)
+    if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, 1):
+        return False
+    if start[r, 1, ENERGY] > start[r, 0, ENERGY]:
+        for k in range(START):
+            start[r, 0, k], start[r, 1, k] = start[r, 1, k], start[r, 0, k]
+    return True

@@ -26,16 +26,15 @@ NEAREST = 0.499
 
 
 @compiled
-def _begin(s: Any, j: int, best: Any, width: float) -> tuple[int, int]:
+def _begin(s: Any, j: int, best: Any, width: float, log_width: float) -> tuple[int, int]:
     """Start of lane `j` from a peak of `find_lines`; its origin and how far the fit looks from there, in px."""
     core = best[CORE]
     clipped = core > 1
     origin = int(np.floor(best[CENTRE] + NEAREST))
-    expected = np.log(width)
     prior = CLIPPED_PRIOR if clipped else WIDTH_PRIOR
     s[lane.CENTRE + j] = best[CENTRE] - origin
     s[lane.AMPLITUDE + j] = best[HEIGHT] * (np.exp(min(4.0, 0.5 * (0.5 * core / width) ** 2)) if clipped else 1.0)
-    s[lane.LOG_WIDTH + j] = s[lane.EXPECTED + j] = expected
+    s[lane.LOG_WIDTH + j] = s[lane.EXPECTED + j] = log_width
     s[lane.LEVEL + j] = best[BACKGROUND]
     s[lane.SLOPE + j] = 0.0
     s[lane.PRIOR + j] = 1.0 / (prior * prior)
@@ -49,8 +48,9 @@ def _gather(row: Any, origin: int, half: int, j: int, into: Any) -> None:
     n = len(row)
     first, k = origin - half - 1, MIDDLE - half - 1
     if first >= 0 and origin + half < n:
-        for i in range(2 * half + 2):
-            into[k + i, j] = row[first + i]
+        part, lane_pixels = row[first : first + 2 * half + 2], into[k : k + 2 * half + 2, j]
+        for i in range(len(part)):
+            lane_pixels[i] = part[i]
     else:
         for i in range(2 * half + 2):
             into[k + i, j] = row[min(max(first + i, 0), n - 1)]
@@ -87,22 +87,22 @@ def _weigh(
 
 @compiled
 def fit_lines(
-    image: Any, dark: Any, start: Any, widths: Any, which: Any, saturation: int, noise: Any, dark_noise: Any, rho: Any,
-    steps: int, out: Any,
+    image: Any, dark: Any, start: Any, widths: Any, log_widths: Any, which: Any, saturation: int, noise: Any,
+    dark_noise: Any, rho: Any, steps: int, out: Any,
 ) -> None:  # fmt: skip
     """Weighted maximum likelihood of the lines `which`: Fisher scoring on centre, amplitude, log width and background.
 
-    `dark` has one line where there is none, `start` is from `find_lines`, `widths` (lines,) the expected σ in px.
-    Variance of a pixel in DN²: noise[0] + noise[1] · value + (noise[2] · stripe)², of which the last is correlated by
-    `rho` (LAGS,) at lags 1, 2, … (of no length: is not); a pixel of the dark frame adds dark_noise[0] + dark_noise[1] ·
-    dark. `out` (FITTED, lines); lines that cannot be fitted are left alone.
+    `dark` has one line where there is none, `start` is from `find_lines`, `widths` (lines,) the expected σ in px,
+    `log_widths` its logarithm. Variance of a pixel in DN²: noise[0] + noise[1] · value + (noise[2] · stripe)², of which
+    the last is correlated by `rho` (LAGS,) at lags 1, 2, … (of no length: is not); a pixel of the dark frame adds
+    dark_noise[0] + dark_noise[1] · dark. `out` (FITTED, lines); lines that cannot be fitted are left alone.
     """
     s = np.zeros(lane.NUMBERS, np.float32)
     raw = np.zeros((ROWS, LANES), np.uint8)
     shade = np.zeros((ROWS, LANES), np.float32)
     values, variance, moved = np.zeros_like(shade), np.zeros_like(shade), np.zeros_like(shade)
     reach = np.zeros((2, LANES), np.float32)
-    used, fisher = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    used, fisher, fitted_width = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
     origins, reaches = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
     noise2, gain, contrast2 = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2] * noise[2])
     for first in range(0, len(which), LANES):
@@ -111,7 +111,7 @@ def fit_lines(
         for j in range(LANES):
             # Lanes to spare repeat the last line.
             r = which[first + min(j, size - 1)]
-            origins[j], reaches[j] = _begin(s, j, start[r, 0], widths[r])
+            origins[j], reaches[j] = _begin(s, j, start[r, 0], widths[r], log_widths[r])
             half = max(half, reaches[j])
             reach[0, j] = max(-reaches[j], -origins[j])
             reach[1, j] = min(reaches[j], image.shape[1] - 1 - origins[j])
@@ -126,8 +126,9 @@ def fit_lines(
             lane.accumulate(s, values, variance, half, noise2, gain, contrast2)
             if lane.step_on(s) == 0.0:
                 break
-        for j in range(size):
+        for j in range(LANES):
             fisher[j] = s[lane.FISHER + j]
+            fitted_width[j] = lane.exponential(s[lane.LOG_WIDTH + j])
         correlated = len(rho) > 0 and contrast2 > 0.0
         if correlated:
             lane.influence(s, variance, half, noise2, gain, contrast2, rho, moved)
@@ -138,7 +139,7 @@ def fit_lines(
             out[FIT_CENTRE, r] = origins[j] + s[lane.CENTRE + j]
             out[SIGMA, r] = np.sqrt(s[lane.VARIANCE + j] if correlated else fisher[j])
             out[AMPLITUDE, r] = s[lane.AMPLITUDE + j]
-            out[WIDTH, r] = np.exp(s[lane.LOG_WIDTH + j])
+            out[WIDTH, r] = fitted_width[j]
             out[LEVEL, r] = s[lane.LEVEL + j]
             out[SLOPE, r] = s[lane.SLOPE + j] / lane.UNIT
             out[CHI2, r] = s[lane.MISFIT + j] / (used[j] - PARAMETERS)

@@ -48,7 +48,7 @@ NUMBERS = 44 * LANES
 
 
 @compiled_fast
-def _exp(x: Any) -> Any:
+def exponential(x: Any) -> Any:
     """The exponential to 2e-7, for the vector unit: the library's is called lane by lane."""
     whole = np.floor(x * np.float32(1.442695041) + np.float32(0.5))
     r = x - whole * np.float32(0.6931471806)
@@ -66,17 +66,17 @@ def _begin(s: Any) -> None:
     """Model and Gaussian at the origin; the Gaussian at x ± 1 is that at x times a ratio, which shrinks evenly."""
     half = np.float32(0.5)
     for j in range(LANES):
-        inverse = _exp(-s[LOG_WIDTH + j])
+        inverse = exponential(-s[LOG_WIDTH + j])
         z = -s[CENTRE + j] * inverse
         rise = s[SLOPE + j] / (inverse * np.float32(UNIT))
         s[_Z + j] = z
         s[_INVERSE + j] = inverse
         s[_BASE + j] = s[LEVEL + j] - rise * z
         s[_RISE + j] = rise
-        shrink = _exp(-half * inverse * inverse)
-        up = _exp(-inverse * z)
+        shrink = exponential(-half * inverse * inverse)
+        up = exponential(-inverse * z)
         down = shrink / up
-        peak = _exp(-half * z * z)
+        peak = exponential(-half * z * z)
         s[_UP + j] = peak
         s[_UP_RATIO + j] = up * shrink
         s[_DOWN + j] = peak * down

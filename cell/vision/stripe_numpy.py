@@ -1,4 +1,4 @@
-"""The search and the fit of `stripe_find.py` and `stripe_fit.py` without a compiler: the same rules, all lines at once.
+"""`stripe_search.py` and `stripe_fit.py` without a compiler: the same rules, all lines at once.
 
 For machines where numba does not run, and as an independent check of the compiled loops. About twenty times slower.
 """
@@ -16,8 +16,8 @@ from cell.vision import stripe_lanes as lane
 CHUNK = 256
 
 
-def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> None:
-    """As `stripe_find.find_lines`."""
+def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> bool:
+    """As `stripe_search.find_lines`."""
     lines = np.arange(len(image))
     place = seen.argmax(axis=1)
     lines, place = _with(seen[lines, place] >= least_peak, lines, place)
@@ -54,6 +54,7 @@ def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: fl
     start[lines, 1] = record
     more = lines[record[:, find.ENERGY] > start[lines, 0, find.ENERGY]]
     start[more] = start[more, ::-1]
+    return len(lines) > 0
 
 
 def _with(mask: Any, *arrays: Any) -> Any:
@@ -115,21 +116,21 @@ def _measure(image: Any, dark: Any, lines: Any, place: Any, saturation: int, lea
 
 
 def fit_lines(
-    image: Any, dark: Any, start: Any, widths: Any, which: Any, saturation: int, noise: Any, dark_noise: Any, rho: Any,
-    steps: int, out: Any,
+    image: Any, dark: Any, start: Any, widths: Any, log_widths: Any, which: Any, saturation: int, noise: Any,
+    dark_noise: Any, rho: Any, steps: int, out: Any,
 ) -> None:  # fmt: skip
     """As `stripe_fit.fit_lines`."""
     for k in range(0, len(which), CHUNK):
         lines = which[k : k + CHUNK]
         shade = dark[lines] if len(dark) > 1 else None
         variances = noise[0], noise[1], noise[2] ** 2
-        one = start[lines, 0], widths[lines], lines
+        one = start[lines, 0], widths[lines], log_widths[lines], lines
         _fit(image[lines], shade, *one, saturation, variances, rho, dark_noise, steps, out)
 
 
 def _fit(
-    image: Any, shade: Any, start: Any, widths: Any, lines: Any, saturation: int, noise: Any, rho: Any,
-    dark_noise: Any, steps: int, out: Any,
+    image: Any, shade: Any, start: Any, widths: Any, expected: Any, lines: Any, saturation: int, noise: Any,
+    rho: Any, dark_noise: Any, steps: int, out: Any,
 ) -> None:  # fmt: skip
     """The lines of one chunk."""
     core = start[:, find.CORE]
@@ -147,7 +148,6 @@ def _fit(
         below = np.take_along_axis(shade, column, axis=1).astype(np.float64)
         value -= below
         extra = dark_noise[0] + dark_noise[1] * below
-    expected = np.log(widths)
     prior = np.where(clipped, fit.CLIPPED_PRIOR, fit.WIDTH_PRIOR) ** -2.0
     amplitude = start[:, find.HEIGHT].copy()
     amplitude[clipped] *= np.exp(np.minimum(4.0, 0.5 * (0.5 * core / widths)[clipped] ** 2))

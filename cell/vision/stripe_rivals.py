@@ -54,30 +54,27 @@ def _line_through(x: Any, y: Any) -> tuple[float, float]:
     return slope, float(np.median(y - slope * x))
 
 
-def smooth_widths(start: Array, allowed: tuple[float, float]) -> Array:
-    """Running mean over 15 lines of the start widths (lines,), which are counts of pixels and coarse one by one."""
-    out = np.empty(len(start))
-    _running_mean(start, allowed[0], allowed[1], out)
-    return out
-
-
 @compiled
-def _running_mean(start: Any, low: float, high: float, out: Any) -> None:
-    lines = len(out)
-    total, count = 0.0, 0
-    overall, found = 0.0, 0
+def survey(start: Any, low: float, high: float) -> tuple[Any, Any]:
+    """What the lines say together: those found (m,) and how wide the stripe is about each line (lines,).
+
+    The width in px is the running mean over 15 lines of the start widths within low … high, which are counts of pixels
+    and coarse one by one.
+    """
+    lines = len(start)
+    found = np.empty(lines, np.int64)
+    # Sums over the lines before each.
+    totals, counts = np.zeros(lines + 1), np.zeros(lines + 1, np.int64)
     for r in range(lines):
+        totals[r + 1], counts[r + 1] = totals[r], counts[r]
         if start[r, 0, ENERGY] > 0:
-            overall += min(max(start[r, 0, WIDTH], low), high)
-            found += 1
-    middle = overall / found if found > 0 else 1.0
-    for r in range(-SMOOTHED, lines):
-        new, old = r + SMOOTHED, r - SMOOTHED - 1
-        if new < lines and start[new, 0, ENERGY] > 0:
-            total += min(max(start[new, 0, WIDTH], low), high)
-            count += 1
-        if old >= 0 and start[old, 0, ENERGY] > 0:
-            total -= min(max(start[old, 0, WIDTH], low), high)
-            count -= 1
-        if r >= 0:
-            out[r] = min(max(total / count if count > 0 else middle, low), high)
+            totals[r + 1] += min(max(start[r, 0, WIDTH], low), high)
+            found[counts[r]] = r
+            counts[r + 1] += 1
+    widths = np.empty(lines)
+    overall = totals[lines] / counts[lines] if counts[lines] > 0 else min(max(1.0, low), high)
+    for r in range(lines):
+        first, end = max(0, r - SMOOTHED), min(lines, r + SMOOTHED + 1)
+        here = counts[end] - counts[first]
+        widths[r] = (totals[end] - totals[first]) / here if here > 0 else overall
+    return found[: counts[lines]], widths

@@ -17,20 +17,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.compiled import compiled
+from cell.vision.stripe_find import CORE, ENERGY
 from cell.vision.stripe_fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
 from cell.vision.stripe_lanes import LAGS
 
 # Correlation of two pixels at distance r is exp(−r²/4 grain²); a lens at f/4 to f/8 with pixels of 5 µm gives .3 to 1.
 GRAINS = np.array([0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3])
 LEAST_CORRELATED, MOST_CORRELATED = (exp(-0.25 / grain**2) for grain in (0.3, 1.3))
-CORE = 2.0
+WITHIN = 2.0
 """Residuals within this many stripe widths of the centre count: farther out there is no speckle to see."""
 LEAST_PAIRS = 8
+MOST_WIDENING = 2.0
 PHASES = 8
 ASSUMED_GRAIN = 0.7
 """Grain in px where none shows: no speckle, or lines that have no column in common."""
 # Speckle below this share of the photon noise's variance at the peak, or not above its own uncertainty, is none.
 NEGLIGIBLE, SIGNIFICANT = 0.05, 3.0
+
+
+class Speckle(NamedTuple):
+    """What a picture shows of the speckle: its contrast, its grain in px, and the width of the fitted stripes over that
+    of their peaks, which are chosen for being bright, so that speckle makes them look too narrow."""
+
+    contrast: float
+    grain: float
+    widening: float
 
 
 class _Seen(NamedTuple):
@@ -49,17 +60,38 @@ class _Seen(NamedTuple):
 
 
 @compiled
+def neighbours(start: Any, double: Any, most: int) -> Any:
+    """Lines (m,) of some `most` pairs of a line and the next, all over the picture, that show one peak, unsaturated."""
+    lines = len(start)
+    clear = np.zeros(lines, np.bool_)
+    pairs = 0
+    for r in range(lines):
+        clear[r] = start[r, 0, ENERGY] > 0 and start[r, 0, CORE] == 0 and not double[r]
+        pairs += r > 0 and clear[r] and clear[r - 1]
+    every = max(1, pairs // most)
+    chosen = np.empty(pairs // every + 1, np.int64)
+    seen, count = 0, 0
+    for r in range(1, lines):
+        if clear[r] and clear[r - 1]:
+            if seen % every == 0:
+                chosen[count] = r - 1
+                count += 1
+            seen += 1
+    return chosen[:count]
+
+
+@compiled
 def _whitened(
     image: Any, dark: Any, r: int, fitted: Any, noise2: float, gain: float, contrast2: float, errors: Any
 ) -> tuple[int, int]:
     """Residuals of line r into `errors` (n,) where its core is; first and last column + 1 of it, 0, 0 if it leaves."""
     n = image.shape[1]
     centre, width, amplitude = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[AMPLITUDE, r]
-    if not (centre > CORE * width + 1.0 and centre < n - 2.0 - CORE * width):
+    if not (centre > WITHIN * width + 1.0 and centre < n - 2.0 - WITHIN * width):
         return 0, 0
     origin = int(np.floor(centre + 0.5))
     level, slope = fitted[LEVEL, r], fitted[SLOPE, r]
-    low, high = int(np.ceil(centre - CORE * width)), int(np.floor(centre + CORE * width)) + 1
+    low, high = int(np.ceil(centre - WITHIN * width)), int(np.floor(centre + WITHIN * width)) + 1
     for i in range(low, high):
         z = (i - centre) / width
         stripe = amplitude * np.exp(-0.5 * z * z)
@@ -134,7 +166,7 @@ def _expected(
         normal = jacobian.T @ jacobian
         normal[2, 2] += WIDTH_PRIOR**-2
         left = np.eye(len(x)) - jacobian @ np.linalg.solve(normal, jacobian.T)
-        rows = left[np.abs(z) <= CORE] * root
+        rows = left[np.abs(z) <= WITHIN] * root
         pulled = rows * stripe
         distance2 = (x[:, None] - x) ** 2
         covariances = [(rows * photon) @ rows.T]
@@ -149,9 +181,9 @@ def _rounded(value: float, step: float) -> float:
 
 
 def measure_speckle(
-    image: Any, dark: Any, pairs: Any, fitted: Any, noise2: float, gain: float, contrast: float
-) -> tuple[float, float, float] | None:
-    """Contrast and grain (px) of the speckle in the lines `pairs` and the ones after them, and their width in px.
+    image: Any, dark: Any, pairs: Any, widths: Any, fitted: Any, noise2: float, gain: float, contrast: float
+) -> Speckle | None:
+    """The speckle in the lines `pairs` and the ones after them, whose peaks have `widths` (lines,) in px.
 
     All of them are `fitted` with `contrast`. None when they are too few. Anything else that the model does not explain,
     such as the texture of the surface, counts as speckle.
@@ -164,11 +196,12 @@ def measure_speckle(
     seen = _Seen(*numbers)
     if seen.pairs < LEAST_PAIRS:
         return None
+    widening = min(max(seen.width / float(np.mean(widths[pairs])), 1 / MOST_WIDENING), MOST_WIDENING)
     typical = _rounded(seen.width, 0.03), _rounded(seen.amplitude, 0.04), _rounded(seen.level, 0.1)
     expected = _expected(*typical, _rounded(noise2, 0.1), gain, contrast**2)
     excess = seen.power - float(expected[0])
     if excess < SIGNIFICANT * seen.scatter / sqrt(seen.pairs):
-        return 0.0, ASSUMED_GRAIN, seen.width
+        return Speckle(0.0, ASSUMED_GRAIN, widening)
     grain = ASSUMED_GRAIN
     if seen.shared > 0:
         # Of the power in the columns that both lines share, speckle has the share that it has of all.
@@ -177,9 +210,9 @@ def measure_speckle(
     contrast2 = excess / float(np.interp(grain, GRAINS, expected[1:]))
     peak_noise = noise2 + gain * (seen.amplitude + max(seen.level, 0.0))
     if contrast2 * seen.amplitude**2 < NEGLIGIBLE * peak_noise:
-        return 0.0, grain, seen.width
+        return Speckle(0.0, grain, widening)
     # Developed speckle has contrast 1; more is a misfit.
-    return sqrt(min(contrast2, 1.0)), grain, seen.width
+    return Speckle(sqrt(min(contrast2, 1.0)), grain, widening)
 
 
 @lru_cache(maxsize=256)
