@@ -1,0 +1,60 @@
+"""The compiled search, which takes most lines side by side, against the same rules written without a compiler."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.bench.stripe_truth import Cell, draw
+from cell.vision import stripe_numpy, stripe_search
+from cell.vision.stripe_find import CANDIDATES, ENERGY, START
+
+SHAPE = (200, 333)
+LEAST_PEAK, SATURATION = 8.0, 255
+
+
+def stripe(*cell: float) -> np.ndarray:
+    return draw(Cell(*cell), SHAPE, 1)[0]
+
+
+def noise(mean: float, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    return np.clip(np.random.default_rng(3).poisson(mean, shape), 0, 255).astype(np.uint8)
+
+
+def with_rivals() -> np.ndarray:
+    """A stripe with a second one beside it, far in some lines and equally bright in others, and gaps."""
+    image = stripe(2.0, 120.0, 0.2)
+    image[:, 300:305] = 200
+    image[50:100] = np.maximum(image[50:100], np.roll(image[50:100], 25, axis=1))
+    image[::7] = 5
+    return image
+
+
+PICTURES = {
+    "a stripe": stripe(2.0, 150.0),
+    "a faint stripe": stripe(1.2, 20.0),
+    "coarse speckle": stripe(3.0, 220.0, 0.5),
+    "a saturated stripe": stripe(2.0, 900.0),
+    "rivals": with_rivals(),
+    "a stripe at the border": np.roll(stripe(2.0, 150.0), SHAPE[1] // 2, axis=1),
+    "jumps": np.stack([np.roll(line, 97 * k) for k, line in enumerate(stripe(2.0, 150.0))]),
+    "nothing but noise": noise(20.0),
+    "anything": np.random.default_rng(4).integers(0, 256, SHAPE).astype(np.uint8),
+    "white": np.full(SHAPE, 255, np.uint8),
+    "a small picture": noise(30.0, (40, 33)),
+}
+
+
+@pytest.mark.parametrize("with_dark", [False, True])
+@pytest.mark.parametrize("name", PICTURES)
+def test_any_line_is_searched_as_without_a_compiler(name, with_dark):
+    image = PICTURES[name]
+    dark = np.minimum(noise(6.0, image.shape), image) if with_dark else np.zeros((1, 1), np.uint8)
+    seen = image - dark if with_dark else image
+    starts, several = [], []
+    for engine in (stripe_search, stripe_numpy):
+        start = np.zeros((len(image), CANDIDATES, START))
+        several.append(engine.find_lines(image, seen, dark, SATURATION, LEAST_PEAK, start))
+        starts.append(start)
+    np.testing.assert_allclose(starts[0], starts[1], atol=1e-3)
+    assert several[0] == several[1] == bool(starts[0][:, 1, ENERGY].any())
