@@ -105,7 +105,7 @@ def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObserva
     """What `cell.steps.verify.collect_verification` brings from this world."""
     config = cell.config
     assert calibration.scan.reference is not None
-    scan_view, target_view = verification_views(config, cell.fine, cell.large)
+    scan_view, target_view = verification_views(config, cell.fine, cell.large, calibration.scan, calibration.target)
     ends = rail_ends(
         calibration.scan, calibration.scan.reference.base_from_board, scan_view, cell.fine, config.rail.travel
     )

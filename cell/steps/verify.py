@@ -1,8 +1,8 @@
 """Verifying the calibration: one view of each deck board, approached several times, and one sweep over the fine board.
 
-The views are poses of the calibration itself, so that the arm's kinematic error is the same; approaching them anew
-averages its repeatability. In each approach the scan camera photographs its board from both ends of the way that the
-rail can go with the board in view.
+The views are the calibration's own, aimed with what it found: near enough to its poses that the arm's kinematic error
+is the same. Approaching them anew averages the arm's repeatability. In each approach the scan camera photographs its
+board from both ends of the way that the rail can go with the board in view.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, SweepErrors
 from cell.stored_calibration import CellCalibration
 from cell.vision import BoardSpec, BoardView, StripeProfile, find_board, parse_board
-from drivers.errors import CalibrationStale, RefusedError
+from drivers.errors import RefusedError
 from drivers.interfaces import Camera
 
 SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
@@ -151,14 +151,11 @@ def collect_verification(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check, progress: Progress
 ) -> CheckObservations:
     """Take all pictures. Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference."""
-    reference = calibration.scan.reference
-    if reference is None:
-        raise CalibrationStale(
-            f"the calibration of {calibration.date} holds no reference to verify against; run `cell calibrate` once"
-        )
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
-    scan_view, target_view = verification_views(config, fine, large)
-    ends = rail_ends(calibration.scan, reference.base_from_board, scan_view, fine, config.rail.travel)
+    scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
+    assert calibration.scan.reference is not None
+    base_from_board = calibration.scan.reference.base_from_board
+    ends = rail_ends(calibration.scan, base_from_board, scan_view, fine, config.rail.travel)
     if not devices.rail.state().homed:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
