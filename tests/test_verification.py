@@ -21,7 +21,7 @@ from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix
 from cell.job import load_job
 from cell.planning import rail_ends, verification_views
-from cell.steps.verify import Verification
+from cell.steps.verification import Verification
 from cell.stored_calibration import CellCalibration, nominal_camera, read_calibration, save_calibration
 from cell.vision.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
