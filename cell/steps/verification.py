@@ -74,8 +74,8 @@ class Verification:
             if not hidden:
                 return text
             return (
-                f"{text}; {1e3 * SHIFT:g} mm and {np.degrees(TURN):g}° would not everywhere: the scatter of arm and "
-                f"rail that the calibration found hides as much in the {'; in the '.join(hidden)}"
+                f"{text}; the scatter of arm and rail that the calibration found hides more than {1e3 * SHIFT:g} mm or "
+                f"{np.degrees(TURN):g}° of: {'; '.join(hidden)}"
             )
         if v.statistic <= v.threshold:
             worst = "; ".join(f"{kind} {v.fit[kind]:.1f} times" for kind in v.badly_fitting)
