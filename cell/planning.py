@@ -6,16 +6,18 @@ the arm can reach them without a collision is `cell.motion`'s business.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration
+from cell.calibration import ScanCalibration, TargetCalibration
 from cell.config import CellConfig
 from cell.geometry.poses import from_parts, transform
 from cell.job import Job
 from cell.vision import BoardSpec
+from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Vector
 
 
@@ -111,44 +113,52 @@ def scan_plans(
 def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
     """Views of the fine deck board for the scan camera: depths, tilts, turns, all of the field and of the rail."""
     base_from_board = config.calibration.fine.base_from_board.se3()
-    low, high = config.rail.travel
     views = []
-    for k, (along, across, depth, tilt_x, tilt_y, turn) in enumerate(_SCAN_VIEWS):
-        rail = low + (high - low) * (0.1 + 0.8 * ((k * 5) % len(_SCAN_VIEWS)) / (len(_SCAN_VIEWS) - 1))
-        offset = np.array([along, across, 0.0]) * 1e-3
-        base_from_camera = _tilted(base_from_board, board, offset, depth * 1e-3, tilt_x, tilt_y, turn)
+    for k in range(len(_SCAN_VIEWS)):
+        rail = _scan_rail(config, k)
         flange_from_camera = config.scan_camera.flange_from_camera.se3() * from_parts((rail, 0.0, 0.0))
-        views.append(View(base_from_camera * flange_from_camera.inverse(), rail))
+        views.append(View(_looking(base_from_board, board, _SCAN_VIEWS[k]) * flange_from_camera.inverse(), rail))
     return views
 
 
 def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
     """Views of the large deck board for the target camera: several distances and tilts, and all of the field."""
     base_from_board = config.calibration.large.base_from_board.se3()
-    views = []
-    for along, across, depth, tilt_x, tilt_y, turn in _TARGET_VIEWS:
-        offset = np.array([along, across, 0.0]) * 1e-3
-        base_from_camera = _tilted(base_from_board, board, offset, depth * 1e-3, tilt_x, tilt_y, turn)
-        views.append(View(base_from_camera * config.target_camera.flange_from_camera.se3().inverse(), 0.0))
-    return views
+    camera_from_flange = config.target_camera.flange_from_camera.se3().inverse()
+    return [View(_looking(base_from_board, board, drawn) * camera_from_flange, 0.0) for drawn in _TARGET_VIEWS]
 
 
-def verification_views(config: CellConfig, fine: BoardSpec, large: BoardSpec) -> tuple[View, View]:
-    """One of the scan camera's calibration views and one of the target camera's.
+def verification_views(
+    config: CellConfig, fine: BoardSpec, large: BoardSpec, scan: ScanCalibration, target: TargetCalibration
+) -> tuple[View, View]:
+    """One of the scan camera's calibration views and one of the target camera's, aimed with what the calibration found.
 
-    The arm's kinematic error at these very poses is part of the calibration. The rail stands near its middle, so that
-    it can move both ways, and the boards are tilted.
+    Mounts and boards stand some millimetres from where they are drawn. From the drawn poses a board may lie half out
+    of the picture, which leaves the rail no way to go; from the calibrated ones the pictures are as drawn. The rail
+    stands near its middle, so that it can move both ways, and the boards are tilted. Raises `CalibrationStale` for a
+    calibration that was stored without its reference.
     """
+    if scan.reference is None or target.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference to verify against, it was made by an older program; run "
+            "`cell calibrate` once"
+        )
+    rail = _scan_rail(config, SCAN_VERIFICATION)
+    base_from_scan = _looking(scan.reference.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
+    base_from_target = _looking(target.reference.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
     return (
-        scan_calibration_views(config, fine)[SCAN_VERIFICATION],
-        target_calibration_views(config, large)[TARGET_VERIFICATION],
+        View(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
+        View(base_from_target * target.flange_from_camera.inverse(), 0.0),
     )
 
 
 def rail_ends(
     scan: ScanCalibration, base_from_board: pin.SE3, view: View, board: BoardSpec, travel: tuple[float, float]
 ) -> tuple[float, float]:
-    """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots."""
+    """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots.
+
+    Raises `RefusedError` when they are less than `LEAST_WAY` apart.
+    """
     points, radius = board.points(), board.dot_radius
     rings = [row * board.cols + column for column, row in board.rings]
     size = np.array([scan.camera.width, scan.camera.height])
@@ -169,19 +179,31 @@ def rail_ends(
         while shown(rail + way):
             rail += way
         ends.append(rail)
+    if ends[1] - ends[0] < LEAST_WAY:
+        raise RefusedError(
+            f"the fine board stays in the scan camera's picture for {1e3 * (ends[1] - ends[0]):.0f} mm of the rail's "
+            f"way, a verification needs at least {1e3 * LEAST_WAY:.0f} mm: run `cell calibrate`, or see that "
+            "calibration.fine.base_from_board and scan_camera.flange_from_camera are as built"
+        )
     return ends[0], ends[1]
 
 
-def _tilted(
-    base_from_board: pin.SE3, board: BoardSpec, offset: np.ndarray, depth: float, rx: float, ry: float, rz: float
-) -> pin.SE3:
-    rotation = pin.rpy.rpyToMatrix(*np.deg2rad([rx, ry, rz]))
+def _scan_rail(config: CellConfig, k: int) -> float:
+    """Where the rail stands in the scan camera's view `k`, m: each view elsewhere, all of the travel but its ends."""
+    low, high = config.rail.travel
+    return low + (high - low) * (0.1 + 0.8 * ((k * 5) % len(_SCAN_VIEWS)) / (len(_SCAN_VIEWS) - 1))
+
+
+def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float]) -> pin.SE3:
+    """base_from_camera for a line of the tables of views."""
+    along, across, depth, *turns = drawn
+    rotation = pin.rpy.rpyToMatrix(*np.deg2rad(turns))
     centre = base_from_board * from_parts(centre_of(board))
-    return centre * from_parts(np.zeros(3), rotation) * from_parts(offset - np.array([0.0, 0.0, depth]))
+    return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
 
 
 SCAN_VERIFICATION, TARGET_VERIFICATION = 6, 5
-EDGE_PX, LEAST_DOTS, RAIL_STEP = 12.0, 0.5, 1e-3
+EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.
 _SCAN_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (

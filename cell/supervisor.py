@@ -26,7 +26,8 @@ from cell.simulation import SimulatedCell, with_endpoints
 from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
-from cell.steps.verify import Verification, collect_verification
+from cell.steps.verification import Verification
+from cell.steps.verify import collect_verification
 from cell.stored_calibration import (
     CellCalibration,
     find_calibration,

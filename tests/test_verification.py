@@ -13,12 +13,15 @@ from cell.bench.verification import disturbances, look_again
 from cell.calibration import Priors
 from cell.calibration.faults import refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
 from cell.calibration.joint import solve_joint, solve_staged
-from cell.calibration.results import ScanCalibration
+from cell.calibration.reference import Reference
+from cell.calibration.results import Quality, ScanCalibration, TargetCalibration
 from cell.calibration.verification_looks import verify
 from cell.config import load_config
+from cell.geometry.light_plane import LightPlane
+from cell.geometry.poses import from_matrix
 from cell.job import load_job
-from cell.planning import rail_ends, scan_calibration_views
-from cell.steps.verify import Verification
+from cell.planning import rail_ends, verification_views
+from cell.steps.verification import Verification
 from cell.stored_calibration import CellCalibration, nominal_camera, read_calibration, save_calibration
 from cell.vision.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
@@ -32,6 +35,25 @@ ALONG = np.array([1.0, 0.0, 0.0])
 
 def world(seed: int, level: str = "nominal") -> ObservedCell:
     return ObservedCell(draw(seed, level), CONFIG, np.random.default_rng([seed, 7]))
+
+
+def true_calibration(cell: ObservedCell) -> tuple[ScanCalibration, TargetCalibration]:
+    """What a calibration without any error would hold; no covariance."""
+    nothing, truth = Quality(0, 1.0, 0.0, 0.0, 0.0, 0.0), cell.truth
+
+    def reference(board: np.ndarray) -> Reference:
+        return Reference(from_matrix(board), np.zeros((27, 27)), 0.0, 0.0, 0.0, 1.0, 1.0)
+
+    plane = LightPlane.of(truth.plane_normal, truth.plane_distance)
+    scan = ScanCalibration(
+        NOMINAL.with_parameters(truth.scan_lens), plane, truth.rail_direction,
+        from_matrix(truth.flange_from_scan), np.zeros((21, 21)), nothing, reference(truth.base_from_fine),
+    )  # fmt: skip
+    target = TargetCalibration(
+        nominal_camera(CONFIG.target_camera).with_parameters(truth.target_lens),
+        from_matrix(truth.flange_from_target), np.zeros((6, 6)), nothing, reference(truth.base_from_large),
+    )  # fmt: skip
+    return scan, target
 
 
 @pytest.fixture(scope="module")
@@ -104,17 +126,36 @@ def test_the_reference_is_stored_and_an_old_file_is_refused(calibrated, tmp_path
         verify(older.scan, older.target, look_again(cell, calibration))
 
 
-def test_the_rail_ends_keep_the_rings_in_the_picture(calibrated):
-    cell, calibration = calibrated
-    view = scan_calibration_views(CONFIG, cell.fine)[6]
-    low, high = rail_ends(
-        calibration.scan, calibration.scan.reference.base_from_board, view, cell.fine, CONFIG.rail.travel
-    )
-    assert high - low > 0.025
+@pytest.mark.parametrize("seed", [1, 5, 18])
+def test_the_views_are_aimed_where_mounts_and_boards_really_stand(seed):
+    # In these worlds the board lies half out of the picture when it is looked at from the drawn pose.
+    cell = world(seed, "harsh")
+    scan, target = true_calibration(cell)
+    view, target_view = verification_views(CONFIG, cell.fine, cell.large, scan, target)
+    low, high = rail_ends(scan, scan.reference.base_from_board, view, cell.fine, CONFIG.rail.travel)
+    assert high - low > 0.035
     rest = cell.move(view.base_from_flange.homogeneous)
     rings = {row * cell.fine.cols + column for column, row in cell.fine.rings}
     for end in (low, high):
         assert rings <= set(cell.scan_view(rest, end).ids.tolist())
+    assert len(cell.target_view(cell.move(target_view.base_from_flange.homogeneous)).ids) == len(cell.large.points())
+
+
+def test_a_rail_without_a_way_to_go_is_refused(calibrated):
+    cell, calibration = calibrated
+    view, _ = verification_views(CONFIG, cell.fine, cell.large, calibration.scan, calibration.target)
+    at = view.rail_position
+    with pytest.raises(RefusedError, match=r"10 mm of the rail's way, .* at least 20 mm"):
+        board = calibration.scan.reference.base_from_board
+        rail_ends(calibration.scan, board, view, cell.fine, (at - 5.5e-3, at + 5.5e-3))
+
+
+def test_a_sweep_that_stands_still_is_refused(calibrated):
+    cell, calibration = calibrated
+    seen = look_again(cell, calibration)
+    still = [replace(seen.sweep[12], rail_position=seen.sweep[12].rail_position + k * 1e-5) for k in range(40)]
+    with pytest.raises(RefusedError, match=r"over 0\.4 mm of the rail's way, at least 10 mm"):
+        verify(calibration.scan, calibration.target, replace(seen, sweep=still))
 
 
 # --- named faults ---

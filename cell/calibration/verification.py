@@ -1,9 +1,9 @@
 """How good is a stored calibration today? One decision from a view of each deck board and a sweep over the fine one.
 
-Every part of the chain that may have changed is a hypothesis: a change of about `SHIFT` or `TURN` of its parameters
-against none. Their mean Bayes factor is the statistic; what it exceeds by chance is found by drawing scores from their
-own covariance, so that a good calibration is called disturbed in `FALSE_ALARMS` of all checks. The most probable part
-is named.
+Every part of the chain that may have changed is a hypothesis against none (`cell.calibration.hypotheses`). Their mean
+Bayes factor is the statistic; what it exceeds by chance is found by drawing scores from their own covariance, so that a
+good calibration is called disturbed in `FALSE_ALARMS` of all checks. The most probable part is named. What a good
+verdict is worth is said by `cell.calibration.detectability`.
 """
 
 from __future__ import annotations
@@ -13,30 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.calibration.blocks import BOARD, HAND, PLANE, RAIL, SHARED, State
+from cell.calibration.blocks import BOARD, PLANE, RAIL, SHARED, State
+from cell.calibration.detectability import Detectable, detectable
 from cell.calibration.evidence import Evidence
+from cell.calibration.hypotheses import Hypothesis, hypotheses, log_factor, log_mean
 from cell.geometry.camera import Array
 from cell.geometry.covariance import covariance_root
 
-SHIFT, TURN = 0.2e-3, float(np.deg2rad(0.05))
-"""The disturbance that has to be found, m and rad."""
-SCAN_DEPTH, TARGET_DEPTH = 0.13, 0.65
-"""Where a shift of a focal length counts, m in front of the camera."""
 FALSE_ALARMS = 0.03
 WORST_FIT = 1.6
 """Residuals larger than this many times the calibration's own have another cause than a moved part."""
 DRAWS = 8_000
 LEAST_PROBABILITY = 0.1
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A change of parameters `index` of one camera's chain, of about `size` each; `part` is what a person would fix."""
-
-    part: str
-    index: tuple[int, ...]
-    size: tuple[float, ...]
-    unit: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +51,8 @@ class Figure:
 class Verdict:
     """`statistic` is the logarithm of the mean Bayes factor for a change, `threshold` what chance reaches.
 
-    `fit` holds RMS residuals over the calibration's own by kind; `suspects` come most probable first.
+    `fit` holds RMS residuals over the calibration's own by kind; `suspects` come most probable first;
+    `detectable` says how large a change of each part had to be to be found today.
     """
 
     statistic: float
@@ -71,6 +60,7 @@ class Verdict:
     fit: dict[str, float]
     suspects: list[Suspect]
     figures: list[Figure]
+    detectable: list[Detectable]
 
     @property
     def badly_fitting(self) -> list[str]:
@@ -83,62 +73,25 @@ class Verdict:
         return self.statistic <= self.threshold and not self.badly_fitting
 
 
-def hypotheses(chain: str, focal: float) -> list[Hypothesis]:
-    """What may change in the chain of the "scan" or the "target" camera of `focal` length in px."""
-    hand = range(HAND.start, HAND.stop)
-    mount, lens = f"{chain} camera's mount on the flange", f"{chain} camera's lens"
-    depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
-    made = [
-        Hypothesis(mount, tuple(hand[:3]), (SHIFT,) * 3, ("m",) * 3),
-        Hypothesis(mount, tuple(hand[3:]), (TURN,) * 3, ("rad",) * 3),
-        Hypothesis(lens, (2, 3), (TURN * focal,) * 2, ("px",) * 2),
-        Hypothesis(lens, (0, 1), (SHIFT / depth * focal,) * 2, ("px",) * 2),
-    ]
-    if chain == "scan":
-        plane, rail = range(PLANE.start, PLANE.stop), range(RAIL.start, RAIL.stop)
-        made += [
-            Hypothesis("laser's light plane", tuple(plane), (TURN, TURN, SHIFT), ("rad", "rad", "m")),
-            Hypothesis("rail", tuple(rail), (TURN,) * 3, ("m/m",) * 3),
-        ]
-    return made
-
-
 def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> Verdict:
     """Decide, by chain ("scan", "target"), from the evidence and the calibrated states that it was weighed against."""
     tests = [(name, h) for name in evidences for h in hypotheses(name, states[name].camera.fx)]
-    found = np.array([_log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
+    found = np.array([log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
     rng = np.random.default_rng(0)
-    drawn = np.empty((DRAWS, len(tests)))
+    scores = {}
     for name, weighed in evidences.items():
         root = covariance_root(weighed.information)
-        scores = rng.normal(size=(DRAWS, root.shape[1])) @ root.T
-        for k, (chain, h) in enumerate(tests):
-            if chain == name:
-                drawn[:, k] = _log_factor(weighed, h, scores)
-    threshold = float(np.quantile(_log_mean(drawn), 1 - FALSE_ALARMS))
+        scores[name] = rng.normal(size=(DRAWS, root.shape[1])) @ root.T
+    drawn = np.stack([log_factor(evidences[name], h, scores[name]) for name, h in tests], axis=1)
+    threshold = float(np.quantile(log_mean(drawn), 1 - FALSE_ALARMS))
     fit = {}
     for name, weighed in evidences.items():
         fit[f"{name} dots"] = weighed.dots
         if np.isfinite(weighed.stripe):
             fit["stripe"] = weighed.stripe
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
-    return Verdict(float(_log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures)
-
-
-def _log_factor(weighed: Evidence, h: Hypothesis, scores: Array) -> Array:
-    """Logarithms (n,) of the Bayes factor for a Gaussian change of size `h.size` against none, for scores (n, 27)."""
-    index, size = list(h.index), np.array(h.size)
-    information = weighed.information[np.ix_(index, index)] * size[:, None] * size
-    posterior = np.eye(len(index)) + information
-    s = scores[:, index] * size
-    gain = 0.5 * np.einsum("ni,ni->n", s, np.linalg.solve(posterior, s.T).T)
-    return np.asarray(gain - 0.5 * np.linalg.slogdet(posterior)[1], dtype=np.float64)
-
-
-def _log_mean(factors: Array) -> Array:
-    """Logarithm (n,) of the mean of exp over the last axis of (n, k)."""
-    most = factors.max(axis=1)
-    return np.asarray(most + np.log(np.mean(np.exp(factors - most[:, None]), axis=1)), dtype=np.float64)
+    seen = detectable(evidences, states, tests, scores, drawn, threshold)
+    return Verdict(float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, seen)
 
 
 def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothesis]], found: Array) -> list[Suspect]:

@@ -22,6 +22,12 @@ from drivers.errors import CalibrationStale, RefusedError
 SWEEP_PROFILES, STRIPE_POINTS = 24, 40
 """Enough of a sweep, as means of neighbouring rows: neighbouring profiles share the rail's error."""
 LEAST_PROFILES = 10
+LEAST_SWEEP_M = 0.01
+"""Of rail between the first and the last profile on the board.
+
+All stripes in one place fit any board that is turned about them: what is left of their scatter is nothing at all, and
+the light plane's evidence is made of rounding errors.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +85,12 @@ def scan_looks(state: State, seen: CheckObservations) -> list[Look]:
         raise RefusedError(
             f"{len(lit)} of {len(few)} profiles of the sweep cross the fine board, at least {LEAST_PROFILES} are "
             "needed; is the laser on, and does it light the board?"
+        )
+    way = float(np.ptp([look.data.rail for look in lit]))
+    if way < LEAST_SWEEP_M:
+        raise RefusedError(
+            f"the stripe crosses the fine board over {1e3 * way:.1f} mm of the rail's way, at least "
+            f"{1e3 * LEAST_SWEEP_M:.0f} mm are needed: does the rail move, and does the board lie in the sweep?"
         )
     return looks + lit
 

@@ -24,11 +24,11 @@ def verify(
     from rich.progress import Progress
     from rich.table import Table
 
-    from cell.bench.verification import CHECKS_OF_A_GOOD_ONE, campaign, disturbances
+    from cell.bench.verification import CHECKS_OF_A_GOOD_ONE, KINDS_OF_CHANGE, campaign, disturbances
 
     chosen = disturbances()
     with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=seeds * (len(chosen) + 1))
+        task = bar.add_task("", total=seeds * (len(chosen) + KINDS_OF_CHANGE + 1))
 
         def progress(text: str) -> None:
             bar.update(task, advance=1, description=text)
@@ -38,14 +38,29 @@ def verify(
         print_json(summary)
         return
     table = Table(title=f"verification over {seeds} worlds, level {level.value}")
-    columns = ("disturbance", "checks", "found %", "its part named first %", "among the suspects %")
+    columns = (
+        "disturbance",
+        "checks",
+        "found %",
+        "in 95 % from",
+        "unit",
+        "its part named first %",
+        "among the suspects %",
+    )
     for k, name in enumerate(columns):
         table.add_column(name, justify="right" if k else "left")
     for row in summary["disturbances"]:
-        keys = ("checks", "found_percent", "named_first_percent", "among_suspects_percent")
+        keys = ("checks", "found_percent", "detectable_mean", "unit", "named_first_percent", "among_suspects_percent")
         table.add_row(row["name"], *(str(row[key]) for key in keys))
     console = Console()
     console.print(table)
+    promised = Table(title="changes as large as the verification says it finds in 95 % of checks")
+    for k, name in enumerate(("part", "change", "mean", "largest", "wanted", "unit", "checks", "found %")):
+        promised.add_column(name, justify="right" if k > 1 else "left")
+    for row in summary["detectable"]:
+        promised.add_row(*(str(value) for value in row.values()))
+    console.print(promised)
+    console.print(f"found of changes of this size: {summary['found_at_detectable_percent']:g} %")
     console.print(
         f"false alarms: {summary['false_alarm_percent']:g} % of {summary['checks_of_good']} checks of good "
         f"calibrations, {CHECKS_OF_A_GOOD_ONE} per world"

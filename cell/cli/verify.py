@@ -68,6 +68,16 @@ def print_verification(summary: Mapping[str, Any]) -> None:
             f"{kind}: residual over the calibration's", f"{value:.2f}", "1", f"≤ {summary['residuals_allowed']}"
         )
     console.print(table)
+    seen = Table(title=f"changes that show in {summary['detectable_share']:.0%} of checks like this one")
+    for name in ("part", "change", "from", "wanted", "unit"):
+        seen.add_column(name, justify="right" if name in ("from", "wanted") else "left")
+    for row in summary["detectable"]:
+        size = "none" if row["size"] is None else f"{row['size']:.3f}"
+        enough = row["size"] is not None and row["size"] <= row["wanted"]
+        seen.add_row(
+            row["part"], row["change"], size, f"{row['wanted']:g}", row["unit"], style=None if enough else "yellow"
+        )
+    console.print(seen)
     if summary["suspects"]:
         suspects = Table(title="suspected parts")
         for name in ("part", "probability", "place error in mm", "most probable change"):

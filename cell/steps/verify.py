@@ -1,29 +1,24 @@
 """Verifying the calibration: one view of each deck board, approached several times, and one sweep over the fine board.
 
-The views are poses of the calibration itself, so that the arm's kinematic error is the same; approaching them anew
-averages its repeatability. In each approach the scan camera photographs its board from both ends of the way that the
-rail can go with the board in view.
+The views are the calibration's own, aimed with what it found: near enough to its poses that the arm's kinematic error
+is the same. Approaching them anew averages the arm's repeatability. In each approach the scan camera photographs its
+board from both ends of the way that the rail can go with the board in view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from cell.assembly import Devices
 from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.place_effect import scan_effect, target_effect
-from cell.calibration.results import PARAMETERS
-from cell.calibration.verification import FALSE_ALARMS, WORST_FIT, Suspect, Verdict
-from cell.calibration.verification_looks import CheckObservations, verify
+from cell.calibration.verification_looks import CheckObservations
 from cell.config import CellConfig
-from cell.geometry.poses import from_parts, from_ur
-from cell.job import Job, ScanSection
-from cell.planning import ScanPlan, View, centre_of, rail_ends, verification_views
+from cell.geometry.poses import from_ur
+from cell.job import ScanSection
+from cell.planning import ScanPlan, View, rail_ends, verification_views
 from cell.reconstruction import ScanGeometry
 from cell.steps.collect import PHOTO_RATE, Check, Progress, move_to_view
 from cell.steps.moves import HOME, Mover
@@ -31,7 +26,7 @@ from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, SweepErrors
 from cell.stored_calibration import CellCalibration
 from cell.vision import BoardSpec, BoardView, StripeProfile, find_board, parse_board
-from drivers.errors import CalibrationStale, RefusedError
+from drivers.errors import RefusedError
 from drivers.interfaces import Camera
 
 SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
@@ -40,125 +35,15 @@ BACK_M = 0.02
 SWEEP_SPEED, SWEEP_RATE = "12 mm/s", "10 Hz"
 
 
-@dataclass(frozen=True, eq=False)
-class Verification:
-    """The verdict with its expected effect on the place: `effects` in m, in the order of `verdict.suspects`."""
-
-    verdict: Verdict
-    effects: list[float]
-    date: str
-
-    @classmethod
-    def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Verification:
-        """Compare what was seen with the calibration, and reckon the effect for a job."""
-        verdict = verify(calibration.scan, calibration.target, seen)
-        board = parse_board(job.board.spec)
-        camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
-        place = (camera_from_board * job.place_from_board.inverse()).translation
-
-        def effect(suspect: Suspect) -> float:
-            if suspect.chain == "target":
-                return target_effect(calibration.target, suspect.change, place)
-            # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
-            half = 0.5 * job.scan.length
-            return scan_effect(calibration.scan, suspect.change, job.scan.stand_off, (-half, half))
-
-        return cls(verdict, [effect(suspect) for suspect in verdict.suspects], calibration.date)
-
-    @property
-    def good(self) -> bool:
-        """True when nothing speaks for a change."""
-        return self.verdict.good
-
-    @property
-    def reason(self) -> str:
-        """The decision in words, and the next step."""
-        v = self.verdict
-        if v.good:
-            return (
-                f"the calibration of {self.date} is good: nothing speaks for a change (log odds {v.statistic:.1f}, "
-                f"chance reaches {v.threshold:.1f} in {FALSE_ALARMS:.0%} of checks)"
-            )
-        if v.statistic <= v.threshold:
-            worst = "; ".join(f"{kind} {v.fit[kind]:.1f} times" for kind in v.badly_fitting)
-            return (
-                f"the observations fit worse than when the calibration of {self.date} was made, and no moved part "
-                f"explains it: {worst} the residuals of then, allowed {WORST_FIT:g}; see whether the boards are clean "
-                "and flat and the lenses in focus, then run `cell calibrate`"
-            )
-        named = " or ".join(
-            f"the {s.part}{_DECK.get(s.part, '')} ({s.probability:.0%}, {1e3 * effect:.2f} mm)"
-            for s, effect in zip(v.suspects, self.effects, strict=True)
-        )
-        return (
-            f"the calibration of {self.date} is not good any more (log odds {v.statistic:.1f}, allowed "
-            f"{v.threshold:.1f}): suspected is {named}, in brackets its probability and the place error to expect; "
-            "fasten what is loose, then run `cell calibrate`"
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """For reports, units in the names."""
-        v = self.verdict
-        return {
-            "good": v.good,
-            "reason": self.reason,
-            "calibration_date": self.date,
-            "log_odds": round(v.statistic, 3),
-            "log_odds_allowed": round(v.threshold, 3),
-            "residuals_over_calibration": {kind: round(value, 3) for kind, value in v.fit.items()},
-            "residuals_allowed": WORST_FIT,
-            "suspects": [
-                {
-                    "part": s.part,
-                    "probability": round(s.probability, 3),
-                    "change": _named(s.change),
-                    "place_error_mm": round(1e3 * effect, 4),
-                }
-                for s, effect in zip(v.suspects, self.effects, strict=True)
-            ]
-            if not v.good
-            else [],
-            "figures": [
-                {"name": f.name, "value": round(f.value, 5), "sigma": round(f.sigma, 5), "unit": f.unit}
-                for f in v.figures
-            ],
-        }
-
-
-_DECK = {
-    "scan camera's mount on the flange": ", or the fine board on the deck",
-    "target camera's mount on the flange": ", or the large board on the deck",
-}
-
-
-def _named(change: np.ndarray) -> dict[str, float]:
-    """The parameters that change, px or relative as they are, m as mm and rad as mrad."""
-    made = {}
-    for k, name in enumerate(PARAMETERS):
-        if change[k] == 0.0:
-            continue
-        plain = name[0] in "fck"
-        unit = "" if plain else "_per_mille" if name.startswith("rail") else "_mrad" if _angle(name) else "_mm"
-        made[name.replace(" ", "_") + (unit or "_px")] = round(float(change[k]) * (1.0 if plain else 1e3), 4)
-    return made
-
-
-def _angle(name: str) -> bool:
-    return "tilt" in name or name.split()[-1] in ("rx", "ry", "rz")
-
-
 def collect_verification(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check, progress: Progress
 ) -> CheckObservations:
     """Take all pictures. Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference."""
-    reference = calibration.scan.reference
-    if reference is None:
-        raise CalibrationStale(
-            f"the calibration of {calibration.date} holds no reference to verify against; run `cell calibrate` once"
-        )
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
-    scan_view, target_view = verification_views(config, fine, large)
-    ends = rail_ends(calibration.scan, reference.base_from_board, scan_view, fine, config.rail.travel)
+    scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
+    assert calibration.scan.reference is not None
+    base_from_board = calibration.scan.reference.base_from_board
+    ends = rail_ends(calibration.scan, base_from_board, scan_view, fine, config.rail.travel)
     if not devices.rail.state().homed:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
