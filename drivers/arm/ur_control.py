@@ -23,7 +23,8 @@ _LOOKAHEAD, _GAIN = 0.05, 500
 _SERVO_BRAKING = 10.0
 _KICK_S = 0.1
 _SLIP_S = 0.004
-_BLIND_S = 0.1
+_BLIND_S, _FEELING_S = 0.1, 0.02
+"""How far streaming may run ahead of what the arm has reported, in seconds on the wall: at most, and in contact."""
 _SETTLE_S = 3.0
 _REST_S = 0.02
 _JOINT_TOLERANCE, _PLACE_TOLERANCE, _TURN_TOLERANCE = 2e-3, 1e-3, 2e-3
@@ -203,7 +204,9 @@ class ControlThread:
     def _stream(self, trajectory: Trajectory, force_limit: float | None) -> End:
         """Stream the trajectory, time running `rate` times as fast as the wall, then stand still."""
         force_before = self._mean_force() if force_limit is not None else ()
+        allowed = _BLIND_S if force_limit is None else _FEELING_S
         start = time.monotonic()
+        seen, lead = self._latest().device_time, 0.0
         cycle, how, text = 0, "", ""
         while not how:
             due = start + cycle * PERIOD
@@ -213,16 +216,20 @@ class ControlThread:
                 # The machine held this thread up. Going on where the arm is told to stand, not where it should have
                 # been by now: the latter would be a jump.
                 start += late
+            newest = self._latest().device_time
+            lead, seen = max(0.0, lead - (newest - seen) / self._setup.rate), newest
             elapsed = cycle * PERIOD * self._setup.rate
-            if not self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
+            if lead > allowed:
+                # The arm would go on unseen, and what is sent would pile up before it and before the next stop.
+                start += PERIOD
+                self._kick()
+            elif self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
+                cycle += 1
+                lead += PERIOD
+            else:
                 how, text = self._problem() or ("arm.refused", "the controller did not accept a streamed point")
                 break
             how, text = self._stream_end(trajectory, elapsed, force_before, force_limit)
-            if time.monotonic() - self._latest().stamp < _BLIND_S:
-                cycle += 1
-            else:
-                # No way forward while the arm's state is not seen.
-                start += PERIOD
         self._control.servoStop(_SERVO_BRAKING)
         if how == "arrived":
             return self._settled(lambda snapshot: _off(snapshot, trajectory.end))

@@ -87,7 +87,7 @@ def _main(speed: float, table: float | None) -> None:
             case ["show"]:
                 answer = {
                     "outputs": model.digital_outputs, "moving": model.moving, "q": model.drive.q.tolist(),
-                    "payload": model.payload[0], "tcp": model.drive.flange_from_tcp.tolist(),
+                    "fault": model.fault_text, "payload": model.payload[0], "tcp": model.drive.flange_from_tcp.tolist(),
                 }  # fmt: skip
             case [fault]:
                 model.fault(fault)
