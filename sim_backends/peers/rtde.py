@@ -28,7 +28,7 @@ from sim_backends.peers.script import ControlProgram, ScriptText
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
-_CATCH_UP = 25
+_CATCH_UP = 100
 """Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 
@@ -97,10 +97,10 @@ class RtdePeer:
                 self._clock.sleep_until(due)
                 late = self._clock.now() - due
                 self._note(late)
-                skipped = late > _CATCH_UP * period
-                due = self._clock.now() if skipped else due
-                self._tick(due, skipped)
+                self._tick(due)
                 due += period
+                if self._clock.now() - due > _CATCH_UP * period:
+                    due = self._clock.now()
         finally:
             self._ports.close()
 
@@ -109,20 +109,19 @@ class RtdePeer:
         if len(self.lateness) > 20000:
             del self.lateness[:10000]
 
-    def _tick(self, t: float, skipped: bool) -> None:
-        """Serve and advance to `t`; `skipped` when this is the only tick for a longer time."""
+    def _tick(self, t: float) -> None:
         self._tick_count += 1
         waiting = set(self._sessions)
         for port, client, data in self._ports.poll():
             if port == RTDE_PORT:
                 waiting.discard(client)
-                self._serve_rtde(client, data, skipped)
+                self._serve_rtde(client, data)
             elif port == DASHBOARD_PORT:
                 self._serve_dashboard(client, data)
             else:
                 self._serve_script(client, data)
         for client in waiting:
-            self._sessions[client].feed(b"", skipped)
+            self._sessions[client].feed(b"")
         self._program.tick()
         self._model.tick(t)
         self._view.runtime_state = self._program.runtime_state
@@ -130,14 +129,14 @@ class RtdePeer:
             if session.started:
                 session.send_state(self._view, self._tick_count)
 
-    def _serve_rtde(self, client: Client, data: bytes | None, everything: bool) -> None:
+    def _serve_rtde(self, client: Client, data: bytes | None) -> None:
         if data is None:
             session = self._sessions.pop(client, None)
             self._owners = {name: owner for name, owner in self._owners.items() if owner is not session}
             return
         if client not in self._sessions:
             self._sessions[client] = Session(self, client)
-        self._sessions[client].feed(data, everything)
+        self._sessions[client].feed(data)
 
     def _serve_dashboard(self, client: Client, data: bytes | None) -> None:
         if data is None:

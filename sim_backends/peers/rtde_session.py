@@ -44,12 +44,12 @@ class Session:
         self._outputs: list[OutputRecipe] = []
         self.started = False
 
-    def feed(self, data: bytes, everything: bool = False) -> None:
+    def feed(self, data: bytes) -> None:
         """Handle what arrived; a header that cannot be one ends the connection.
 
         One data packet is taken each tick, now and then a second one: a stream of targets that piled up while the
-        machine was busy is then followed about as it was sent, not as one jump. `everything` takes all of them, for a
-        tick that makes up for many. Call with no data in ticks in which nothing arrived.
+        machine was busy is then followed about as it was sent, not as one jump. Call with no data in ticks in which
+        nothing arrived.
         """
         self._buffer += data
         self._calls += 1
@@ -66,7 +66,7 @@ class Session:
             if handler is not None:
                 handler(self, payload)
             left -= chr(kind) == "U"
-            if left <= 0 and len(self._buffer) < _FLOOD and not everything:
+            if left == 0 and len(self._buffer) < _FLOOD:
                 return
 
     def send_state(self, view: View, tick: int) -> None:

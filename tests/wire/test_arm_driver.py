@@ -77,15 +77,13 @@ def lowering(arm, depth, seconds):
     """Times and joints of a straight descent, with the joints that the arm itself reports along such a move."""
     top = arm.state()
     goal = top.flange - np.array([0, 0, depth, 0, 0, 0])
-    moving = arm.move_linear(goal, 0.2, 1.0)
+    with arm.record() as states:
+        arm.move_linear(goal, 0.1, 1.0).wait(10.0)
     joints, heights = [top.joints], [top.flange[2]]
-    while not moving.done:
-        state = arm.state()
+    for state in states:
         if state.flange[2] < heights[-1] - 1e-4:
             joints.append(state.joints)
             heights.append(state.flange[2])
-        Clock().sleep(0.004)
-    moving.wait(1.0)
     arm.move_joints(top.joints, 1.0, 2.0).wait(10.0)
     times = (heights[0] - np.array(heights)) / depth * seconds
     return times, np.array(joints)
