@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
-from scipy import stats
+from scipy.special import fdtrc
 
 from cell.calibration.adjustment import Adjusted
 from cell.calibration.blocks import CAMERA, FLANGE, ViewData, dots_block
@@ -107,7 +107,7 @@ def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> No
     test = float(bend @ np.linalg.solve(covariance[8:, 8:] * variance, bend)) / 3
     heights = _shapes((whole - middle) / half) @ bend
     size, allowed = float(np.ptp(heights)), LARGEST_BEND * 2 * half
-    if size > allowed and stats.f.sf(test, 3, freedom) < CHANCE:
+    if size > allowed and fdtrc(3, freedom, test) < CHANCE:
         across = [np.ptp(_shapes((whole - middle) * axis / half) @ bend) for axis in (np.eye(3)[0], np.eye(3)[1])]
         raise RefusedError(
             f"the {board} board is not flat: its dots stand {1e3 * size:.2f} mm out of a plane "
@@ -162,7 +162,7 @@ def refuse_slipped(
             best = float(test), first, solution[:6]
     test, first, moved = best
     shift, turn = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
-    if stats.f.sf(test, 6, freedom) * count < CHANCE and (shift > LARGEST_SLIP_M or turn > LARGEST_SLIP_RAD):
+    if fdtrc(6, freedom, test) * count < CHANCE and (shift > LARGEST_SLIP_M or turn > LARGEST_SLIP_RAD):
         raise RefusedError(
             f"the {camera} camera's mount slipped on the flange before {names[first]}: from there on the camera sits "
             f"{1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from where it was, allowed {1e3 * LARGEST_SLIP_M:g} mm "

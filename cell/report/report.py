@@ -12,7 +12,6 @@ from cell.config import CellConfig
 from cell.geometry.poses import to_ur, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
-from cell.report.pictures import run_picture
 from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
 from cell.runs import REPORT, write_json
 from cell.steps.laser_sweep import SweepRecord
@@ -137,6 +136,9 @@ def _add_truth(
 
 
 def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, report: dict[str, Any]) -> None:
+    # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
+    from cell.report.pictures import run_picture
+
     stripe: tuple[Image, Vector, Vector] | None = None
     cloud: tuple[Vector, Vector] | None = None
     sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))

@@ -13,6 +13,6 @@ from tests.wire.cells import cell
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the calibration of the simulated cell of seed 3; tests run jobs in it."""
     folder = tmp_path_factory.mktemp("cell")
-    done = cell("calibrate", "--sim", "all", "--seed", "3", "--json", folder=folder)
+    done = cell("calibrate", "--sim", "all", "--seed", "3", "--json", folder=folder, timeout=900.0)
     assert done.returncode == 0, done.stderr
     return folder
