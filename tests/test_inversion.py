@@ -218,11 +218,11 @@ def test_the_pose_is_found_from_twenty_degrees_and_eight_millimetres_away(height
 def test_at_least_99_of_100_starts_lead_to_the_true_pose(height: Height) -> None:
     rng = np.random.default_rng(11)
     lost = 0
-    for k in range(200):
+    for k in range(100):
         scan = Scan.of(scanned(height, k, missing=0.4 * (k % 2)), 3000)
         found = register(scan, nominal(height), Prior(start_away(rng, 0.008, 20.0), LOOSE))
         lost += bool(np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) > 1e-4)
-    assert lost <= 2
+    assert lost <= 1
 
 
 def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
