@@ -1,4 +1,4 @@
-"""What several of the wire tests start from."""
+"""What several of the wire tests start from, and what becomes of a failure while the machine stood still."""
 
 from __future__ import annotations
 
@@ -7,6 +7,29 @@ from pathlib import Path
 import pytest
 
 from tests.wire.cells import cell
+from tests.wire.heartbeat import Heartbeat
+
+_heartbeat = pytest.StashKey[Heartbeat]()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A failure says nothing when the machine stood still meanwhile: such a test, and no other, is repeated."""
+    config.stash[_heartbeat] = Heartbeat()
+    for item in items:
+        if item.get_closest_marker("wire") is not None:
+            item.add_marker(pytest.mark.flaky(reruns=3, condition=config.stash[_heartbeat].missed))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """End what was started."""
+    if _heartbeat in session.config.stash:
+        session.config.stash[_heartbeat].end()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Watch from the first of the test's fixtures on."""
+    item.config.stash[_heartbeat].watch()
 
 
 @pytest.fixture(scope="session")
