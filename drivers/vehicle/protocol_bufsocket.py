@@ -1,14 +1,18 @@
 """pyserial URL handler `bufsocket://HOST:PORT`: its `socket://`, with what has arrived read in one go.
 
 python-can's slcan asks for every byte by itself, which on a plain socket costs two system calls each: at the vehicle's
-1000 frames a second that is a third of a processor.
+1000 frames a second that is a third of a processor. And pyserial calls a write late that was taken at once when the
+machine does not run the writer for the length of the timeout.
 """
 
 from __future__ import annotations
 
 import select
 import socket
+import time
+from typing import Any
 
+from serial import PortNotOpenError, SerialException, SerialTimeoutException
 from serial.urlhandler import protocol_socket
 
 _CHUNK = 4096
@@ -34,6 +38,25 @@ class Serial(protocol_socket.Serial):
             self._buffer = super().read(1)
         data, self._buffer = self._buffer[:size], self._buffer[size:]
         return data
+
+    def write(self, data: Any) -> int:
+        """Send all of `data`; raises when the other end takes none of it for as long as the port's write timeout says.
+
+        Raises SerialTimeoutException then, SerialException when the connection is lost.
+        """
+        if not self.is_open:
+            raise PortNotOpenError
+        left, timeout = memoryview(data), self.write_timeout
+        end = None if timeout is None else time.monotonic() + timeout
+        while left:
+            try:
+                left = left[self._socket.send(left) :]
+            except BlockingIOError:
+                if not select.select([], [self._socket], [], end and max(0.0, end - time.monotonic()))[1]:
+                    raise SerialTimeoutException("write timeout") from None
+            except OSError as error:
+                raise SerialException(f"write failed: {error}") from error
+        return len(data)
 
     def reset_input_buffer(self) -> None:
         """Forget what has arrived."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import can
 import numpy as np
 import pytest
+import serial
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
@@ -260,3 +262,23 @@ def test_nobody_on_the_bus_is_named() -> None:
         )
     with pytest.raises(ConfigError, match="carrier-pigeon"):
         AgilexVehicle("vehicle", "carrier-pigeon", "x", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
+
+
+def test_a_writer_that_was_not_run_for_long_is_not_a_stuck_adapter() -> None:
+    """What the other end took at once was not late; one that takes nothing is."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = serial.serial_for_url(f"bufsocket://127.0.0.1:{server.getsockname()[1]}", write_timeout=1e-9)
+        other, _ = server.accept()
+        with other:
+            for _ in range(200):
+                assert port.write(b"t1118\r") == 6
+            assert other.recv(5) == b"t1118"
+            port.write_timeout = 0.05
+            with pytest.raises(serial.SerialTimeoutException):
+                for _ in range(1000):
+                    port.write(bytes(65536))
+            other.shutdown(socket.SHUT_RDWR)
+        with pytest.raises(serial.SerialException):
+            for _ in range(1000):
+                port.write(b"t1118\r")
+        port.close()
