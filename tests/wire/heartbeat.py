@@ -13,23 +13,24 @@ import time
 
 LATE_S = 0.05
 
+# Standard input ends with the process that started it, however that ended.
 _CODE = f"""
-import time
-while True:
-    due = time.monotonic() + 0.005
-    time.sleep(0.005)
-    late = time.monotonic() - due
-    if late > {LATE_S}:
-        print(time.monotonic(), flush=True)
+import select, sys, time
+due = time.monotonic() + 0.005
+while not select.select([sys.stdin], [], [], 0.005)[0]:
+    now = time.monotonic()
+    if now - due > {LATE_S}:
+        print(now, flush=True)
+    due = now + 0.005
 """
 
 
 class Heartbeat:
-    """The process; `since` begins to watch, `missed` says whether the machine stood still since then."""
+    """The process; `watch` begins to watch, `missed` says whether the machine stood still since then."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CODE], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
+            [sys.executable, "-c", _CODE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
         assert self._process.stdout is not None
         self._pipe = self._process.stdout.fileno()
