@@ -20,8 +20,8 @@ WANTED = frozenset({*CYCLIC, "VersionResponse"})
 _FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
-STILL = 0.002
-"""What is reported of a standing vehicle is at most this, m/s and rad/s: its encoders flicker by a step."""
+_STILL = 0.002
+"""Reported speeds up to this, m/s and rad/s, count as standstill: two steps of the protocol."""
 
 
 def patience(clock: Clock, seconds: float) -> float:
@@ -84,7 +84,7 @@ class Feedback:
     def stands(self, since: float) -> bool:
         """True when the vehicle has reported standstill after host time `since`."""
         motion = self._newest["MotionState"][1]
-        return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= STILL
+        return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= _STILL
 
     def state(self, max_age: float, braked: bool) -> VehicleState:
         """All as one record; `DeadlineError` when it is older than `max_age` s.

@@ -17,7 +17,6 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.agilex import AgilexVehicle
-from drivers.vehicle.feedback import STILL
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.agilex import AgilexPeer
@@ -26,8 +25,8 @@ pytestmark = pytest.mark.wire
 
 SPEED = 5.0
 TRACK = 0.583
-STANDSTILL = STILL + 0.0005
-"""The vehicle reports whole mm/s."""
+STANDSTILL = 0.0025
+"""Up to 2 mm/s count as standstill, m/s, and the vehicle reports whole mm/s."""
 
 
 @dataclass
