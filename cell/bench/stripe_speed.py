@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.bench.stripe_truth import Cell, draw
-from cell.vision.stripe import Method, StripeSettings, extract
+from cell.vision.stripe import Method, StripeProfile, StripeSettings, extract
 from cell.vision.stripe_methods import gaussian_derivatives
 from cell.vision.stripe_stream import StripeStream, extract_all
 
@@ -90,9 +90,8 @@ def _stream(images: list[Image]) -> None:
         stream.extract(image)
 
 
-def _two_cores(images: list[Image]) -> None:
-    for _ in extract_all(images, threads=2):
-        pass
+def _two_cores(images: list[Image]) -> list[StripeProfile]:
+    return list(extract_all(images, threads=2))
 
 
 def _best(run: Run, images: list[Image], repeats: int) -> float:

@@ -1,7 +1,8 @@
 """Child side: the thread that commands the arm. One request at a time; a stop overtakes everything.
 
 Moves are started asynchronously and watched, since a synchronous one cannot be interrupted. A joint trajectory is
-streamed on absolute deadlines of 2 ms. While nothing else is sent, the controller's watchdog is kept quiet.
+streamed on absolute deadlines of 2 ms, never far ahead of what the arm has reported. While nothing else is sent, the
+controller's watchdog is kept quiet.
 """
 
 from __future__ import annotations

@@ -52,7 +52,8 @@ class Serial(protocol_socket.Serial):
             try:
                 left = left[self._socket.send(left) :]
             except BlockingIOError:
-                if not select.select([], [self._socket], [], end and max(0.0, end - time.monotonic()))[1]:
+                wait = None if end is None else max(0.0, end - time.monotonic())
+                if not select.select([], [self._socket], [], wait)[1]:
                     raise SerialTimeoutException("write timeout") from None
             except OSError as error:
                 raise SerialException(f"write failed: {error}") from error
