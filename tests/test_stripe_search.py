@@ -7,7 +7,7 @@ import pytest
 
 from cell.bench.stripe_truth import Cell, draw
 from cell.vision import stripe_numpy, stripe_search
-from cell.vision.stripe_find import CANDIDATES, ENERGY, START
+from cell.vision.stripe_find import CANDIDATES, CUT, ENERGY, NOWHERE, START
 
 SHAPE = (200, 333)
 LEAST_PEAK, SATURATION = 8.0, 255
@@ -54,7 +54,10 @@ def test_any_line_is_searched_as_without_a_compiler(name, with_dark):
     starts, several = [], []
     for engine in (stripe_search, stripe_numpy):
         start = np.zeros((len(image), CANDIDATES, START))
-        several.append(engine.find_lines(image, seen, dark, SATURATION, LEAST_PEAK, start))
+        cut, cut_at = np.zeros((len(image), CUT), np.uint8), np.full(len(image), NOWHERE)
+        several.append(engine.find_lines(image, seen, dark, SATURATION, LEAST_PEAK, start, cut, cut_at))
         starts.append(start)
+        for r in np.flatnonzero(cut_at != NOWHERE):
+            np.testing.assert_array_equal(cut[r], image[r, cut_at[r] : cut_at[r] + CUT])
     np.testing.assert_allclose(starts[0], starts[1], atol=1e-3)
     assert several[0] == several[1] == bool(starts[0][:, 1, ENERGY].any())

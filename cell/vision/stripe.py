@@ -134,8 +134,9 @@ def extract(
     noise2, whole = pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
+    cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
     search = (stripe_search if quick else stripe_numpy).find_lines
-    several = search(work, seen, shade, settings.saturation_dn, least, start)
+    several = search(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
@@ -146,8 +147,8 @@ def extract(
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
         (fit if quick else stripe_numpy).fit_lines(
-            work, shade, start, widths, np.log(widths), which, settings.saturation_dn, (noise2, gain, contrast),
-            of_dark, rho, settings.steps, fitted,
+            work, cut, cut_at, shade, start, widths, np.log(widths), which, settings.saturation_dn,
+            (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
         )  # fmt: skip
 
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
@@ -166,19 +167,11 @@ def extract(
     else:
         variance = noise2, gain, frames if dark is not None else 0
         fitted = METHODS[method](work, shade, start, found, variance, (contrast, rho), settings)
-    believe(fitted, start, work.shape[1], low, high, 0.5 * least, 1 + SECOND_ORDER * contrast**2)
-    centres = fitted[fit.FIT_CENTRE]
-    there = centres == centres
-    return StripeProfile(
-        axis=axis,
-        centres=centres,
-        sigma=fitted[fit.SIGMA],
-        amplitude=fitted[fit.AMPLITUDE],
-        width=fitted[fit.WIDTH],
-        saturated=there & (start[:, 0, find.CORE] > 0),
-        double=there & double,
-        speckle=speckle,
-    )
+    saturated = np.empty(len(work), np.bool_)
+    excess = 1 + SECOND_ORDER * contrast**2
+    believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
+    centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
+    return StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle)
 
 
 def _check(image: Image, dark: Any) -> None:

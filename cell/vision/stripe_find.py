@@ -2,6 +2,9 @@
 
 A line is an image row, or a column for stripes along columns. This search takes any line; `stripe_search.py` runs it
 where a line is not an ordinary one. `stripe_numpy.py` says the same without a compiler.
+
+Loops that run for every line take the whole picture and the line's number: a view of the line is counted as a reference
+by the compiler, which costs as much as the loop. Unsigned indices save the question whether they count from the end.
 """
 
 from __future__ import annotations
@@ -19,33 +22,37 @@ CANDIDATES = 2
 
 BLOCK = 128
 SEARCH = 12
+# Pixels around a line's brightest one that are kept for the fit, which finds the line itself no longer near.
+CUT = 64
+NOWHERE = -(10**6)
 # What is elsewhere in the line competes for being the stripe from this share of the first peak's height on.
 RIVAL = 0.15
 TRIES = 3
 
 
 @compiled_fast
-def largest(row: Any) -> int:
-    """Largest value of some pixels, 0 when there are none."""
+def largest(picture: Any, r: int, low: int, high: int) -> int:
+    """Largest value of the pixels low … high − 1 of line `r`, 0 when there are none."""
     top = np.uint8(0)
-    for i in range(len(row)):
-        top = row[i] if row[i] > top else top
+    for i in range(np.uint64(low), np.uint64(max(low, high))):
+        top = picture[r, i] if picture[r, i] > top else top
     return int(top)
 
 
 @compiled_fast
-def largest_outside(row: Any, low: int, high: int) -> int:
-    """Largest value of a line outside low … high."""
-    return int(max(largest(row[: max(0, low)]), largest(row[min(len(row), high + 1) :])))
+def largest_outside(picture: Any, r: int, low: int, high: int) -> int:
+    """Largest value of line `r` outside of low … high."""
+    n = picture.shape[1]
+    return int(max(largest(picture, r, 0, low), largest(picture, r, min(n, high + 1), n)))
 
 
 @compiled
-def first_at(row: Any, top: int) -> int:
-    """Where a line first reaches its largest value `top`: block by block, for a block's maximum is quickly had."""
+def first_at(picture: Any, r: int, top: int) -> int:
+    """Where line `r` first reaches its largest value `top`: block by block, for a block's maximum is quickly had."""
     begin = 0
-    while begin + BLOCK < len(row) and largest(row[begin : begin + BLOCK]) < top:
+    while begin + BLOCK < picture.shape[1] and largest(picture, r, begin, begin + BLOCK) < top:
         begin += BLOCK
-    while row[begin] < top:
+    while picture[r, begin] < top:
         begin += 1
     return begin
 
@@ -61,7 +68,9 @@ def _rises(row: Any, begin: int, end: int, rises: Any) -> int:
     for i in range(size):
         beside = left[i] if left[i] > right[i] else right[i]
         rises[i] = here[i] - beside if here[i] > beside else 0
-    top: int = largest(rises[:size])
+    top = 0
+    for i in range(size):
+        top = max(top, int(rises[i]))
     return top
 
 
@@ -165,10 +174,10 @@ def find_line(
     True when it has two peaks. `window` (n,) and `rises` (n,) are overwritten.
     """
     row = seen[r]
-    top = largest(row)
+    top = largest(seen, r, 0, len(row))
     if top < least_peak:
         return False
-    place = first_at(row, top)
+    place = first_at(seen, r, top)
     found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
     low = high = place
     for _ in range(TRIES - 1):
@@ -183,7 +192,7 @@ def find_line(
         return False
     reach = reach_of(start[r, 0, WIDTH], int(start[r, 0, CORE]))
     low, high = place - reach, place + reach
-    if largest_outside(row, low, high) < rival_limit(start[r, 0, BACKGROUND], start[r, 0, HEIGHT], least_peak):
+    if largest_outside(seen, r, low, high) < rival_limit(start[r, 0, BACKGROUND], start[r, 0, HEIGHT], least_peak):
         return False
     place = _prominent(row, low, high, rises)
     if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, 1):

@@ -44,7 +44,9 @@ _ROW = FISHER = 30 * LANES
 # At the origin: z, background and its rise per z; the Gaussian and its ratio to the next pixel, upwards and downwards.
 _Z, _INVERSE, _BASE, _RISE = (k * LANES for k in range(35, 39))
 _UP, _UP_RATIO, _DOWN, _DOWN_RATIO, _SHRINK = (k * LANES for k in range(39, 44))
-NUMBERS = 44 * LANES
+# The first and last pixel that a lane may use, from its origin, and how many it uses.
+LOW, HIGH, USED = (k * LANES for k in range(44, 47))
+NUMBERS = 47 * LANES
 
 
 @compiled_fast

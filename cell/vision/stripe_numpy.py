@@ -16,8 +16,10 @@ from cell.vision import stripe_lanes as lane
 CHUNK = 256
 
 
-def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> bool:
-    """As `stripe_search.find_lines`."""
+def find_lines(
+    image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any, _cut: Any, _cut_at: Any
+) -> bool:
+    """As `stripe_search.find_lines`, but for what that one keeps for the fit, which here has no use for it."""
     lines = np.arange(len(image))
     place = seen.argmax(axis=1)
     lines, place = _with(seen[lines, place] >= least_peak, lines, place)
@@ -116,8 +118,8 @@ def _measure(image: Any, dark: Any, lines: Any, place: Any, saturation: int, lea
 
 
 def fit_lines(
-    image: Any, dark: Any, start: Any, widths: Any, log_widths: Any, which: Any, saturation: int, noise: Any,
-    dark_noise: Any, rho: Any, steps: int, out: Any,
+    image: Any, _cut: Any, _cut_at: Any, dark: Any, start: Any, widths: Any, log_widths: Any, which: Any,
+    saturation: int, noise: Any, dark_noise: Any, rho: Any, steps: int, out: Any,
 ) -> None:  # fmt: skip
     """As `stripe_fit.fit_lines`."""
     for k in range(0, len(which), CHUNK):

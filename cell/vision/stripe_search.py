@@ -16,6 +16,7 @@ from cell.vision.stripe_find import (
     BACKGROUND,
     CENTRE,
     CORE,
+    CUT,
     ENERGY,
     HEIGHT,
     SEARCH,
@@ -24,17 +25,21 @@ from cell.vision.stripe_find import (
     first_at,
     largest,
     largest_outside,
-    reach_of,
     rival_limit,
     width_of,
 )
 from cell.vision.stripe_lanes import LANES
 
 PIXELS = 2 * SEARCH + 1
+# What is noted of a line: its brightest pixel's place and value, the largest value outside of the window there, and
+# whether it takes more to say where its stripe is.
+_PLACE, _TOP, _OUTSIDE, _OPEN = range(4)
+_NOTES = 4
 # Rows of the sums of a window: its background, what half of the peak and a fifth of it reach, how far the peak stands
-# above the higher side; sums of the values, of what lies above a fifth and its moment; pixels above half.
-_BACKGROUND, _HALF, _FIFTH, _RISE, _TOTAL, _OVER, _MOMENT, _ABOVE = range(8)
-_SUMS = 8
+# above the higher side; sums of the values, of what lies above a fifth and its moment; pixels above half; the largest
+# value beside the peak.
+_BACKGROUND, _HALF, _FIFTH, _RISE, _TOTAL, _OVER, _MOMENT, _ABOVE, _BESIDE = range(9)
+_SUMS = 9
 
 
 @compiled_fast
@@ -63,85 +68,131 @@ def _sum_windows(window: Any, s: Any) -> None:
             s[_ABOVE, j] += one if value > s[_HALF, j] else zero
 
 
-@compiled
-def _near(row: Any, guess: int, top: int) -> int:
-    """Where a line first reaches `top` within SEARCH of a guess, else where it does at all."""
-    low = max(0, guess - SEARCH)
-    part = row[low : guess + SEARCH + 1]
-    for i in range(len(part)):
-        if part[i] >= top:
-            return low + i
-    return int(first_at(row, top))
-
-
-@compiled
-def _copy_window(image: Any, dark: Any, r: int, low: int, j: int, window: Any) -> None:
-    """The pixels of line `r` from `low` on, above the dark frame, into lane `j`."""
-    line, lane = image[r, low : low + PIXELS], window[:, j]
+@compiled_fast
+def _look_beside(window: Any, s: Any) -> None:
+    """The largest value of each window outside of what belongs to its peak, which is `reach_of` its width."""
+    zero, one, four = np.float32(0.0), np.float32(1.0), np.float32(4.0)
+    share = np.float32(4.0 / 2.355)
+    for j in range(LANES):
+        s[_BESIDE, j] = zero
     for i in range(PIXELS):
-        lane[i] = line[i]
-    if len(dark) > 1:
-        shade = dark[r, low : low + PIXELS]
-        for i in range(PIXELS):
-            lane[i] -= shade[i]
+        away = np.float32(abs(i - SEARCH))
+        for j in range(LANES):
+            value = window[i, j] if away >= max(four, share * s[_ABOVE, j]) + one else zero
+            s[_BESIDE, j] = max(s[_BESIDE, j], value)
+
+
+@compiled
+def _near(seen: Any, r: int, guess: int, top: int) -> int:
+    """Where line `r` first reaches `top` within SEARCH of a guess, else where it does at all."""
+    for i in range(max(0, guess - SEARCH), min(seen.shape[1], guess + SEARCH + 1)):
+        if seen[r, i] >= top:
+            return i
+    return int(first_at(seen, r, top))
 
 
 @compiled_fast
-def _largest_beside(seen: Any, first: int, size: int, places: Any, reaches: Any, tops: Any) -> None:
-    """The largest value of each line outside of what belongs to its peak, into `tops` (LANES,)."""
-    # A loop of its own: within the caller's, the compiler does not get it into the vector unit.
+def _note_brightest(seen: Any, first: int, size: int, least_peak: float, notes: Any) -> None:
+    """Where the lines `first` on are brightest, and the largest value farther than SEARCH from there, into `notes`.
+
+    A line is read once where its brightest pixel is near that of the line before. Of a line that does not reach
+    `least_peak` only the value is true.
+    """
+    n = seen.shape[1]
+    guess = notes[_PLACE, LANES - 1]
     for j in range(size):
-        tops[j] = largest_outside(seen[first + j], places[j] - reaches[j], places[j] + reaches[j])
+        r = first + j
+        place, top, outside = guess, 0, 0
+        if SEARCH <= guess < n - SEARCH:
+            outside = largest_outside(seen, r, guess - SEARCH, guess + SEARCH)
+            for i in range(guess - SEARCH, guess + SEARCH + 1):
+                if seen[r, i] > top:
+                    place, top = i, int(seen[r, i])
+        if top > outside:
+            # What the window around the place does not reach any more is outside, too.
+            for i in range(guess - SEARCH, place - SEARCH):
+                outside = max(outside, int(seen[r, i]))
+            for i in range(place + SEARCH + 1, guess + SEARCH + 1):
+                outside = max(outside, int(seen[r, i]))
+        else:
+            top = largest(seen, r, 0, n)
+            if top >= least_peak:
+                place = _near(seen, r, guess, top)
+                outside = largest_outside(seen, r, place - SEARCH, place + SEARCH)
+        if top >= least_peak:
+            guess = place
+        notes[_PLACE, j], notes[_TOP, j], notes[_OUTSIDE, j] = guess, top, outside
+
+
+@compiled_fast
+def _keep(image: Any, dark: Any, first: int, size: int, notes: Any, window: Any, cut: Any, cut_at: Any) -> None:
+    """The pixels around the lines' noted places: above the dark frame into `window` (PIXELS, LANES), raw into `cut`."""
+    n = image.shape[1]
+    for j in range(size):
+        r, place = first + j, notes[_PLACE, j]
+        if n >= CUT:
+            begin = np.uint64(min(max(place - CUT // 2, 0), n - CUT))
+            cut_at[r] = begin
+            # Of a count that it knows beforehand the compiler makes single steps.
+            for i in range(np.uint64(0), np.uint64(cut.shape[1])):
+                cut[r, i] = image[r, begin + i]
+        low = place - SEARCH
+        if low >= 0 and low + PIXELS <= n:
+            for i in range(PIXELS):
+                window[i, j] = image[r, low + i]
+            if len(dark) > 1:
+                for i in range(PIXELS):
+                    window[i, j] -= dark[r, low + i]
 
 
 @compiled
-def _take(place: int, window: Any, s: Any, j: int, line: Any) -> None:
-    """Start values from the sums of lane `j` into line (CANDIDATES, START)."""
-    background = s[_BACKGROUND, j]
-    line[0, CENTRE] = place - SEARCH + s[_MOMENT, j] / s[_OVER, j]
-    line[0, WIDTH] = width_of(s[_ABOVE, j])
-    line[0, HEIGHT] = window[SEARCH, j] - background
-    line[0, BACKGROUND] = background
-    line[0, ENERGY] = max(s[_TOTAL, j] - np.float32(PIXELS) * background, 1e-6)
-    line[0, CORE] = 0.0
+def _take(
+    image: Any, first: int, size: int, saturation: int, least_peak: float, notes: Any, window: Any, s: Any, start: Any
+) -> None:
+    """Start values of the ordinary lines among the lanes, from their sums; the others are noted as open."""
+    n = image.shape[1]
+    for j in range(size):
+        r, place = first + j, notes[_PLACE, j]
+        background, height = s[_BACKGROUND, j], window[SEARCH, j] - s[_BACKGROUND, j]
+        # What lies above the dark frame is rounded elsewhere: near the limit, a line is looked at more closely.
+        beside = max(float(notes[_OUTSIDE, j]), s[_BESIDE, j] + 0.5)
+        alone = beside < rival_limit(background, height, least_peak) and s[_RISE, j] >= least_peak
+        inside = SEARCH <= place < n - SEARCH and image[r, place] < saturation
+        bright = notes[_TOP, j] >= least_peak
+        notes[_OPEN, j] = bright and not (alone and inside)
+        if bright and alone and inside:
+            start[r, 0, CENTRE] = place - SEARCH + s[_MOMENT, j] / s[_OVER, j]
+            start[r, 0, WIDTH] = width_of(s[_ABOVE, j])
+            start[r, 0, HEIGHT] = height
+            start[r, 0, BACKGROUND] = background
+            start[r, 0, ENERGY] = max(s[_TOTAL, j] - np.float32(PIXELS) * background, 1e-6)
+            start[r, 0, CORE] = 0.0
 
 
 @compiled
-def find_lines(image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any) -> bool:
+def find_lines(
+    image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any, cut: Any, cut_at: Any
+) -> bool:
     """Start values of the lines of `image` (lines, n) into `start` (lines, CANDIDATES, START), which is 0 before.
 
     `dark` has one pixel where there is no dark frame, `seen` is what lies above it. The brightest peak comes first;
     where it is none (bright scenery), the one that stands out most. Of two peaks the one with more energy stays first;
-    True when any line has two.
+    True when any line has two. The pixels around a line's brightest are kept for the fit in `cut` (lines, CUT), from
+    pixel `cut_at` (lines,) on, which is NOWHERE before.
     """
-    n = image.shape[1]
-    line, rises = np.empty(n, np.float32), np.empty(n, np.uint8)
+    line, rises = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.uint8)
     window, sums = np.zeros((PIXELS, LANES), np.float32), np.zeros((_SUMS, LANES), np.float32)
-    places, reaches = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
-    tops, beside = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)
-    guess, several = 0, False
+    notes = np.zeros((_NOTES, LANES), np.int64)
+    several = False
     for first in range(0, len(image), LANES):
         size = min(LANES, len(image) - first)
-        for j in range(size):
-            row = seen[first + j]
-            top = tops[j] = largest(row)
-            if top >= least_peak:
-                places[j] = guess = _near(row, guess, top)
-                if SEARCH <= guess < n - SEARCH:
-                    _copy_window(image, dark, first + j, guess - SEARCH, j, window)
+        _note_brightest(seen, first, size, least_peak, notes)
+        _keep(image, dark, first, size, notes, window, cut, cut_at)
         _sum_windows(window, sums)
+        _look_beside(window, sums)
+        _take(image, first, size, saturation, least_peak, notes, window, sums, start)
         for j in range(size):
-            reaches[j] = reach_of(width_of(sums[_ABOVE, j]), 0)
-        _largest_beside(seen, first, size, places, reaches, beside)
-        for j in range(size):
-            r, place = first + j, places[j]
-            if tops[j] < least_peak:
-                continue
-            background = sums[_BACKGROUND, j]
-            limit = rival_limit(background, window[SEARCH, j] - background, least_peak)
-            inside = SEARCH <= place < n - SEARCH and image[r, place] < saturation
-            if inside and sums[_RISE, j] >= least_peak and beside[j] < limit:
-                _take(place, window, sums, j, start[r])
-            elif find_line(image, seen, dark, r, saturation, least_peak, line, rises, start):
-                several = True
+            if notes[_OPEN, j]:
+                found_two = find_line(image, seen, dark, first + j, saturation, least_peak, line, rises, start)
+                several = several or found_two
     return several
