@@ -57,15 +57,19 @@ def draw_systems(result: Mapping[str, Any], path: Path) -> Path:
     axes = figure.subplots()
     rows = result["systems"]
     places = np.arange(len(rows))
+    expected = [row["ours"]["expected_mean_mm"] for row in rows]
     series = (
         ([row["theirs"]["mm"] for row in rows], "theirs, as published (hardware)", "tab:gray"),
         ([row["ours"]["p95_mm"] for row in rows], "ours, 95 % of the points below (simulated)", "tab:blue"),
         ([row["ours"]["mean_mm"] for row in rows], "ours, mean (simulated)", "tab:cyan"),
     )
     for k, (values, label, colour) in enumerate(series):
-        bars = axes.bar(places + 0.27 * (k - 1), values, 0.25, color=colour, label=label)
-        axes.bar_label(bars, fmt="%.3g", fontsize=8)
-    expected = [row["ours"]["expected_mean_mm"] for row in rows]
+        axes.bar(places + 0.27 * (k - 1), values, 0.25, color=colour, label=label)
+        # The number stands clear of the expected mean's line, which is drawn over the last bars.
+        tops = np.maximum(values, expected) if k == 2 else values
+        for place, value, top in zip(places, values, tops, strict=True):
+            axes.annotate(f"{value:.3g}", (place + 0.27 * (k - 1), top), (0, 3), textcoords="offset points",
+                          fontsize=8, ha="center", va="bottom")  # fmt: skip
     axes.plot(places + 0.27, expected, "_", color="tab:green", markersize=26, markeredgewidth=2,
               label="expected mean for the assumed noise")  # fmt: skip
     axes.set_yscale("log")
