@@ -98,6 +98,7 @@ class VehicleConfig(Table):
     track: Annotated[float, quantity("mm", 100, 3000)]
     max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]
     max_yaw_rate: Annotated[float, quantity("deg/s", 1, 90)]
+    lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0004
 
 
 class CameraConfig(Table):

@@ -170,7 +170,14 @@ class JobWork:
     def reconstruct(self, context: StepContext) -> Reconstruction:
         """See `cell.steps.reconstruct`."""
         sweep = cast(SweepRecord, context.results["laser_sweep"])
-        return reconstruct(sweep, self._calibration.scan, self._job.scan.largest_hole, self._folder / "cloud.ply")
+        return reconstruct(
+            sweep,
+            self._calibration.scan,
+            self._job.scan.largest_hole,
+            self._folder / "cloud.ply",
+            self._config.arm.vehicle_from_base.se3().inverse(),
+            self._config.vehicle.lean_sigma,
+        )
 
     def invert_pose(self, context: StepContext) -> PlacePose:
         """See `cell.steps.invert_pose`."""

@@ -10,7 +10,15 @@ from test_reconstruction import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
 
 from cell.geometry.poses import from_ur, to_ur
 from cell.motion.track import FlangeTrack
-from cell.reconstruction import Cloud, ProfileBuilder, calibration_motions, find_seams, flange_motions, merge
+from cell.reconstruction import (
+    Cloud,
+    ProfileBuilder,
+    calibration_motions,
+    find_seams,
+    flange_motions,
+    lean_motions,
+    merge,
+)
 from cell.vision.stripe import StripeProfile
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
@@ -116,6 +124,33 @@ def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
     expected = 1e-8 * by_turn[:, :, None] * by_turn[:, None, :]
     expected[:, 2, 2] += 9e-10
     assert np.allclose(covariance[lines >= 8], expected, atol=1e-16)
+
+
+def test_a_leaning_vehicle_moves_the_base_under_the_sweeps_as_the_motions_say(pair: Cloud) -> None:
+    base_from_vehicle = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.4])), np.array([-0.3, 0.1, -0.55]))
+    springs = np.array([3e-4, 5e-4])
+
+    def base(reach: Array) -> pin.SE3:
+        """Where the base is in the world when the arm reaches out to `reach` in base axes."""
+        along = base_from_vehicle.rotation.T @ reach
+        lean = pin.exp3(np.array([-springs[1] * along[1], springs[0] * along[0], 0.0]))
+        return base_from_vehicle * pin.SE3(lean, np.zeros(3)) * base_from_vehicle.inverse()
+
+    lines, rows = pair.subsample(300)
+    flanges = pair.flanges[:, :3, 3]
+    middle = base(flanges.mean(axis=0))
+    points = pair.points[lines, rows]
+    # What stands still, seen from the base of the middle and from that of its own line.
+    seen = np.array([base(flanges[k]).inverse() * middle * p for k, p in zip(lines, points, strict=True)])
+    motions = [lean_motions(pair, lines, rows, base_from_vehicle, s)[:, :, k] for k, s in enumerate(springs[::-1])]
+    np.testing.assert_allclose(sum(motions), seen - points, atol=2e-9)
+    assert np.abs(seen - points).max() > 1e-6
+
+
+def test_a_sweep_by_the_rail_alone_does_not_move_the_base() -> None:
+    cloud = swept((0, 0, 0), np.zeros(3), 1, 4)
+    lines, rows = cloud.subsample(50)
+    assert np.abs(lean_motions(cloud, lines, rows, pin.SE3.Identity(), 1e-3)).max() < 1e-12
 
 
 def test_a_cloud_of_moving_flanges_is_solved_again_with_each_lines_own(pair: Cloud) -> None:

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from cell.bench.acceptance import acceptance
 from cell.bench.expected import expect
-from cell.bench.scan_errors import COVERED, by_pose, own_base, scan_errors
+from cell.bench.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
 from cell.bench.whole_job import JobRecord, run_whole_job
 from cell.config import CellConfig, load_config
 from cell.geometry.poses import difference, transform
@@ -114,7 +114,7 @@ def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSur
         "placing": 1e3 * expected.placing_m,
     }
     made["chi2_registration"] = pose.chi2_per_dof
-    true = own_base(record) * pose_of(record.at_sweep, "base_from_surface")
+    true = own_base(record) * surface_at_middle(record)
     off = difference(pose.base_from_surface, true)
     points = part_points(nominal)
     apart = transform(pose.base_from_surface, points) - transform(true, points)

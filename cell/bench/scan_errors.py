@@ -116,6 +116,13 @@ def own_base(record: JobRecord) -> pin.SE3:
     return from_matrix(flanges[nearest]) * from_matrix(true).inverse()
 
 
+def surface_at_middle(record: JobRecord) -> pin.SE3:
+    """base_from_surface when the arm was in the middle of all lines: a vehicle leans otherwise wherever it reaches."""
+    flanges = np.array([shot.base_from_flange[:3, 3] for shot in record.shots])
+    middle = int(np.argmin(np.linalg.norm(flanges - flanges.mean(axis=0), axis=1)))
+    return from_matrix(record.shots[middle].base_from_surface)
+
+
 def true_geometry(record: JobRecord) -> ScanGeometry:
     """The scan head as it is; what the rail reads is then the carriage's true displacement."""
     assert record.at_sweep is not None and record.calibration is not None

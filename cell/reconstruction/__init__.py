@@ -5,7 +5,7 @@ from cell.reconstruction.cloud import Cloud, Filled, merge
 from cell.reconstruction.holes import fill_holes
 from cell.reconstruction.ply import deviation_colours, write_cloud, write_ply
 from cell.reconstruction.seams import Seam, find_seams
-from cell.reconstruction.sensitivity import calibration_motions, flange_motions
+from cell.reconstruction.sensitivity import calibration_motions, flange_motions, lean_motions
 
 __all__ = [
     "Cloud",
@@ -18,6 +18,7 @@ __all__ = [
     "fill_holes",
     "find_seams",
     "flange_motions",
+    "lean_motions",
     "merge",
     "write_cloud",
     "write_ply",

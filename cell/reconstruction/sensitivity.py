@@ -1,4 +1,4 @@
-"""How the cloud would move if the calibration, or where the flange stood, were another one within its uncertainty."""
+"""How the cloud would move if calibration, flange or vehicle were elsewhere, each within its uncertainty."""
 
 from __future__ import annotations
 
@@ -52,4 +52,23 @@ def flange_motions(
         mine = np.flatnonzero(sweeps == k)
         for i, column in enumerate((vectors * np.sqrt(np.maximum(values, 0.0))).T):
             motions[mine, :, 6 * k + i] = column[:3] + np.cross(column[3:], arms[mine])
+    return motions
+
+
+def lean_motions(
+    cloud: Cloud, lines: NDArray[np.intp], rows: NDArray[np.intp], base_from_vehicle: pin.SE3, sigma: float
+) -> Array:
+    """(n, 3, 2) displacements in m, base axes, of the points at (lines, rows) by how the vehicle leans meanwhile.
+
+    On its suspension it rolls and pitches about its own origin, towards where the arm reaches out, by `sigma` rad per
+    metre each: one standard deviation of two springs. The arm base leans with it, so that what stands still in the
+    world seems to move when the arm does. Told against the lean in the middle of all lines.
+    """
+    turn = base_from_vehicle.rotation
+    flanges = cloud.flanges[:, :3, 3]
+    reach = (flanges[lines] - flanges.mean(axis=0)) @ turn
+    arms = cloud.points[lines, rows] - base_from_vehicle.translation
+    motions = np.empty((len(lines), 3, 2))
+    for k, (axis, amount) in enumerate(((turn[:, 0], -reach[:, 1]), (turn[:, 1], reach[:, 0]))):
+        motions[:, :, k] = np.cross(axis, arms) * (-sigma * amount[:, None])
     return motions

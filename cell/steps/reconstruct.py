@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from cell.calibration import ScanCalibration
 from cell.reconstruction import (
@@ -15,6 +16,7 @@ from cell.reconstruction import (
     fill_holes,
     find_seams,
     flange_motions,
+    lean_motions,
     merge,
     write_cloud,
 )
@@ -26,7 +28,7 @@ from cell.steps.laser_sweep import SweepRecord
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """The cloud, how its sweeps agree where they overlap, and how its points move by one standard deviation of each
-    independent parameter of the calibration and by what each sweep's flange pose is off."""
+    independent parameter of the calibration, and by what each sweep's flange pose and the vehicle's lean are off."""
 
     cloud: Cloud
     seams: tuple[Seam, ...]
@@ -43,10 +45,19 @@ def build_cloud(sweep: SweepRecord) -> Cloud:
     return merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
 
 
-def reconstruct(sweep: SweepRecord, calibration: ScanCalibration, largest_hole: float, path: Path) -> Reconstruction:
+def reconstruct(
+    sweep: SweepRecord,
+    calibration: ScanCalibration,
+    largest_hole: float,
+    path: Path,
+    base_from_vehicle: pin.SE3,
+    lean_sigma: float,
+) -> Reconstruction:
     """Place every profile, remove outliers, interpolate holes up to `largest_hole` m and write the cloud to `path`.
 
-    Raises `RefusedError` when too few points are left.
+    The vehicle, which carries the arm at `base_from_vehicle`, leans by `lean_sigma` rad, one standard deviation, per
+    metre that the arm reaches out: an arm that moves during the sweeps moves its base, too. Raises `RefusedError` when
+    too few points are left.
     """
     cloud = fill_holes(build_cloud(sweep).require(), largest_hole)
     geometry, variants = calibration.geometry(), calibration.variants()
@@ -56,7 +67,8 @@ def reconstruct(sweep: SweepRecord, calibration: ScanCalibration, largest_hole: 
         return calibration_motions(cloud, lines, rows, None, geometry, variants)
 
     def by_poses(lines: Indices, rows: Indices) -> Array:
-        return flange_motions(cloud, lines, rows, covariances)
+        leaning = lean_motions(cloud, lines, rows, base_from_vehicle, lean_sigma)
+        return np.concatenate([flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
 
     def by_both(lines: Indices, rows: Indices) -> Array:
         return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
