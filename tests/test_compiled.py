@@ -1,9 +1,10 @@
-"""Promises of a machine where numba does not load."""
+"""Promises of the compiled loops: of a machine where numba does not load, and of when the others are loaded."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 WITHOUT_NUMBA = """
 import sys, warnings
@@ -30,3 +31,33 @@ print(len(told), told[0].count("Reinstall numba"), error < 0.2)
 def test_without_numba_the_cell_says_so_once_and_still_finds_stripes() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_NUMBA], capture_output=True, text=True, timeout=120)
     assert done.stdout.split() == ["1", "1", "True"], done.stderr
+
+
+REHEARSED = """
+import importlib, pkgutil
+import cell.vision
+from cell.bench.stripe_truth import Cell, draw
+from cell.steps.swath import rehearse
+from cell.vision import StripeStream
+from test_reconstruction import GEOMETRY
+
+def loaded():
+    modules = [importlib.import_module(f"cell.vision.{m.name}") for m in pkgutil.iter_modules(cell.vision.__path__)]
+    return {name: len(f.signatures) for m in modules for name, f in vars(m).items() if hasattr(f, "signatures")}
+
+before = loaded()
+rehearse(GEOMETRY)
+rehearsed = loaded()
+shape = (GEOMETRY.camera.height, GEOMETRY.camera.width)
+stream = StripeStream()
+for seed, speckle in enumerate([0.0, 0.2, 0.2]):
+    stream.extract(draw(Cell(2.0, 100.0, speckle), shape, seed)[0])
+print(sum(before.values()) < sum(rehearsed.values()), loaded() == rehearsed)
+"""
+
+
+def test_nothing_is_loaded_or_compiled_any_more_when_a_sweep_has_begun() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", REHEARSED], capture_output=True, text=True, timeout=300, cwd=Path(__file__).parent
+    )
+    assert done.stdout.split() == ["True", "True"], done.stdout + done.stderr

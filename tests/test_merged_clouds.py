@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -220,6 +222,16 @@ def test_late_packets_do_not_move_the_flange() -> None:
     angle = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     assert np.abs(angle - 0.1 * np.linspace(0.1, 1.5, 40)).max() < 1e-9
     assert track.inside(np.array([999.0, 1000.5, 1002.0])).tolist() == [False, True, False]
+
+
+def test_a_pause_that_no_state_tells_of_leaves_the_way_there_unknown() -> None:
+    whole = states(np.zeros(200))
+    # For 64 ms nothing came. Either the arm went on evenly, or it stood still for half of that time and lags since.
+    evenly = whole[:100] + whole[108:]
+    paused = whole[:100] + [replace(late, flange=whole[k - 4].flange) for k, late in enumerate(whole[108:], start=108)]
+    times = np.array([1000.4, 1000.82, 1001.2])
+    assert FlangeTrack("arm", evenly).even(times).tolist() == [True, True, True]
+    assert FlangeTrack("arm", paused).even(times).tolist() == [True, False, True]
 
 
 def test_a_gap_in_the_states_is_a_fault_and_not_bridged() -> None:

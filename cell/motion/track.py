@@ -19,6 +19,8 @@ from drivers.interfaces import ArmState, Vector
 LEAST_STATES = 10
 LONGEST_GAP_S = 0.2
 """Between two states further apart than this the arm may have done anything."""
+MOST_BEND_M = 2e-5
+"""What a straight and even way between two states may be off by, by how the speed before and after differs from it."""
 
 
 class FlangeTrack:
@@ -36,10 +38,22 @@ class FlangeTrack:
         poses = [from_ur(states[int(k)].flange) for k in kept]
         self.translations: Vector = np.array([pose.translation for pose in poses])
         self._rotations = [pose.rotation for pose in poses]
+        gaps = np.diff(self.times)
+        speeds = np.diff(self.translations, axis=0) / gaps[:, None]
+        change = np.linalg.norm(np.diff(speeds, axis=0), axis=1)
+        self._bends = 0.25 * gaps * np.maximum(np.append(0.0, change), np.append(change, 0.0))
 
     def inside(self, times: Vector) -> NDArray[np.bool_]:
         """Which of the times (n,) lie between the first and the last state."""
         return np.asarray((times >= self.times[0]) & (times <= self.times[-1]))
+
+    def even(self, times: Vector) -> NDArray[np.bool_]:
+        """At which of the times (n,), which must be `inside`, the arm is known to have moved evenly.
+
+        An arm that paused where no state came from it was not on the straight way between the two states around.
+        """
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        return np.asarray(self._bends[after - 1] <= MOST_BEND_M)
 
     def at(self, times: Vector) -> Vector:
         """base_from_flange (n, 4, 4) at the times (n,), which must be `inside`.

@@ -15,7 +15,7 @@ from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.planning import ScanPlan
 from cell.steps.moves import Mover
-from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors
 from drivers.errors import CellError, DeviceFault
 
 RUN_UP_S = 0.7
@@ -29,8 +29,8 @@ JITTER_S = 0.0003
 def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
     """Move the scan head over the placement area and pair every profile with the flange's pose.
 
-    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, or the arm's
-    states have gaps; whatever happens meanwhile, the arm is stopped before the error goes on.
+    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, the arm's
+    states have gaps or it moved unevenly between them; whatever happens, the arm is stopped before the error goes on.
     """
     scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
     shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
@@ -66,6 +66,18 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     flanges = track.at(times[seen])
     done = (flanges[:, :3, 3] - plan.base_from_flange.translation) @ along
     within = (done >= 0) & (done <= length)
+    even = track.even(times[seen])
+    uneven = int(np.count_nonzero(within & ~even))
+    if uneven > MAX_LOST_FRACTION * np.count_nonzero(within):
+        raise DeviceFault(
+            arm.name,
+            "arm.uneven_sweep",
+            f"where the arm was is not known at {uneven} of {np.count_nonzero(within)} profiles, allowed are "
+            f"{100 * MAX_LOST_FRACTION:.0f} %: it did not move evenly between the states that came from it",
+            recoverable=True,
+            hint="Look at the arm's link and at what else this machine is busy with.",
+        )
+    within &= even
     lines, flanges, done = seen[within], flanges[within], done[within]
     middle = collector.require_frames(camera.name, lines)
     if len(lines) < 3:
@@ -76,8 +88,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
             recoverable=True,
             hint="Lower scan.speed or raise scan.frame_rate.",
         )
-    even = np.polynomial.Polynomial.fit(times[lines], done, 1)
-    residual = float(np.std(done - even(times[lines])))
+    steady = np.polynomial.Polynomial.fit(times[lines], done, 1)
+    residual = float(np.std(done - steady(times[lines])))
     shared = np.zeros((6, 6))
     shared[:3, :3] = np.outer(along, along) * (scan.speed * LATENCY_S * errors.rate) ** 2
     own = scan.speed * JITTER_S * errors.rate * along
@@ -89,7 +101,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         rail=np.full(len(lines), rail),
         line_spread=np.tile(own, (len(lines), 1)),
         covariance=errors.repeatability + shared,
-        lost=collector.lost,
+        lost=collector.lost + uneven,
         residual=residual,
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],

@@ -14,7 +14,7 @@ from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
 from cell.steps.moves import Mover
 from cell.steps.rail_sweep import rail_sweep
-from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.swath import Collector, Swath, SweepErrors, rehearse
 from cell.vision import StripeProfile
 from drivers.interfaces import Frame
 
@@ -67,6 +67,8 @@ def laser_sweep(
     `check` raises when the run is to end. Raises what `rail_sweep` and `arm_sweep` raise.
     """
     sweep = arm_sweep if scan.mode == "arm" else rail_sweep
+    progress(0.01, "preparing")
+    rehearse(geometry)
     swaths = []
     for k, plan in enumerate(plans):
         check()

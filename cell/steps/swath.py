@@ -61,6 +61,17 @@ class Swath:
         return from_matrix(self.flanges[len(self.flanges) // 2])
 
 
+def rehearse(geometry: ScanGeometry) -> None:
+    """Take one drawn profile and let it go: what is loaded or compiled on first use is so before anything moves.
+
+    Done under way it takes longer than the gaps that frames and the arm's states may have.
+    """
+    rows, columns = np.mgrid[: geometry.camera.height, : geometry.camera.width]
+    centres = 0.5 * geometry.camera.width + 4 * np.sin(rows / 40)
+    image = 12 + 140 * np.exp(-0.5 * ((columns - centres) / 2) ** 2)
+    ProfileBuilder(geometry, 1).see(StripeStream().extract(image.astype(np.uint8)))
+
+
 @dataclass(eq=False)
 class Collector:
     """Takes the frames of one sweep: keeps them, triangulates their profiles, remembers when they were exposed."""

@@ -23,7 +23,7 @@ from cell.reconstruction import ScanGeometry
 from cell.steps.collect import PHOTO_RATE, Check, Progress, move_to_view
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
-from cell.steps.swath import Collector, SweepErrors
+from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.stored_calibration import CellCalibration
 from cell.vision import BoardSpec, BoardView, StripeProfile, find_board, parse_board
 from drivers.errors import RefusedError
@@ -117,6 +117,7 @@ def _sweep(
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
     errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, devices.clock.rate)
     collector = Collector(geometry, section, lambda _: None, progress, profiles.append)
+    rehearse(geometry)
     swath = rail_sweep(plan, mover, devices, errors, collector)
     return [
         ScanObservation(None, profiles[line], swath.base_from_flange, float(position))
