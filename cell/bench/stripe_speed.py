@@ -17,7 +17,7 @@ from cell.vision.stripe_methods import gaussian_derivatives
 from cell.vision.stripe_stream import StripeStream, extract_all
 
 SHAPE = (1024, 1280)
-FRAMES = 16
+FRAMES = 32
 CONDITION = Cell(2.0, 150.0)
 SPECKLED = Cell(2.0, 120.0, 0.2)
 

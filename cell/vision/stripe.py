@@ -75,8 +75,9 @@ class StripeProfile:
 
     `centres` and `sigma` (one standard deviation of the centre) in px, `amplitude` in DN (of the fitted peak, above the
     sensor's range in `saturated` rows), `width` the stripe's σ in px. `double` marks rows with a second peak of
-    comparable energy: the one nearer to where the neighbours' stripe runs was taken, else the stronger. `speckle` is
-    what the deviations were made with; None where it was assumed, for too few lines show any, or declared.
+    comparable energy: the one nearer to where the neighbours' stripe runs was taken, else the stronger. The deviations
+    were made with `speckle`, None where it was assumed, for too few lines show any, or declared, and with `noise`: the
+    variance of a pixel in DN², without photons and whole (`stripe_noise.pixel_noise`).
     """
 
     axis: Axis
@@ -87,6 +88,7 @@ class StripeProfile:
     saturated: NDArray[np.bool_]
     double: NDArray[np.bool_]
     speckle: Speckle | None = None
+    noise: tuple[float, float] | None = None
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -113,15 +115,15 @@ def extract(
     *,
     method: Method | str = Method.MAXIMUM_LIKELIHOOD,
     engine: Literal["auto", "compiled", "numpy"] = "auto",
-    speckle: Speckle | None = None,
+    like: StripeProfile | None = None,
 ) -> StripeProfile:
     """Stripe centres of an 8-bit image (h, w), one per row (or per column with axis "columns").
 
     `dark` (h, w) is a frame of the same view without the laser and is subtracted; its noise counts. `engine` "numpy"
-    does without the compiler, as "auto" does where there is none. `speckle` is what an earlier picture of the same
-    scene showed (its profile's); None: measured in this one, where the settings do not declare it. Raises ValueError
-    for an image of another type, a dark frame of another size or an unknown method, `PictureRefused` for a picture that
-    is blinded.
+    does without the compiler, as "auto" does where there is none. `like` is the profile of an earlier picture of the
+    same scene, whose noise and speckle hold for this one as far as it has them; None: they are measured, where the
+    settings do not declare them. Raises ValueError for an image of another type, a dark frame of another size or an
+    unknown method, `PictureRefused` for a picture that is blinded.
     """
     settings = settings or StripeSettings()
     method = Method(method)
@@ -131,7 +133,8 @@ def extract(
     quick = compiled.AVAILABLE and engine != "numpy"
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
-    noise2, whole = pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
+    noise = like.noise if like is not None else None
+    noise2, whole = noise or pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
@@ -151,6 +154,7 @@ def extract(
             (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
         )  # fmt: skip
 
+    speckle = like.speckle if like is not None else None
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
     if contrast is None or (contrast > 0 and grain is None):
         if speckle is None:
@@ -171,7 +175,7 @@ def extract(
     excess = 1 + SECOND_ORDER * contrast**2
     believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
-    return StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle)
+    return StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
 
 
 def _check(image: Image, dark: Any) -> None:

@@ -1,7 +1,7 @@
 """The stripe in pictures that stream by, such as a sweep's: what they have in common is measured in some of them.
 
-Laser, lens and surface make the speckle, not the single picture: its contrast and grain are measured in the first
-picture of every `BLOCK` and hold for the others of the block, which saves a third of the time.
+Laser, lens and surface make the speckle, camera and exposure the noise, not the single picture: both are measured in
+the first picture of every `BLOCK` and hold for the others of the block, which saves a third of the time.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.vision.stripe import Axis, Image, StripeProfile, StripeSettings, extract
-from cell.vision.stripe_speckle import Speckle
 
-BLOCK = 8
-"""Pictures for which a measured speckle holds: .8 mm of a sweep at .1 mm a profile."""
+BLOCK = 16
+"""Pictures for which what was measured holds: 1.6 mm of a sweep at .1 mm a profile."""
 
 Dark = NDArray[np.floating[Any]] | NDArray[np.uint8]
 
@@ -31,16 +30,16 @@ class StripeStream:
         self._dark = dark
         self._axis = axis
         self._settings = settings
-        self._speckle: Speckle | None = None
+        self._like: StripeProfile | None = None
         self._seen = 0
 
     def extract(self, image: Image) -> StripeProfile:
         """The profile of the next picture (h, w); raises what `extract` raises."""
         if self._seen % BLOCK == 0:
-            self._speckle = None
-        profile = extract(image, self._dark, self._axis, self._settings, speckle=self._speckle)
-        # Where a block's first picture shows too little, the next one is asked.
-        self._speckle = profile.speckle
+            self._like = None
+        profile = extract(image, self._dark, self._axis, self._settings, like=self._like)
+        # Where a block's first picture shows too little of the speckle, the next one is asked.
+        self._like = profile
         self._seen += 1
         return profile
 
