@@ -127,6 +127,9 @@ def test_in_a_stream_the_speckle_of_a_block_is_that_of_its_first_picture_with_a_
     assert len({profile.speckle for profile in profiles[1:BLOCK]}) == 1
     assert profiles[BLOCK].speckle != profiles[1].speckle == extract(images[0]).speckle
     assert profiles[1].speckle.contrast == pytest.approx(0.2, abs=0.05)
+    # The covered picture is without any noise, which must not be believed of the others.
+    assert len({profile.noise for profile in profiles[1:BLOCK]}) == 1
+    assert profiles[1].noise == extract(images[0]).noise != profiles[0].noise
 
 
 def test_the_stated_deviation_is_true_with_the_speckle_of_an_earlier_picture():

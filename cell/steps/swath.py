@@ -38,8 +38,9 @@ class Swath:
     `frame_ids`, base_from_flange in `flanges` (n, 4, 4) and the rail's position in `rail` (n,) at the middle of the
     exposure, and `line_spread` (n, 3), m in base axes, one standard deviation of the line's own place along the sweep.
 
-    `covariance` (6, 6) of base_from_flange is common to all lines. `lost` frames are known from the gaps of the frame
-    ids; `residual` in m is how far the readings scatter about an even motion.
+    `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts the frames that the gaps of the frame
+    ids tell of, and those left out because nothing tells where the arm was; `residual` in m is how far the readings
+    scatter about an even motion.
     """
 
     builder: ProfileBuilder

@@ -38,8 +38,8 @@ class StripeStream:
         if self._seen % BLOCK == 0:
             self._like = None
         profile = extract(image, self._dark, self._axis, self._settings, like=self._like)
-        # Where a block's first picture shows too little of the speckle, the next one is asked.
-        self._like = profile
+        # A block's first picture that shows too few lines, such as a covered one, says nothing of the others.
+        self._like = profile if profile.speckle is not None else None
         self._seen += 1
         return profile
 
