@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 FILE_NAME = "journal.sqlite"
 """The journal's name in a run's folder."""
 
-REQUESTS = ("abort", "pause", "resume")
+REQUESTS = ("abort", "pause", "go-on", "confirm")
 """What another process can ask of a run."""
 
 _SCHEMA = """
@@ -220,7 +220,7 @@ def read(folder: Path) -> Record:
 
 
 def request(folder: Path, kind: str, reason: str) -> None:
-    """Ask the run in `folder` for `kind` (abort, pause or resume); the runner sees it within a fraction of a second."""
+    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second."""
     if kind not in REQUESTS:
         raise ValueError(f"request '{kind}' is unknown; a run takes {', '.join(REQUESTS)}")
 

@@ -25,13 +25,15 @@ class Outcome(Enum):
 class Failure:
     """Why a step did not succeed: the outcome it leads to unless it is repeated, and the reason in words.
 
-    `code` is short and stable, for scripts. `recoverable` says that a recovery can clear it.
+    `code` is short and stable, for scripts. `recoverable` says that a recovery can clear it; `needs_person` that a
+    person has to look and confirm before that.
     """
 
     outcome: Outcome
     reason: str
     code: str = ""
     recoverable: bool = False
+    needs_person: bool = False
 
 
 class OnFailure(Enum):
@@ -89,13 +91,17 @@ class Policy:
     """The steps' policies and the time that stopping, ending and recovering may take.
 
     `stop_deadline_s` bounds one safe stop and `grace_s` the time that a step has to end after it was stopped, both in
-    seconds on the wall; `recovery_deadline_s` bounds a recovery, in seconds of the cell's clock.
+    seconds on the wall; `recovery_deadline_s` bounds a recovery, in seconds of the cell's clock. A run that needs a
+    person's word waits `confirm_deadline_s` on the wall; with `simulated_person` it is given at once, for a simulated
+    cell, where nobody can be hurt.
     """
 
     steps: tuple[Step, ...] = field(default_factory=_default_steps)
     stop_deadline_s: float = 10.0
     grace_s: float = 5.0
     recovery_deadline_s: float = 60.0
+    confirm_deadline_s: float = 1800.0
+    simulated_person: bool = False
 
     def __post_init__(self) -> None:
         names = [step.name for step in self.steps]

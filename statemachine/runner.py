@@ -7,18 +7,30 @@ neither devices nor the cell: exceptions are judged by `classify`, the cell is b
 
 from __future__ import annotations
 
-import threading
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+from statemachine.cancel import CancelToken
+from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.sequence import STEPS, Sequence, SequenceError, State, Trigger
-from statemachine.step import Event, Observer, RunResult, StepCall, StepContext, StepOverrun, StepRecord, Summarised
+from statemachine.step import (
+    Event,
+    FaultRecord,
+    Observer,
+    RunResult,
+    StepCall,
+    StepContext,
+    StepOverrun,
+    StepRecord,
+    Summarised,
+)
 from statemachine.watch import Call, Clock, SignalWatch
 
-__all__ = ["Event", "RunResult", "Runner", "StepContext", "StepRecord"]
+__all__ = ["Event", "FaultRecord", "RunResult", "Runner", "StepContext", "StepRecord"]
 
 POLL_S = 0.02
 """How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
@@ -27,6 +39,10 @@ REQUEST_POLLS = 10
 HEALTH_POLLS = 5
 """The cell's health is looked at every so many polls."""
 
+JOURNALLED = frozenset(("state", "safe_stop", "note", "fault", "confirm_needed", "confirmed", "paused", "going_on"))
+"""The kinds of events that are written to the journal; steps have a table of their own there."""
+
+Recover = Callable[[BaseException, CancelToken, bool], None]
 
 _END_TRIGGERS = {
     Outcome.REFUSED: Trigger.REFUSE,
@@ -37,11 +53,12 @@ _END_TRIGGERS = {
 
 @dataclass
 class Runner:
-    """Runs one job. `run()` is called once; `abort`, `pause` and `resume` come from any thread.
+    """Runs one job. `run()` is called once; what a person or another program asks comes through `control`.
 
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
     stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
-    a step is cut short, and exactly once more at the end of every run. `recover(error)` clears a recoverable fault.
+    a step is cut short, and exactly once more at the end of every run. `recover(error, token, confirmed)` clears a
+    recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
     `health()` is called about ten times a second while a step works, and raises what must end it whatever it does.
     """
 
@@ -53,14 +70,14 @@ class Runner:
     classify: Callable[[BaseException], Failure]
     safe_stop: Callable[[str], None]
     observer: Observer | None = None
-    recover: Callable[[BaseException], None] | None = None
+    recover: Recover | None = None
     health: Callable[[], None] | None = None
-    _asked: str | None = field(default=None, init=False)
-    _paused: threading.Event = field(default_factory=threading.Event, init=False)
+    control: RunControl = field(default_factory=RunControl)
     _polls: int = field(default=0, init=False)
     _signals: SignalWatch = field(default_factory=SignalWatch, init=False)
     _records: dict[str, StepRecord] = field(default_factory=dict, init=False)
     _results: dict[str, object] = field(default_factory=dict, init=False)
+    _faults: list[FaultRecord] = field(default_factory=list, init=False)
     _error: BaseException | None = field(default=None, init=False)
     _abandoned: bool = field(default=False, init=False)
 
@@ -69,19 +86,6 @@ class Runner:
         if missing:
             raise ValueError(f"no work was given for {', '.join(missing)}")
         self._records = {step.value: StepRecord(step.value) for step in STEPS}
-
-    def abort(self, reason: str) -> None:
-        """End the run as aborted: what moves is stopped at once."""
-        if self._asked is None:
-            self._asked = reason
-
-    def pause(self) -> None:
-        """Hold the run before its next step."""
-        self._paused.set()
-
-    def resume(self) -> None:
-        """Let a held run go on."""
-        self._paused.clear()
 
     def run(self, done: Mapping[str, object] | None = None) -> RunResult:
         """Do the steps that are not in `done` (results of an earlier run by step name) and return how it ended.
@@ -124,53 +128,98 @@ class Runner:
             left = step.max_retries + 1 - attempt
             error = self._error
             if left == 0 or error is None or self._abandoned or end.outcome is Outcome.ABORTED:
+                self._note_fault(step.name, attempt, end, "ended the run")
                 return end
             self.sequence.facts.retries_left = left
             self.sequence.facts.recoverable = end.recoverable
             if step.retries(error):
-                self._stop(f"before {step.name} is tried again")
+                if (unsafe := self._stop(f"before {step.name} is tried again", end)) is not None:
+                    self._note_fault(step.name, attempt, unsafe, "ended the run")
+                    return unsafe
+                self._note_fault(step.name, attempt, end, "tried again")
                 self.sequence.fire(Trigger.RETRY)
             elif end.recoverable and step.on_failure is OnFailure.RECOVER and self.recover is not None:
-                if (failed := self._recover(step, error, self.recover)) is not None:
+                failed, by = self._recover(step, end, error, self.recover)
+                remedy = "ended the run" if failed else f"confirmed by {by}, recovered" if by else "recovered"
+                self._note_fault(step.name, attempt, end, remedy)
+                if failed is not None:
                     return failed
             else:
+                self._note_fault(step.name, attempt, end, "ended the run")
                 return end
             if (asked := self._hold()) is not None:
                 return asked
             attempt += 1
         return None
 
-    def _recover(self, step: Step, error: BaseException, recover: Callable[[BaseException], None]) -> Failure | None:
+    def _recover(
+        self, step: Step, end: Failure, error: BaseException, recover: Recover
+    ) -> tuple[Failure | None, str | None]:
+        """Clear a fault: why that ended the run, or None; and who has confirmed it, where that was needed."""
         self.sequence.fire(Trigger.FAULT)
-        self._stop(f"fault in {step.name}")
+        # A device that is to be recovered may not have confirmed it; after the recovery all have to.
+        self._stop(f"fault in {step.name}", end)
+        by = None
+        if end.needs_person:
+            refused, by = self._person(step, end)
+            if refused is not None:
+                return refused, None
         self.sequence.fire(Trigger.RECOVER)
-        call = Call("recovery", lambda: recover(error))
-        end = self._watch(call, self.clock.now() + self.policy.recovery_deadline_s, "the recovery")
-        if end is None and call.error is not None:
+        token = CancelToken(self.control.token)
+        call = Call("recovery", lambda: recover(error, token, by is not None))
+        failed = self._watch(call, self.clock.now() + self.policy.recovery_deadline_s, "the recovery", token)
+        if failed is None and call.error is not None:
             self._error = call.error
+            failed = self._ask()
+        if failed is None and call.error is not None:
             judged = self._judge(call.error)
-            end = replace(judged, outcome=Outcome.FAULTED, reason=f"{error}; the recovery failed: {judged.reason}")
-        if end is None:
+            failed = replace(judged, outcome=Outcome.FAULTED, reason=f"{error}; the recovery failed: {judged.reason}")
+        if failed is None:
+            failed = self._stop(f"recovered, before {step.name} is tried again", end)
+        if failed is None:
             self.sequence.fire(Trigger.RECOVERED)
-        return end
+        return failed, by
+
+    def _person(self, step: Step, end: Failure) -> tuple[Failure | None, str | None]:
+        """Wait until a person has confirmed: why that ended the run, or None; and who it was."""
+        if self.policy.simulated_person:
+            by = "the simulated person"
+        else:
+            number = self.control.ask(end.reason)
+            self._tell(Event("confirm_needed", step.name, {"reason": end.reason, "code": end.code, "number": number}))
+            try:
+                until = time.monotonic() + self.policy.confirm_deadline_s
+                while (found := self.control.answer()) is None:
+                    if (asked := self._pause_briefly()) is not None:
+                        return asked, None
+                    if time.monotonic() > until:
+                        text = f"{end.reason}; nobody confirmed within {self.policy.confirm_deadline_s:g} s"
+                        return replace(end, outcome=Outcome.FAULTED, reason=text), None
+                by = found
+            finally:
+                self.control.asked_no_more()
+        self._tell(Event("confirmed", step.name, {"by": by, "reason": end.reason}))
+        return None, by
 
     def _attempt(self, step: Step, attempt: int) -> Failure | None:
         """One try: None, or the end that it leads to unless it is repeated."""
-        started = self.clock.now()
+        started, begun = self.clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
-        context = StepContext(step, attempt, deadline, dict(self._results), self.clock, self._tell)
+        context = StepContext(step, attempt, deadline, dict(self._results), self.clock, self._tell, self.control)
         key = self.journal.step_started(step.name, attempt)
         self._tell(Event("step_started", step.name, {"attempt": attempt}))
         self._error = None
         call = Call(step.name, lambda: self.steps[step.name](context))
-        end = self._watch(call, deadline, step.name, context.cancel)
+        end = self._watch(call, deadline, step.name, context.token, ailing=True)
         if end is None and call.error is not None:
             self._error = call.error
             end = self._ask() or self._judge(call.error)
+        context.token.cancel(f"{step.name} has ended")
         duration = self.clock.now() - started
-        before = self._records[step.name].duration_s
+        before = self._records[step.name]
+        wall = before.wall_s + time.monotonic() - begun
         state = "done" if end is None else "failed"
-        self._records[step.name] = StepRecord(step.name, state, before + duration, attempt - 1)
+        self._records[step.name] = StepRecord(step.name, state, before.duration_s + duration, attempt - 1, wall)
         if end is not None:
             self.journal.step_ended(key, duration, error=end.reason)
             self._tell(Event("step_failed", step.name, {"attempt": attempt, "reason": end.reason}))
@@ -184,10 +233,14 @@ class Runner:
     # --- watching ---
 
     def _watch(
-        self, call: Call, deadline: float, what: str, cancel: Callable[[str], None] | None = None
+        self, call: Call, deadline: float, what: str, token: CancelToken, ailing: bool = False
     ) -> Failure | None:
-        """Wait for the end of `call`; on a request, a signal or the deadline stop the cell and say why."""
+        """Wait for the end of `call`; on a request, a signal or the deadline end it, stop the cell and say why.
+
+        With `ailing` the cell's health is looked at as well. Time for which the run is held does not count.
+        """
         cause: Failure | None = None
+        held = self.control.held_s
         while cause is None:
             if self.clock.wait(call.done, POLL_S * self.clock.rate):
                 return None
@@ -196,13 +249,12 @@ class Runner:
             except JournalError as error:
                 self._error = error
                 cause = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
-            if cause is None and cancel is not None:
+            if cause is None and ailing:
                 cause = self._ail()
-            if cause is None and self.clock.now() > deadline:
+            if cause is None and self.clock.now() > deadline + (self.control.held_s - held) * self.clock.rate:
                 self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
                 cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
-        if cancel is not None:
-            cancel(cause.reason)
+        token.cancel(cause.reason)
         trouble = self._halt(cause.reason)
         if not self.clock.wait(call.done, self.policy.grace_s * self.clock.rate):
             self._abandoned = True
@@ -214,19 +266,13 @@ class Runner:
     def _ask(self) -> Failure | None:
         """The end that somebody asked for, if any."""
         self._polls += 1
-        if self._polls % REQUEST_POLLS == 1:
-            for request in self.journal.take_requests():
-                match request.kind:
-                    case "abort":
-                        self.abort(request.reason)
-                    case "pause":
-                        self.pause()
-                    case "resume":
-                        self.resume()
         if self._signals.reason is not None:
-            return Failure(Outcome.ABORTED, self._signals.reason, "signal")
-        if self._asked is not None:
-            return Failure(Outcome.ABORTED, self._asked, "request")
+            self.control.abort(self._signals.reason, self._signals.number)
+        # Who asked in this process does not wait for the disk.
+        if self.control.token.reason is None and self._polls % REQUEST_POLLS == 1:
+            self.control.obey(self.journal.take_requests())
+        if (reason := self.control.token.reason) is not None:
+            return Failure(Outcome.ABORTED, reason, "request" if self.control.signal is None else "signal")
         return None
 
     def _ail(self) -> Failure | None:
@@ -243,15 +289,21 @@ class Runner:
     def _hold(self) -> Failure | None:
         """Stay paused for as long as it is asked for."""
         end = self._ask()
-        if end is None and self._paused.is_set():
+        if end is None and self.control.paused():
+            step = self.sequence.state.value
             self.sequence.fire(Trigger.PAUSE)
-            never = threading.Event()
-            while end is None and self._paused.is_set():
-                self.clock.wait(never, POLL_S * self.clock.rate)
-                end = self._ask()
+            self._tell(Event("paused", step, {"text": f"held before {step}"}))
+            while end is None and self.control.paused():
+                end = self._pause_briefly()
             if end is None:
                 self.sequence.fire(Trigger.RESUME)
+                self._tell(Event("going_on", step, {"text": "goes on"}))
         return end
+
+    def _pause_briefly(self) -> Failure | None:
+        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any."""
+        self.clock.wait(self.control.token.event, POLL_S * self.clock.rate)
+        return self._ask()
 
     def _judge(self, error: BaseException) -> Failure:
         if isinstance(error, KeyboardInterrupt | SystemExit):
@@ -273,18 +325,27 @@ class Runner:
             return f"it did not end within {self.policy.stop_deadline_s:g} s"
         return None if call.error is None else f"{type(call.error).__name__}: {call.error}"
 
-    def _stop(self, reason: str) -> None:
+    def _stop(self, reason: str, end: Failure) -> Failure | None:
+        """Bring the cell to rest before the run goes on after `end`; the end of the run if that was not confirmed."""
         trouble = self._halt(reason)
         self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
+        if trouble is None:
+            return None
+        return Failure(Outcome.FAULTED, f"{end.reason}; the safe stop after it failed: {trouble}", "safe_stop")
 
     def _finish(self, end: Failure | None) -> RunResult:
         outcome = Outcome.PLACED if end is None else end.outcome
         reason = f"end of the run ({outcome.value})"
+        # Whoever still works in an abandoned thread begins nothing any more.
+        self.control.token.cancel("the run has ended")
+        self.control.over = True
         trouble = self._halt(reason)
         said = "all steps done" if end is None else end.reason
         if trouble is not None:
             end = Failure(Outcome.FAULTED, f"{said}; the safe stop failed: {trouble}", "safe_stop")
         try:
+            if trouble is not None and end is not None:
+                self._note_fault("", 0, end, "ended the run")
             self._tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
             if end is not None:
                 self.sequence.fire(_END_TRIGGERS[end.outcome])
@@ -294,19 +355,33 @@ class Runner:
             outcome = Outcome.FAULTED
             end = Failure(outcome, f"{said}; the end could not be recorded: {error}", "run.internal")
             said = end.reason
+        self._tell(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
         records = tuple(self._records[step.value] for step in STEPS)
         code = "" if end is None else end.code
-        return RunResult(outcome, said, code, records, dict(self._results), self._error, self._signals.number)
+        return RunResult(
+            outcome, said, code, records, dict(self._results), self._error, self.control.signal, tuple(self._faults)
+        )
 
     # --- telling ---
+
+    def _note_fault(self, step: str, attempt: int, end: Failure, remedy: str) -> None:
+        """Keep what went wrong and what was done about it, for the report; an end that was asked for is no fault."""
+        if end.outcome is Outcome.ABORTED:
+            return
+        self._tell(Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy}))
 
     def _on_change(self, trigger: Trigger, source: State, target: State) -> None:
         self._tell(Event("state", None, {"trigger": trigger.value, "from": source.value, "to": target.value}))
 
     def _tell(self, event: Event) -> None:
         """Write to the journal what is not in its steps table, and tell the observer; from any thread."""
-        if event.kind in ("state", "safe_stop", "note"):
+        if event.kind in JOURNALLED:
             self.journal.event(event.kind, event.step, event.data)
+        if event.kind == "fault":
+            attempt, code, reason = (event.data[key] for key in ("attempt", "code", "reason"))
+            remedy = str(event.data.get("remedy", "noted"))
+            assert isinstance(attempt, int)
+            self._faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy))
         observer = self.observer
         if observer is not None:
             try:

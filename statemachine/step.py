@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+from statemachine.cancel import CancelToken
+from statemachine.control import RunControl
 from statemachine.policy import Outcome, Step
 from statemachine.watch import Clock
 
 
 class StepOverrun(RuntimeError):
     """A step did not end within its deadline. A policy can name it in `retry_on`."""
-
-
-class StepCancelled(RuntimeError):
-    """Raised by `StepContext.check` in a step that is to end now."""
 
 
 @runtime_checkable
@@ -28,24 +27,37 @@ class Summarised(Protocol):
 
 @dataclass(frozen=True)
 class Event:
-    """What an observer is told: `kind` is state, step_started, step_done, step_failed, progress, safe_stop or note."""
+    """What an observer is told, with the time in seconds since the epoch.
+
+    `kind` is state, step_started, step_done, step_failed, progress, safe_stop, note, fault, confirm_needed, confirmed,
+    paused, going_on or run_ended.
+    """
 
     kind: str
     step: str | None
     data: Mapping[str, object]
+    at: float = field(default_factory=time.time)
 
 
 Observer = Callable[[Event], None]
 
 
 class StepContext:
-    """What a step is given: earlier results, its deadline, and ways to report.
+    """What a step is given: earlier results, its deadline, its end, and ways to report.
 
     `results` maps the earlier steps' names to what they returned. `deadline` is in seconds of the cell's clock.
+    `token` ends this attempt: with the run, or by itself when the attempt is cut short.
     """
 
     def __init__(
-        self, step: Step, attempt: int, deadline: float, results: Mapping[str, object], clock: Clock, tell: Observer
+        self,
+        step: Step,
+        attempt: int,
+        deadline: float,
+        results: Mapping[str, object],
+        clock: Clock,
+        tell: Observer,
+        control: RunControl | None = None,
     ) -> None:
         self.step = step
         self.attempt = attempt
@@ -53,16 +65,25 @@ class StepContext:
         self.results = results
         self._clock = clock
         self._tell = tell
-        self._cancelled: str | None = None
+        self._control = control or RunControl()
+        self.token = CancelToken(self._control.token)
 
     def remaining(self) -> float:
         """Seconds of the cell's clock until the deadline, at least 0."""
         return max(0.0, self.deadline - self._clock.now())
 
     def check(self) -> None:
-        """Raise `StepCancelled` if the step is to end now. For loops that wait for no device."""
-        if self._cancelled is not None:
-            raise StepCancelled(self._cancelled)
+        """Raise `Cancelled` if the step is to end now. For loops that wait for no device."""
+        self.token.check()
+
+    def safe_point(self) -> None:
+        """A moment at which nothing moves and the laser is off: a paused run is held here. Raises like `check`."""
+
+        def say(held: bool) -> None:
+            kind = "paused" if held else "going_on"
+            self._tell(Event(kind, self.step.name, {"text": "held before its next motion" if held else "goes on"}))
+
+        self._control.safe_point(self.token, say)
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""
@@ -73,24 +94,47 @@ class StepContext:
         """Write something worth keeping to the journal and tell the observer."""
         self._tell(Event("note", self.step.name, data))
 
-    def cancel(self, reason: str) -> None:
-        """Let `check` raise from now on."""
-        self._cancelled = reason
+    def fault(self, code: str, reason: str) -> None:
+        """Note a fault that the step goes on after; it is in the run's faults."""
+        self._tell(Event("fault", self.step.name, {"attempt": self.attempt, "code": code, "reason": reason}))
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """How one step went; `state` is open, done, failed or resumed. `duration_s` sums all attempts, in cell seconds."""
+    """How one step went; `state` is open, done, failed or resumed.
+
+    `duration_s` sums all attempts in seconds of the cell's clock, `wall_s` in seconds on the wall.
+    """
 
     name: str
     state: str = "open"
     duration_s: float = 0.0
     retries: int = 0
+    wall_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class FaultRecord:
+    """A fault or a failed attempt on the way, and what was done about it.
+
+    `at` is in seconds since the epoch; `code` is short and stable; `remedy` is tried again, recovered, confirmed by a
+    person, noted, or ended the run.
+    """
+
+    at: float
+    step: str
+    attempt: int
+    code: str
+    reason: str
+    remedy: str
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `signal` is the number of the signal that ended it; `error` the exception behind the end."""
+    """How a run ended. `signal` is the number of the signal that ended it; `error` the exception behind the end.
+
+    `faults` are all that was met on the way, in their order, also those that the run went on after.
+    """
 
     outcome: Outcome
     reason: str
@@ -99,6 +143,7 @@ class RunResult:
     results: Mapping[str, object]
     error: BaseException | None = None
     signal: int | None = None
+    faults: tuple[FaultRecord, ...] = ()
 
 
 StepCall = Callable[[StepContext], object]

@@ -45,6 +45,54 @@ class Call:
             self.done.set()
 
 
+class SignalInterrupt(BaseException):
+    """A signal asked the program to end, outside of any run. Like `KeyboardInterrupt`, nothing but the top takes it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(said(number))
+        self.number = number
+
+
+def said(number: int) -> str:
+    """A signal in words for the operator."""
+    if number == signal.SIGINT:
+        return "interrupted from the keyboard"
+    return f"asked to end ({signal.Signals(number).name})"
+
+
+class EndSignals:
+    """Inside this context SIGTERM and SIGHUP, which would end the program without a word, raise `SignalInterrupt`.
+
+    So does SIGINT with `keyboard`. Only the first one does: the cleaning up after it is not cut short by a second. Only
+    where nobody else has a handler, and only in the main thread; contexts nest.
+    """
+
+    def __init__(self, keyboard: bool = False) -> None:
+        self._numbers = [signal.SIGTERM, signal.SIGHUP, *([signal.SIGINT] if keyboard else [])]
+        self._previous: dict[int, object] = {}
+        self._raised = False
+
+    def __enter__(self) -> EndSignals:
+        if threading.current_thread() is threading.main_thread():
+            for number in self._numbers:
+                if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                    self._previous[number] = signal.signal(number, self._raise)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in self._previous.items():
+                signal.signal(number, handler)  # type: ignore[arg-type]
+            self._previous = {}
+
+    def _raise(self, number: int, frame: FrameType | None) -> None:
+        if not self._raised:
+            self._raised = True
+            raise SignalInterrupt(number)
+
+
 class SignalWatch:
     """Inside this context SIGINT, SIGTERM and SIGHUP are noted in `reason` and do not interrupt anything.
 
@@ -59,11 +107,7 @@ class SignalWatch:
     @property
     def reason(self) -> str | None:
         """What to tell the operator, or None if no signal came."""
-        if self.number is None:
-            return None
-        if self.number == signal.SIGINT:
-            return "interrupted from the keyboard"
-        return f"asked to end ({signal.Signals(self.number).name})"
+        return None if self.number is None else said(self.number)
 
     def __enter__(self) -> SignalWatch:
         if threading.current_thread() is threading.main_thread():

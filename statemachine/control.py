@@ -1,0 +1,147 @@
+"""What a person or a program holds of a run that is going on: end it, hold it, let it go on, confirm.
+
+One object for every way to ask: the run's handle, another process through the journal, a signal, `Cell.stop()`. Whoever
+does the run's work asks here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from statemachine.cancel import CancelToken
+
+
+class Asked(Protocol):
+    """A request of another process: what is asked for, and why."""
+
+    @property
+    def kind(self) -> str:
+        """One of `statemachine.journal.REQUESTS`."""
+
+    @property
+    def reason(self) -> str:
+        """In the words of whoever asked."""
+
+
+class RunControl:
+    """The reins of one run; every method may be called from any thread."""
+
+    def __init__(self) -> None:
+        self.token = CancelToken()
+        self.signal: int | None = None
+        self.over = False
+        """Set by the run once it has come to an end of its own."""
+        self._change = threading.Condition()
+        self._paused = False
+        self._wanted: str | None = None
+        self._question = 0
+        self._confirmed: str | None = None
+        self._held_since: float | None = None
+        self._held_s = 0.0
+
+    # --- asked from outside ---
+
+    def abort(self, reason: str, signal: int | None = None) -> None:
+        """End the run as aborted: what moves is stopped at once. `signal` is the number of one that asked for it."""
+        first = self.token.cancel(reason)
+        # A signal after the run's own end still tells the program to end.
+        if signal is not None and self.signal is None and (first or self.over):
+            self.signal = signal
+        with self._change:
+            self._change.notify_all()
+
+    def pause(self) -> None:
+        """Hold the run at its next safe point: before its next free motion, or its next step."""
+        with self._change:
+            self._paused = True
+            self._change.notify_all()
+
+    def go_on(self) -> None:
+        """Let a held run go on."""
+        with self._change:
+            self._paused = False
+            self._change.notify_all()
+
+    def confirm(self, by: str, number: int | None = None) -> bool:
+        """A person has looked and says that the run may go on; False when the run waits for nobody's word.
+
+        Said before it is asked for, it does not count, nor with the `number` of another question: it could not have
+        been about this.
+        """
+        with self._change:
+            if self._wanted is None or number not in (None, self._question):
+                return False
+            self._confirmed = by
+            self._change.notify_all()
+            return True
+
+    def obey(self, requests: Iterable[Asked]) -> None:
+        """Do what other processes asked for."""
+        for request in requests:
+            match request.kind:
+                case "abort":
+                    self.abort(request.reason)
+                case "pause":
+                    self.pause()
+                case "go-on":
+                    self.go_on()
+                case "confirm":
+                    self.confirm(request.reason)
+
+    # --- asked by the run ---
+
+    def paused(self) -> bool:
+        """Whether the run is asked to hold."""
+        return self._paused
+
+    @property
+    def waits_for(self) -> str | None:
+        """What a person has to confirm now, or None."""
+        return self._wanted
+
+    @property
+    def held_s(self) -> float:
+        """Wall seconds that the run was held in its steps, until now: they count towards no deadline."""
+        with self._change:
+            since = self._held_since
+            return self._held_s + (0.0 if since is None else time.monotonic() - since)
+
+    def safe_point(self, token: CancelToken, say: Callable[[bool], None]) -> None:
+        """Stay here for as long as the run is paused; `say(True)` when it is held, `say(False)` when it goes on.
+
+        Raises `Cancelled` when `token` ends the work.
+        """
+        token.check()
+        if not self.paused():
+            return
+        say(True)
+        with self._change:
+            self._held_since = time.monotonic()
+        try:
+            while self.paused():
+                if token.event.wait(0.02):
+                    token.check()
+        finally:
+            with self._change:
+                self._held_s += time.monotonic() - (self._held_since or time.monotonic())
+                self._held_since = None
+        say(False)
+
+    def ask(self, what: str) -> int:
+        """From now on the run waits for a person's word about `what`; the number of this question."""
+        with self._change:
+            self._wanted, self._confirmed = what, None
+            self._question += 1
+            return self._question
+
+    def answer(self) -> str | None:
+        """Who has confirmed since `ask`, or None."""
+        return self._confirmed
+
+    def asked_no_more(self) -> None:
+        """The run does not wait for a person any more."""
+        with self._change:
+            self._wanted = None
