@@ -18,6 +18,10 @@ Every text says what happened, the value, the allowed range with units, and what
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
 
 class CellError(Exception):
     """Base of every error that the cell raises on purpose; `str()` is fit to be shown to an operator."""
@@ -81,8 +85,49 @@ class CalibrationStale(CellError):
     """The stored calibration is missing, foreign or was made under another configuration."""
 
 
+@dataclass(frozen=True)
+class Measured:
+    """A number in `unit` beside what it is held against: at least `least`, at most `most`, or `about` so much."""
+
+    name: str
+    value: float
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    about: float | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready: name, value, limit, bound ("at least", "at most", "about" or None), unit, kept."""
+        bounds = (("at least", self.least), ("at most", self.most), ("about", self.about))
+        bound, limit = next(((word, limit) for word, limit in bounds if limit is not None), (None, None))
+        value, limit = (None if number is None else float(number) for number in (self.value, limit))
+        return {"name": self.name, "value": value, "limit": limit, "bound": bound, "unit": self.unit, "kept": self.kept}
+
+    @property
+    def kept(self) -> bool:
+        """True unless the value leaves its limit; `most` holds for either sign."""
+        low = self.least is None or bool(self.value >= self.least)
+        return low and (self.most is None or bool(abs(self.value) <= self.most))
+
+
 class RefusedError(CellError):
-    """A measurement is not good enough to go on. Example: the board is seen too obliquely."""
+    """A measurement is not good enough to go on. Example: the board is seen too obliquely.
+
+    `numbers` are what the refusal rests on, with their limits; `seen` is what was looked at, by name (frames, a cloud,
+    a pose), so that whoever ends the run can keep it. Neither is part of the text.
+    """
+
+    def __init__(self, message: str, *numbers: Measured) -> None:
+        super().__init__(message)
+        self.numbers: tuple[Measured, ...] = numbers
+        self.seen: dict[str, object] = {}
+
+    def showing(self, *numbers: Measured, seen: Mapping[str, object] | None = None) -> Self:
+        """This error with more evidence; what is nearer to the cause came first and stays."""
+        known = {number.name for number in self.numbers}
+        self.numbers += tuple(number for number in numbers if number.name not in known)
+        self.seen = {**(seen or {}), **self.seen}
+        return self
 
 
 class NotObservable(RefusedError):

@@ -93,7 +93,11 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class RailState:
-    """Rail reading; `stamp` is the host time (middle of the round trip) at which `position` held."""
+    """Rail reading; `stamp` is the host time (middle of the round trip) at which `position` held.
+
+    `homed` is what the device says, whoever homed it and whenever; `homed_here` that this program did, so that nothing
+    can have moved it unseen.
+    """
 
     stamp: float
     position: float
@@ -102,6 +106,7 @@ class RailState:
     moving: bool
     left_switch: bool
     right_switch: bool
+    homed_here: bool = False
 
 
 class Sweep(Motion, Protocol):
@@ -118,6 +123,18 @@ class Sweep(Motion, Protocol):
     def position_at(self, host_time: float) -> float:
         """Position in m at a host time inside `window`; `ValueError` outside."""
 
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of the times behind `position_at`, known once the sweep has ended.
+
+        A reading's time is known within its round trip only. Replies that are all late by as much shift all positions
+        by what the rail covers in half of that: nothing in the readings shows it.
+        """
+
+    @property
+    def unevenness(self) -> float:
+        """Median distance in m of the readings from an even motion, beyond what their round trips explain."""
+
 
 class Rail(Device, Protocol):
     """A linear axis that carries the scan head; positions in m from the home switch."""
@@ -125,13 +142,16 @@ class Rail(Device, Protocol):
     travel: tuple[float, float]
 
     def state(self) -> RailState:
-        """Read position, velocity and switches now."""
+        """Read position, velocity, switches and whether it is homed now.
+
+        Raises `DeviceFault` (rail.reset), once, when the device has lost the zero that it had.
+        """
 
     def home(self) -> Motion:
         """Search the reference switch; position 0 is there afterwards."""
 
     def move_to(self, position: float, speed: float | None = None) -> Motion:
-        """Move to `position`; refused with `InterlockError` before homing."""
+        """Move to `position`; refused with `InterlockError` before homing, `DeviceFault` when the zero was lost."""
 
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """Move so that the velocity is constant from `start` to `stop`, with start-up and run-out outside of them.
@@ -180,6 +200,10 @@ class Camera(Device, Protocol):
     """A camera that delivers 8-bit grey frames."""
 
     shape: tuple[int, int]
+
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of the host times of its newest frames, as far as the clocks could be compared."""
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """Set exposure in s and frame rate in Hz; refused outside the range or when they clash."""
@@ -265,8 +289,12 @@ class Arm(Device, Protocol):
     def digital_input(self, index: int) -> bool:
         """Read a digital input from the newest state."""
 
-    def recover(self) -> None:
-        """Clear a protective stop, restart the link if needed and upload the control program again."""
+    def recover(self, *, confirmed: bool = False) -> None:
+        """Restart the link if needed and upload the control program again, with the laser's output off.
+
+        A protective stop is cleared only when a person has `confirmed` it, else `DeviceFault` (arm.protective_stop).
+        `stop()` and `close()` end it: it raises `Aborted`, and nothing was unlocked or started after them.
+        """
 
 
 # --- vehicle ---
@@ -277,7 +305,9 @@ class VehicleState:
     """Vehicle feedback.
 
     Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
-    frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported.
+    frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None as long as this
+    driver has not commanded the brake. `trouble` says in words what ends motion. `interruptions` counts how often
+    odometry lost its connection to where the vehicle was before, and `interruption` says why it did last.
     """
 
     stamp: float
@@ -287,10 +317,13 @@ class VehicleState:
     speed: float
     yaw_rate: float
     command_mode: bool
-    braked: bool
+    braked: bool | None
     emergency_stop: bool
     error_bits: int
     battery_volts: float
+    trouble: tuple[str, ...] = ()
+    interruptions: int = 0
+    interruption: str = ""
 
 
 class Vehicle(Device, Protocol):
@@ -299,8 +332,14 @@ class Vehicle(Device, Protocol):
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` seconds old, else `DeadlineError`."""
 
+    def check(self) -> None:
+        """Raise the `DeviceFault` that the vehicle shows: lost link, silence, emergency stop, error, lost command."""
+
     def enable(self) -> None:
         """Take command over CAN and release the brake."""
+
+    def recover(self) -> None:
+        """Clear what can be cleared and take command again, with the brake locked throughout."""
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity that is kept alive until the next call or `stop()`; must be renewed within 0.5 s."""

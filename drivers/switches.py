@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.clock import Clock
+from drivers.endings import in_the_end
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Arm, Identity, LinkStatistics
 
@@ -63,11 +64,9 @@ class ArmSwitchedLaser(_Switch):
                 raise InterlockError(
                     self.name, f"output {self._output} is already on and not ours. Switch it off with stop() first"
                 )
-            try:
+            with in_the_end(lambda: self._arm.set_digital_output(self._output, False)):
                 self._arm.set_digital_output(self._output, True)
                 yield
-            finally:
-                self._arm.set_digital_output(self._output, False)
         finally:
             self._owner.release()
 

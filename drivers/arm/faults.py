@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from drivers.arm.dashboard import Dashboard
 from drivers.clock import Clock
@@ -12,7 +13,8 @@ _UNLOCK_S = 20.0
 
 _FAULTS: dict[str, tuple[str, bool, str]] = {
     "arm.protective_stop": (
-        "the arm is in protective stop", True, "Look for what it ran into, clear the way, then recover().",
+        "the arm is in protective stop", True,
+        "Look for what it ran into and clear the way; then a person confirms: `cell confirm`, recover(confirmed=True).",
     ),
     "arm.emergency_stop": (
         "the emergency stop is pressed", False,
@@ -26,6 +28,13 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
     "arm.program_stopped": ("the control program does not run on the arm", True, "recover() starts it again."),
     "arm.not_arrived": ("the motion ended away from its target", True, "See what hinders the arm, then recover()."),
     "arm.not_stopped": ("the arm does not come to rest", False, "Use the emergency stop."),
+    "arm.not_safe": (
+        "the arm is not known to be safe", False, "Use the emergency stop; see that it stands and the laser is off.",
+    ),
+    "arm.wrong_kinematics": (
+        "the arm is not the one that is configured", False,
+        "See that its address and model are right and that nobody has set another tool at the pendant.",
+    ),
     "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
 }  # fmt: skip
 
@@ -36,16 +45,22 @@ def fault(device: str, code: str, text: str = "") -> DeviceFault:
     return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 
-def unlock(device: str, dashboard: Dashboard, clock: Clock) -> None:
-    """Release a protective stop; the controller allows it only some seconds after its beginning.
+def unlock(
+    device: str, dashboard: Dashboard, clock: Clock, confirmed: bool, require_wanted: Callable[[], None]
+) -> None:
+    """Release a protective stop that a person has `confirmed`; the controller allows it only some seconds after it.
 
-    Raises `DeviceFault` when the stop is one that only the operator can clear.
+    Raises `DeviceFault` when nobody has, or when the stop is one that only the operator can clear, and whatever
+    `require_wanted` raises, which is asked before each try.
     """
     deadline = time.monotonic() + _UNLOCK_S
-    while (status := dashboard.ask("safetystatus").rpartition(":")[2].strip()) != "NORMAL":
+    while (status := dashboard.ask("safetystatus").rpartition(":")[2].strip()) not in ("NORMAL", "REDUCED"):
         if status != "PROTECTIVE_STOP":
             code = "arm.emergency_stop" if "EMERGENCY" in status else "arm.safety_fault"
             raise fault(device, "arm.safeguard_stop" if "SAFEGUARD" in status else code, status)
+        if not confirmed:
+            raise fault(device, "arm.protective_stop", "nobody has confirmed that it may be unlocked")
+        require_wanted()
         dashboard.ask("close safety popup")
         reply = dashboard.ask("unlock protective stop")
         if time.monotonic() > deadline:

@@ -14,14 +14,16 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
 from drivers.arm.messages import Ended, Lost, Reply, Request, Setup, Snapshot
-from drivers.errors import DeviceFault, NotConnectedError
+from drivers.errors import Aborted, DeviceFault, NotConnectedError
 
 _SILENCE_S = 2.0
+_LOOK_S = 0.02
 
 
 class _Pending:
@@ -33,8 +35,8 @@ class _Pending:
 class ArmLink:
     """A running child process, connected to the arm.
 
-    `on_snapshot` and `on_ended` are called from the link's own thread, and so is `on_lost`, once, when the link is
-    lost otherwise than by `close`.
+    `on_snapshot` and `on_ended` are called from the link's own thread, and so is `on_lost`, once, when a link that was
+    up is lost otherwise than by `close`.
     """
 
     def __init__(
@@ -45,8 +47,12 @@ class ArmLink:
         on_snapshot: Callable[[Snapshot], None],
         on_ended: Callable[[Ended], None],
         on_lost: Callable[[DeviceFault], None],
+        wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline."""
+        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline.
+
+        `Aborted`, with the child gone, as soon as it is not `wanted` any more.
+        """
         self.lost: DeviceFault | None = None
         self._name = name
         self._address = setup.address
@@ -64,12 +70,16 @@ class ArmLink:
         self._reader = threading.Thread(target=self._read, name=f"{name} link", daemon=True)
         self._reader.start()
         self._transmit(setup)
-        up.done.wait(connect_deadline)
+        deadline = time.monotonic() + connect_deadline
+        while not up.done.wait(_LOOK_S) and wanted() and time.monotonic() < deadline:
+            pass
         reason = f"no answer within {connect_deadline:g} s" if not up.done.is_set() else (up.problem or ("", ""))[1]
-        if reason:
+        if reason or not wanted():
             self._closing = True
             self._process.kill()
             self._end()
+            if not wanted():
+                raise Aborted(f"{name}: connecting was stopped; the process that had begun it is gone")
             raise NotConnectedError(
                 name,
                 f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its address "
@@ -89,8 +99,9 @@ class ArmLink:
         """
         pending = _Pending()
         number = next(self._numbers)
-        self._raise_if_lost()
         with self._lock:
+            # Under the lock: whoever is not told of the loss by it will be by `_fail`, which takes all that wait.
+            self._raise_if_lost()
             self._pending[number] = pending
         self._transmit(Request(number, name, arguments))
         if not pending.done.wait(deadline):
@@ -103,9 +114,12 @@ class ArmLink:
     def close(self, deadline: float) -> None:
         """Let the child stop the arm, switch the safe outputs off and end; it is killed if it does not."""
         self._closing = True
-        if self.lost is None:
-            number = next(self._numbers)
-            pending = self._pending[number] = _Pending()
+        pending, number = _Pending(), next(self._numbers)
+        with self._lock:
+            up = self.lost is None
+            if up:
+                self._pending[number] = pending
+        if up:
             self._transmit(Request(number, "close"))
             pending.done.wait(deadline)
         self._fail("it was closed")
@@ -192,7 +206,9 @@ class ArmLink:
             pending.done.set()
         if not self._closing:
             self._process.kill()
-            self._on_lost(self.lost)
+            # Before it was up nothing on the arm was ours: there is nothing to make safe, and others are left alone.
+            if self._connected:
+                self._on_lost(self.lost)
 
     def _last_words(self) -> str:
         """What the child wrote last before it died, for an error at the start."""
@@ -214,9 +230,12 @@ class ArmLink:
         self._errors.close()
 
 
-def switch_off(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
-    """Switch outputs of the arm off through a process of its own that needs nothing else; False if that failed."""
-    command = [sys.executable, "-m", "drivers.arm.ur_child", "--off", address, ",".join(map(str, outputs))]
+def see_safe(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
+    """Switch outputs of the arm off through a process of its own that needs nothing else.
+
+    True once the arm itself has shown that they are off and that it stands, False if it did not within `deadline` s.
+    """
+    command = [sys.executable, "-m", "drivers.arm.ur_child", "--safe", address, ",".join(map(str, outputs))]
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
     try:
         done = subprocess.run(

@@ -19,7 +19,8 @@ class Setup:
     """How the child works: `rate` is the clock's, `safe_off` the outputs to switch off when the owner is lost.
 
     `payload` is mass in kg and centre of gravity in the flange frame in m. The controller ends its program when it
-    hears nothing for `watchdog` seconds. `braking` is the deceleration of a stop in rad/s².
+    hears nothing for `watchdog` seconds on the wall. `braking` is the deceleration of a stop in rad/s². Without
+    `control` the arm is only looked at: nothing is set, started or ended.
     """
 
     address: str
@@ -28,6 +29,7 @@ class Setup:
     payload: tuple[float, tuple[float, float, float]]
     watchdog: float
     braking: float
+    control: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class Snapshot:
     """One state packet of the arm; `stamp` is when it arrived, `device_time` in s when the controller measured it, on
     the controller's own clock.
 
-    `safety_bits`, `mode` and `program_running` as the controller reports them; `wrench` at the flange in base axes.
+    `safety_bits`, `mode` and `runtime`, the state of the program, as the controller reports them; `wrench` at the
+    flange in base axes.
     """
 
     stamp: float
@@ -62,10 +65,20 @@ class Snapshot:
     wrench: Six
     safety_bits: int
     mode: int
-    program_running: bool
+    runtime: int
     inputs: int
     outputs: int
     device_time: float = 0.0
+
+    @property
+    def program_running(self) -> bool:
+        """True while a program runs; one that is paused does not."""
+        return self.runtime == PLAYING
+
+    @property
+    def at_rest(self) -> bool:
+        """True while the arm stands still."""
+        return max(abs(speed) for speed in self.speeds) < AT_REST
 
 
 @dataclass(frozen=True)
@@ -83,6 +96,9 @@ class Lost:
 
     text: str
 
+
+STOPPED, PLAYING = 1, 2
+"""`Snapshot.runtime` without a program, and while one runs; others are between the two, or paused."""
 
 MODE_RUNNING = 7
 """`Snapshot.mode` of an arm whose joints are powered and whose brakes are released."""

@@ -29,6 +29,14 @@ class Trajectory:
         before = self._joints[after - 1]
         return tuple(a + part * (b - a) for a, b in zip(before, self._joints[after], strict=True))
 
+    def speed_at(self, time: float) -> float:
+        """Speed of the leading joint at `time`, rad/s; 0 outside the trajectory."""
+        if not 0.0 <= time < self.duration:
+            return 0.0
+        after = bisect_right(self._times, time)
+        way = largest_difference(self._joints[after - 1], self._joints[after])
+        return way / (self._times[after] - self._times[after - 1])
+
 
 def largest_difference(a: Six, b: Six) -> float:
     """The largest absolute difference of two sets of joint angles."""

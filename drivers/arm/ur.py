@@ -2,7 +2,7 @@
 
 Everything is checked here before anything is sent; the child does the talking. A lost child or link is a
 `DeviceFault` in every waiting call, after which the arm is stopped and the safe outputs are switched off by other
-ways; `recover()` starts afresh.
+ways; `recover()` starts afresh. A cut cable is noticed by the controller's own watchdog, which ends the program.
 """
 
 from __future__ import annotations
@@ -12,36 +12,27 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from drivers.arm.dashboard import Dashboard
-from drivers.arm.faults import fault, unlock
-from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
-from drivers.arm.link import ArmLink, switch_off
-from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
+from drivers.arm.session import ArmSession
+from drivers.arm.wrong_arm import Forward
 from drivers.clock import Clock
-from drivers.errors import (
-    Aborted,
-    DeadlineError,
-    DeviceError,
-    DeviceFault,
-    InterlockError,
-    LimitError,
-    NotConnectedError,
-)
-from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
+from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
+from drivers.interfaces import ArmSafety, ArmState, Identity, Vector
 from drivers.quantities import check_positive, shown
 
-_CALL_S = 5.0
-_OUTPUT_S = 1.0
-_CLOSE_S = 4.0
-_SWITCH_OFF_S, _SWITCH_OFF_LEAST_S = 3.0, 0.3
 _FIRST_POINT = 0.02
-_WATCHDOG_S = 1.5
+_WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45
+"""Silence in seconds on the wall after which the controller ends its program.
+
+Only simulated arms are driven faster than the wall, and they share a busy machine with everything else.
+"""
 _OUTPUTS = 18
 _SAFETY = {
     "": ArmSafety.NORMAL,
@@ -58,6 +49,12 @@ class UrArm:
     `payload` is mass in kg and centre of gravity (3,) in the flange frame in m. `safe_off_outputs` are switched off
     when the driver closes or dies, or its link is lost: the laser's output belongs here. `braking` is the deceleration
     of a stop in rad/s². `connect_timeout` is in wall seconds. Raises `NotConnectedError` when no arm answers.
+
+    `forward`, joints (6,) in rad to the flange's pose (6,), is the caller's own model of the arm: here and before every
+    motion it has to agree with what the arm reports within 5 mm and 1°, else `DeviceFault` (arm.wrong_kinematics).
+
+    With `control=False` the arm is only looked at: nothing on it is started, set or ended, by `close` neither, and a
+    program that runs on it runs on. Everything but reading is then an `InterlockError`.
     """
 
     def __init__(
@@ -70,43 +67,47 @@ class UrArm:
         safe_off_outputs: tuple[int, ...] = (),
         braking: float = 4.0,
         connect_timeout: float = 10.0,
+        forward: Forward | None = None,
+        control: bool = True,
         clock: Clock,
     ) -> None:
         self.name = name
         self.limits = limits or ArmLimits()
-        self.statistics = LinkStatistics()
-        self._address = address
         self._clock = clock
-        self._connect_timeout = connect_timeout
-        self._payload = self.limits.check_payload(name, payload[0], np.array(payload[1]))
-        self._safe_off = tuple(_check_output(name, index) for index in safe_off_outputs)
-        self._braking = check_positive(name, "braking", braking, 20.0, "rad/s^2")
-        self._dashboard = Dashboard(name, address)
         self._numbers = itertools.count(1)
-        self._feed = StateFeed(name, clock, lambda: self._link.lost is not None, self._alive, self.statistics)
         self._starting = threading.Lock()
         self._motion: UrMotion | None = None
-        self._safing: threading.Thread | None = None
-        self._closed = False
-        self._link = self._connect()
+        setup = Setup(
+            address,
+            clock.rate,
+            tuple(_check_output(name, index) for index in safe_off_outputs),
+            self.limits.check_payload(name, payload[0], np.array(payload[1])),
+            _WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
+            check_positive(name, "braking", braking, 20.0, "rad/s^2"),
+            control,
+        )
+        self._session = ArmSession(name, setup, clock, connect_timeout, forward, self._on_ended, self._end_motion)
+        self._feed = self._session.feed
+        self.statistics = self._session.statistics
 
     # --- who and how ---
 
     def identity(self) -> Identity:
         """Model, serial number and controller version, asked of the dashboard server."""
-        version = self._dashboard.ask("PolyscopeVersion")
+        dashboard = self._session.dashboard
+        version = dashboard.ask("PolyscopeVersion")
         return Identity(
-            model=self._dashboard.ask("get robot model"),
-            serial=self._dashboard.ask("get serial number"),
+            model=dashboard.ask("get robot model"),
+            serial=dashboard.ask("get serial number"),
             firmware=version.removeprefix("URSoftware").split("(")[0].strip(),
-            address=self._address,
+            address=self._session.setup.address,
         )
 
     def ping(self) -> float:
         """Ask the dashboard server for the robot mode; the round trip in wall seconds."""
-        self._alive()
+        self._session.require_link()
         begun = time.monotonic()
-        self._dashboard.ask("robotmode")
+        self._session.dashboard.ask("robotmode")
         seconds = time.monotonic() - begun
         self.statistics.add_round_trip(seconds)
         return seconds
@@ -131,7 +132,7 @@ class UrArm:
             flange=np.array(snapshot.flange),
             wrench=np.array(snapshot.wrench),
             safety=_SAFETY[safety_code(snapshot.safety_bits)],
-            moving=max(abs(speed) for speed in snapshot.speeds) >= AT_REST,
+            moving=not snapshot.at_rest,
             digital_inputs=snapshot.inputs,
             digital_outputs=snapshot.outputs,
             device_time=snapshot.device_time,
@@ -178,32 +179,29 @@ class UrArm:
         return self._start("trajectory", "follow", times.tolist(), points, force_limit)
 
     def stop(self) -> None:
-        """Bring the arm to rest now, whatever it does; returns when it stands. Callable from any thread."""
-        self._ask("stop")
+        """Bring the arm to rest now, whatever it does, so that nothing of its motion can go on; from any thread.
+
+        Returns when it stands. A program that is paused is ended; `recover` starts it again, and is itself ended by a
+        stop. Without its link the arm is stopped and the safe outputs are switched off through the dashboard and a
+        process of its own; a `DeviceFault` says when the arm has not shown within 5 s that this was done.
+        """
+        self._session.stop()
 
     # --- settings, inputs and outputs ---
 
     def zero_force(self) -> None:
         """Take the present wrench as zero."""
-        self._ask("zero_force")
+        self._session.ask("zero_force")
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """Mass in kg and centre of gravity (3,) in the flange frame, m."""
         payload = self.limits.check_payload(self.name, mass, centre)
-        self._ask("payload", *payload)
-        self._payload = payload
+        self._session.ask("payload", *payload)
+        self._session.setup = replace(self._session.setup, payload=payload)
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
-        _check_output(self.name, index)
-        self._ask("output", index, bool(value), deadline=_OUTPUT_S)
-        if not self._feed.wait_for(lambda snapshot: bool(snapshot.outputs >> index & 1) == bool(value), _OUTPUT_S):
-            self.statistics.count("output not shown")
-            raise DeadlineError(
-                self.name,
-                f"output {index} was set to {bool(value)}, but the arm did not show it within {shown(_OUTPUT_S, 's')}. "
-                "See that no other program sets this output.",
-            )
+        self._session.set_output(_check_output(self.name, index), bool(value))
 
     def digital_input(self, index: int) -> bool:
         """Read a digital input (0-7 standard, 8-15 configurable, 16-17 tool) from the newest state."""
@@ -212,106 +210,44 @@ class UrArm:
 
     # --- ends and new beginnings ---
 
-    def recover(self) -> None:
-        """Clear a protective stop and start the link and the control program afresh.
+    def recover(self, *, confirmed: bool = False) -> None:
+        """Start the link and the control program afresh, with the safe outputs off.
 
-        The old program is ended first: an unlocked arm would otherwise finish its old move. Raises `DeviceFault` when
-        the stop is one that only the operator can clear.
+        The old program is ended first: an unlocked arm would otherwise finish its old move. A protective stop is
+        unlocked only when a person has `confirmed` that this is safe; the maker prohibits it otherwise. Raises
+        `DeviceFault` when the stop is one that only the operator can clear, or that nobody has confirmed; `Aborted`
+        when `stop` or `close` is called meanwhile: nothing is unlocked or started then, and no process is left behind.
         """
-        if self._closed:
-            raise NotConnectedError(self.name, "the driver was closed. Open a new one.")
-        self._dashboard.ask("stop")
-        unlock(self.name, self._dashboard, self._clock)
-        self._link.close(_CLOSE_S)
-        self._end_motion(fault(self.name, "arm.program_stopped", "the arm was recovered"))
-        self._join_safing()
-        self._feed.forget()
-        self._link = self._connect()
-        self._require_ready()
+        self._session.recover(confirmed)
 
     def close(self) -> None:
         """Stop the arm, switch the safe outputs off and end the child process; idempotent, bounded in time."""
-        if self._closed:
-            return
-        self._closed = True
-        self._link.close(_CLOSE_S)
-        self._end_motion(NotConnectedError(self.name, "the driver was closed"))
-        self._join_safing()
-        self._dashboard.close()
+        self._session.close()
 
     # --- inside ---
 
-    def _connect(self) -> ArmLink:
-        setup = Setup(self._address, self._clock.rate, self._safe_off, self._payload, _WATCHDOG_S, self._braking)
-        return ArmLink(self.name, setup, self._connect_timeout, self._feed.take, self._on_ended, self._on_lost)
-
-    def _alive(self) -> None:
-        if self._closed:
-            raise NotConnectedError(self.name, "the driver was closed. Open a new one.")
-        if self._link.lost is not None:
-            raise self._link.lost
-
-    def _ask(self, name: str, *arguments: Any, deadline: float = _CALL_S) -> None:
-        self._alive()
-        problem = self._link.call(name, *arguments, deadline=deadline)
-        if problem is not None:
-            if problem[0] == "arm.stopped":
-                raise Aborted(f"{self.name}: {name} was dropped because the arm was stopped")
-            raise fault(self.name, *problem)
-
     def _start(self, what: str, name: str, *arguments: Any) -> UrMotion:
+        self._session.require_control()
         with self._starting:
-            self._require_ready()
+            self._session.require_ready()
             if self._motion is not None and not self._motion.done:
                 raise InterlockError(
                     self.name, "a motion is still under way; nothing was sent. Wait for it or stop it."
                 )
+            self._session.require_same_arm()
             motion = UrMotion(self.name, what, next(self._numbers), self._clock, self.stop)
             self._motion = motion
             try:
-                self._ask(name, motion.number, *arguments)
+                self._session.ask(name, motion.number, *arguments)
             except (DeviceError, Aborted) as error:
                 motion.fail(error)
                 raise
             return motion
 
-    def _require_ready(self) -> None:
-        """Raise the `DeviceFault` that keeps the arm from moving, if any."""
-        snapshot, _ = self._feed.fresh(0.1)
-        if code := safety_code(snapshot.safety_bits):
-            raise fault(self.name, code)
-        if snapshot.mode != MODE_RUNNING:
-            raise fault(self.name, "arm.not_powered")
-        if not snapshot.program_running:
-            raise fault(self.name, "arm.program_stopped")
-
     def _on_ended(self, ended: Ended) -> None:
         motion = self._motion
         if motion is not None and motion.number == ended.motion:
             motion.end(ended.how, ended.text)
-
-    def _on_lost(self, error: DeviceFault) -> None:
-        self.statistics.count("link lost")
-        self._safing = threading.Thread(target=self._make_safe, name=f"{self.name} make safe", daemon=True)
-        self._safing.start()
-        self._end_motion(error)
-        self._feed.wake()
-
-    def _make_safe(self) -> None:
-        """Without the child: end the arm's program, which stops it, and switch the safe outputs off."""
-        try:
-            Dashboard(self.name, self._address).ask("stop")
-        except DeviceError:
-            self.statistics.count("emergency stop of the program failed")
-        end = time.monotonic() + _SWITCH_OFF_S
-        while self._safe_off and (left := end - time.monotonic()) > _SWITCH_OFF_LEAST_S:
-            if switch_off(self._address, self._safe_off, deadline=min(2.0, left)):
-                return
-            self.statistics.count("emergency switching of outputs failed")
-
-    def _join_safing(self) -> None:
-        if self._safing is not None:
-            self._safing.join(_SWITCH_OFF_S + 1.0)
 
     def _end_motion(self, error: Exception) -> None:
         if self._motion is not None:

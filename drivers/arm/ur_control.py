@@ -1,8 +1,9 @@
 """Child side: the thread that commands the arm. One request at a time; a stop overtakes everything.
 
-Moves are started asynchronously and watched, since a synchronous one cannot be interrupted. A joint trajectory is
-streamed on absolute deadlines of 2 ms, never far ahead of what the arm has reported. While nothing else is sent, the
-controller's watchdog is kept quiet.
+Moves and stops are started asynchronously and watched: a synchronous one cannot be interrupted, and nothing could be
+sent meanwhile to keep the controller's watchdog quiet. A joint trajectory is streamed on absolute deadlines of 2 ms,
+never far ahead of what the arm has reported. A motion that ends otherwise than at its end or by a stop ends the whole
+program: one that is only paused would go on when it is released.
 """
 
 from __future__ import annotations
@@ -15,18 +16,34 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Reply, Request, Setup, Six, Snapshot, safety_code
+from drivers.arm.dashboard import Dashboard
+from drivers.arm.messages import (
+    MODE_RUNNING,
+    PLAYING,
+    STOPPED,
+    Ended,
+    Reply,
+    Request,
+    Setup,
+    Six,
+    Snapshot,
+    safety_code,
+)
 from drivers.arm.trajectory import Trajectory, largest_difference, pose_difference
 from drivers.clock import Clock
+from drivers.errors import DeviceError
 
 PERIOD = 0.002
 _LOOKAHEAD, _GAIN = 0.05, 500
 _SERVO_BRAKING = 10.0
-_KICK_S = 0.1
+_KICK_S, _KICK_BLIND = 0.02, 0.7
+"""How often the watchdog is kicked, in s on the wall, and for which part of its time without a word from the arm."""
 _SLIP_S = 0.004
 _BLIND_S, _FEELING_S = 0.1, 0.02
 """How far streaming may run ahead of what the arm has reported, in seconds on the wall: at most, and in contact."""
 _SETTLE_S = 3.0
+_BRAKING_S, _ENDING_S = 1.0, 0.7
+"""How long on the wall the arm may take to come to rest, by its program and then by the end of its program."""
 _REST_S = 0.02
 _JOINT_TOLERANCE, _PLACE_TOLERANCE, _TURN_TOLERANCE = 2e-3, 1e-3, 2e-3
 
@@ -51,6 +68,7 @@ class ControlThread:
         self._send = send
         self._lose = lose
         self._clock = Clock()
+        self._dashboard = Dashboard("arm", setup.address, timeout=_ENDING_S)
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._kicked = 0.0
@@ -95,9 +113,11 @@ class ControlThread:
                 self._stop.clear()
                 self._send(Reply(request.number, self._brake()))
             case "close":
-                self._brake()
-                if self._control is not None and self._control.isProgramRunning():
-                    self._control.stopScript()
+                # Whoever never had the arm leaves it as it is.
+                if self._control is not None:
+                    self._brake()
+                    if self._control.isProgramRunning():
+                        self._control.stopScript()
                 self.finished.set()
             case "zero_force":
                 self._answer(request, lambda: bool(self._control.zeroFtSensor()))
@@ -149,8 +169,12 @@ class ControlThread:
             problem = self._problem() or ("arm.refused", "the controller did not accept the move")
         self._send(Reply(request.number, problem))
         if problem is None:
-            how, text = self._watch(before) or self._settled(missed)
-            self._send(Ended(motion, how, text))
+            self._end(motion, *(self._watch(before) or self._settled(missed)))
+
+    def _end(self, motion: int, how: str, text: str) -> None:
+        if how not in ("arrived", "contact", "stopped") and (problem := self._end_program()) is not None:
+            text = "; ".join(filter(None, (text, problem[1])))
+        self._send(Ended(motion, how, text))
 
     def _operation(self) -> tuple[int, bool]:
         if self._control is None:
@@ -180,7 +204,7 @@ class ControlThread:
         deadline = standing + _SETTLE_S
         while True:
             snapshot = self._latest()
-            text = missed(snapshot) or ("" if _at_rest(snapshot) else "the arm does not come to rest")
+            text = missed(snapshot) or ("" if snapshot.at_rest else "the arm does not come to rest")
             if text:
                 standing = time.monotonic()
             elif snapshot.stamp - standing > _REST_S:
@@ -199,16 +223,20 @@ class ControlThread:
         problem = self._problem()
         self._send(Reply(request.number, problem))
         if problem is None:
-            how, text = self._stream(Trajectory(times, joints), force_limit)
-            self._send(Ended(motion, how, text))
+            self._end(motion, *self._stream(Trajectory(times, joints), force_limit))
 
     def _stream(self, trajectory: Trajectory, force_limit: float | None) -> End:
-        """Stream the trajectory, time running `rate` times as fast as the wall, then stand still."""
+        """Stream the trajectory, time running `rate` times as fast as the wall, then stand still.
+
+        A stop slows time down to nothing, so that the arm brakes on its way: the controller's own stop takes all its
+        time in one command, in which its watchdog would bark.
+        """
         force_before = self._mean_force() if force_limit is not None else ()
         allowed = _BLIND_S if force_limit is None else _FEELING_S
         start = time.monotonic()
         seen, lead = self._latest().device_time, 0.0
         cycle, how, text = 0, "", ""
+        elapsed, pace, slower, braked_by = 0.0, 1.0, 0.0, math.inf
         while not how:
             due = start + cycle * PERIOD
             self._clock.sleep(due - time.monotonic())
@@ -219,7 +247,9 @@ class ControlThread:
                 start += late
             newest = self._latest().device_time
             lead, seen = max(0.0, lead - (newest - seen) / self._setup.rate), newest
-            elapsed = cycle * PERIOD * self._setup.rate
+            if self._stop.is_set() and not slower:
+                slower = PERIOD * self._setup.rate * _SERVO_BRAKING / max(trajectory.speed_at(elapsed), 1e-6)
+                braked_by = time.monotonic() + _BRAKING_S
             if lead > allowed:
                 # The arm would go on unseen, and what is sent would pile up before it and before the next stop.
                 start += PERIOD
@@ -227,10 +257,16 @@ class ControlThread:
             elif self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
                 cycle += 1
                 lead += PERIOD
+                elapsed += PERIOD * self._setup.rate * pace
+                pace = max(0.0, pace - slower)
             else:
                 how, text = self._problem() or ("arm.refused", "the controller did not accept a streamed point")
                 break
-            how, text = self._stream_end(trajectory, elapsed, force_before, force_limit)
+            standing = pace == 0.0 and self._latest().at_rest
+            if self._stop.is_set() and (standing or lead > allowed or time.monotonic() > braked_by):
+                how = "stopped"
+            else:
+                how, text = self._stream_end(trajectory, elapsed, force_before, force_limit)
         self._control.servoStop(_SERVO_BRAKING)
         if how == "arrived":
             return self._settled(lambda snapshot: _off(snapshot, trajectory.end))
@@ -239,14 +275,12 @@ class ControlThread:
     def _stream_end(self, trajectory: Trajectory, elapsed: float, before: Six, force_limit: float | None) -> End:
         """Whether streaming is over, and why; an empty reason to go on."""
         snapshot = self._latest()
-        if self._stop.is_set():
-            return "stopped", ""
         if (problem := self._problem()) is not None:
             return problem
         if force_limit is not None and math.dist(snapshot.wrench[:3], before) > force_limit:
             return "contact", ""
         late = elapsed - trajectory.duration
-        if late >= 0 and (not _off(snapshot, trajectory.end) and _at_rest(snapshot)):
+        if late >= 0 and (not _off(snapshot, trajectory.end) and snapshot.at_rest):
             return "arrived", ""
         if late > _SETTLE_S * self._setup.rate:
             return "arm.not_arrived", _off(snapshot, trajectory.end) or "the arm does not come to rest"
@@ -282,28 +316,60 @@ class ControlThread:
             if snapshot.mode != MODE_RUNNING:
                 return "arm.not_powered", f"robot mode {snapshot.mode}"
             self._clock.sleep(PERIOD)
-        return "arm.program_stopped", ""
+        paused = self._latest().runtime not in (STOPPED, PLAYING)
+        return "arm.program_stopped", "it was paused at the arm" if paused else ""
 
-    def _brake(self) -> tuple[str, str] | None:
-        """Bring the arm to rest; None once it is."""
-        if self._control is not None and self._control.isProgramRunning():
-            self._control.stopJ(self._setup.braking)
-        deadline = time.monotonic() + _SETTLE_S
-        while not _at_rest(self._latest()):
+    def _brake(self) -> End | None:
+        """Bring the arm to rest, and see to it that nothing of its motion can go on; None once that is so.
+
+        A program that runs stops its motion and lives on. One that is paused, pausing or resuming cannot be reached: it
+        is ended, and so is one that does not brake.
+        """
+        runs = self._control is not None and self._control.isProgramRunning()
+        if runs:
+            # It does not tell whether it was taken: the program's state does.
+            self._control.stopJ(self._setup.braking, True)
+        begun = time.monotonic()
+        while runs and time.monotonic() - begun < _BRAKING_S:
+            snapshot = self._latest()
+            if not snapshot.program_running:
+                break
+            if snapshot.at_rest and snapshot.stamp > begun:
+                return None
+            self._kick()
+            self._clock.sleep(PERIOD)
+        return self._end_program()
+
+    def _end_program(self) -> End | None:
+        """End whatever program the arm has, which stops the arm; None once there is none and the arm stands."""
+        if self._ended():
+            return None
+        try:
+            reply = self._dashboard.ask("stop")
+        except DeviceError as error:
+            return "arm.not_stopped", f"its program could not be ended: {error.message}"
+        deadline = time.monotonic() + _ENDING_S
+        while not self._ended():
             if time.monotonic() > deadline:
-                return "arm.not_stopped", f"still moving {_SETTLE_S:g} s after the stop"
+                return "arm.not_stopped", f"its program could not be ended, the dashboard server says '{reply}'"
             self._clock.sleep(PERIOD)
         return None
 
+    def _ended(self) -> bool:
+        snapshot = self._latest()
+        return snapshot.runtime == STOPPED and snapshot.at_rest
+
     def _kick(self) -> None:
-        now = time.monotonic()
-        if self._control is not None and now - self._kicked >= _KICK_S and self._problem() is None:
+        """Keep the watchdog quiet for as long as the arm is heard and its program runs."""
+        now, snapshot = time.monotonic(), self._latest()
+        if (
+            self._control is not None
+            and now - self._kicked >= _KICK_S
+            and now - snapshot.stamp < _KICK_BLIND * self._setup.watchdog
+            and snapshot.program_running
+        ):
             self._kicked = now
             self._control.kickWatchdog()
-
-
-def _at_rest(snapshot: Snapshot) -> bool:
-    return max(abs(speed) for speed in snapshot.speeds) < AT_REST
 
 
 def _off(snapshot: Snapshot, target: Six) -> str:

@@ -5,6 +5,7 @@ For measuring on recordings. There is no exposure to wait for: times are those o
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -77,6 +78,11 @@ class FolderCamera:
     def identity(self) -> Identity:
         """The folder as the address; recordings have no serial number."""
         return Identity("folder", "", "", str(self._folder))
+
+    @property
+    def time_bound(self) -> float:
+        """Unlimited: nothing tells when a recorded picture was exposed."""
+        return math.inf
 
     def ping(self) -> float:
         """Look at the folder; returns the wall seconds it took."""

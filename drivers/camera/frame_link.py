@@ -144,6 +144,9 @@ class FrameLink:
                             self._statistics.count("late_replies")
         except (OSError, StreamError, KeyError, ValueError, TypeError) as error:
             self._fail(str(error) or repr(error))
+        except Exception as error:
+            # Without its reader the link is lost, whatever ended it.
+            self._fail(repr(error))
 
     def _receive(self, count: int) -> bytearray:
         data = bytearray(count)

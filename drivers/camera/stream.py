@@ -18,6 +18,7 @@ from drivers.camera.frame_link import FrameLink
 from drivers.camera.frame_protocol import Header
 from drivers.camera.frame_queue import FrameQueue
 from drivers.clock import Clock
+from drivers.endings import in_the_end
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics
 from drivers.quantities import check_positive, check_range, shown
@@ -74,6 +75,11 @@ class StreamCamera:
     def identity(self) -> Identity:
         """Ask the camera who it is."""
         return self._identify().identity
+
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of a frame's host time: half the shortest latch, and the drift since."""
+        return self._map.uncertainty
 
     def ping(self) -> float:
         """One latch of the device's clock; returns the round trip in wall seconds."""
@@ -137,12 +143,8 @@ class StreamCamera:
             self._compare_clocks()
             with self._queue(capacity=max(8, _QUEUE_BYTES // (height * width))) as frames:
                 frames.expect(self._link.request("start", **settings)[0].get("next_frame_id"))
-                try:
+                with in_the_end(self._end_acquisition):
                     yield frames
-                finally:
-                    # A lost camera acquires nothing any more, and the frames' reader has been told.
-                    if self._link.alive:
-                        self._link.request("stop")
 
     def stop(self) -> None:
         """End every acquisition; whoever waits for a frame gets `Aborted`."""
@@ -155,10 +157,14 @@ class StreamCamera:
         for queue in self._queues:
             queue.close(aborted=True)
         try:
-            if self._link.alive:
-                self._link.request("stop")
+            self._end_acquisition()
         finally:
             self._link.close()
+
+    def _end_acquisition(self) -> None:
+        # A lost camera acquires nothing any more, and the frames' reader has been told.
+        if self._link.alive:
+            self._link.request("stop")
 
     def _identify(self) -> _About:
         about = self._link.request("identify")[0]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeviceFault
 from drivers.quantities import shown
 from drivers.rail.motion import patience
 from drivers.rail.tmcl_codec import Axis
 from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.zero import ZeroMark
 
 STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""
@@ -23,9 +22,9 @@ Samples = list[tuple[float, float, float]]
 class Arrival:
     """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
 
-    `issued` is the count of stops it was commanded under. `lost_position` is called when the count can no longer be
-    trusted. Called again and again: True at the target; raises `Aborted` after a stop and `DeviceFault` for
-    rail.limit_switch, rail.missed_target and rail.stalled.
+    `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
+    it does not. Called again and again: True at the target; raises `Aborted` after a stop and `DeviceFault` for
+    rail.reset, rail.limit_switch, rail.missed_target and rail.stalled.
     """
 
     def __init__(
@@ -37,14 +36,14 @@ class Arrival:
         counts: float,
         issued: int,
         samples: Samples,
-        lost_position: Callable[[], None],
+        zero: ZeroMark,
     ) -> None:
         self._link = link
         self._target = target
         self._counts = counts
         self._issued = issued
         self._samples = samples
-        self._lost_position = lost_position
+        self._zero = zero
         self._standstill = patience(clock, STANDSTILL_S)
         self._last: int | None = None
         self._moved = clock.now()
@@ -56,6 +55,8 @@ class Arrival:
         if self._link.stops != self._issued:
             raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
         if position == self._target and self._link.get(Axis.POSITION_REACHED):
+            # A module that was reset stands at its target, too, if that is 0.
+            self._zero.require_still()
             return True
         if position != self._last:
             self._last, self._moved = position, stamp
@@ -65,12 +66,13 @@ class Arrival:
 
     def _failure(self, position: int) -> DeviceFault:
         link = self._link
+        self._zero.require_still()
         short = (
             f"stands at {shown(position / self._counts, 'm')}, its target is {shown(self._target / self._counts, 'm')}"
         )
         side, switch = ("right", Axis.RIGHT_SWITCH) if self._target > position else ("left", Axis.LEFT_SWITCH)
         if link.get(switch):
-            self._lost_position()
+            self._zero.forget()
             return DeviceFault(
                 link.name,
                 "rail.limit_switch",
@@ -86,7 +88,7 @@ class Arrival:
                 recoverable=True,
                 hint="See what else commands this module.",
             )
-        self._lost_position()
+        self._zero.forget()
         flags = link.get(Axis.DRIVER_ERRORS)
         reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]
         if link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG:

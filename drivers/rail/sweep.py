@@ -1,7 +1,7 @@
 """A constant-velocity sweep and its position at any host time.
 
 The module's counter runs uniformly between the ramps, so a straight line through the samples of that stretch gives
-the position between them. A sample's time is only known within its round trip; its weight says so.
+the position between them. A sample's time is only known within its round trip: see `drivers.rail.timing`.
 """
 
 from __future__ import annotations
@@ -14,25 +14,10 @@ from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Vector
 from drivers.rail.motion import RailMotion
+from drivers.rail.timing import EvenMotion
 
 _MIN_SAMPLES = 5
 _SPEED_TOLERANCE = 0.05
-
-
-def fit_line(times: Vector, positions: Vector, round_trips: Vector) -> tuple[float, float]:
-    """Least-squares line through (n,) samples: position in m at time 0 s and velocity in m/s.
-
-    The counter held at some instant within the round trip, taken as uniformly distributed, so a sample's weight is
-    1 / round trip²: one late sample hardly counts. Round trips are floored at a fifth of their median, because a very
-    short one does not make the counter's last digit any finer.
-    """
-    weights = 1.0 / np.square(np.maximum(round_trips, 0.2 * np.median(round_trips) + 1e-9))
-    total = weights.sum()
-    centre = (weights * times).sum() / total
-    mean = (weights * positions).sum() / total
-    along = times - centre
-    velocity = float((weights * along * (positions - mean)).sum() / (weights * along * along).sum())
-    return float(mean - velocity * centre), velocity
 
 
 class RailSweep(RailMotion):
@@ -55,7 +40,7 @@ class RailSweep(RailMotion):
         self._stop = stop
         self._speed = speed
         self._record = record
-        self._line: tuple[float, float] | None = None
+        self._motion: EvenMotion | None = None
         super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration)
 
     @property
@@ -70,8 +55,8 @@ class RailSweep(RailMotion):
         Raises `InterlockError` while the sweep runs, its own error if it failed, and `DeviceFault` (rail.velocity)
         when the samples are too few or show another velocity than the commanded one.
         """
-        origin, velocity = self._fitted()
-        return (self._start - origin) / velocity, (self._stop - origin) / velocity
+        motion = self._even()
+        return motion.time_at(self._start), motion.time_at(self._stop)
 
     def position_at(self, host_time: float) -> float:
         """Position in m at a host time inside `window`; `ValueError` outside."""
@@ -81,21 +66,30 @@ class RailSweep(RailMotion):
                 f"{self._name}: {host_time:.4f} s is outside the sweep's constant-velocity window, "
                 f"{begin:.4f} to {end:.4f} s"
             )
-        origin, velocity = self._fitted()
-        return origin + velocity * host_time
+        return self._even().position_at(host_time)
 
-    def _fitted(self) -> tuple[float, float]:
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of the times behind `position_at`; see `drivers.interfaces.Sweep`. Raises as `window`."""
+        return self._even().time_bound
+
+    @property
+    def unevenness(self) -> float:
+        """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
+        return self._even().unevenness
+
+    def _even(self) -> EvenMotion:
         if not self.done:
             raise InterlockError(
                 self._name, "the sweep still runs; its window is known once it has ended. wait() first"
             )
         if self.error is not None:
             raise self.error
-        if self._line is None:
-            self._line = self._fit()
-        return self._line
+        if self._motion is None:
+            self._motion = self._fit()
+        return self._motion
 
-    def _fit(self) -> tuple[float, float]:
+    def _fit(self) -> EvenMotion:
         rows = np.array(self._record, dtype=np.float64).reshape(-1, 3)
         low, high = sorted((self._start, self._stop))
         inside = rows[(rows[:, 1] >= low) & (rows[:, 1] <= high)]
@@ -103,14 +97,14 @@ class RailSweep(RailMotion):
             raise self._fault(
                 f"only {len(inside)} positions were read between start and stop, at least {_MIN_SAMPLES} are needed"
             )
-        origin, velocity = fit_line(inside[:, 0], inside[:, 1], inside[:, 2])
+        motion = EvenMotion.of(inside[:, 0], inside[:, 1], inside[:, 2])
         expected = np.copysign(self._speed, self._stop - self._start)
-        if not abs(velocity - expected) <= _SPEED_TOLERANCE * self._speed:
+        if not abs(motion.velocity - expected) <= _SPEED_TOLERANCE * self._speed:
             raise self._fault(
-                f"the rail ran at {velocity * 1e3:.3f} mm/s instead of {expected * 1e3:.3f} mm/s "
+                f"the rail ran at {motion.velocity * 1e3:.3f} mm/s instead of {expected * 1e3:.3f} mm/s "
                 f"(allowed ±{_SPEED_TOLERANCE:.0%})"
             )
-        return origin, velocity
+        return motion
 
     def _fault(self, message: str) -> DeviceFault:
         return DeviceFault(

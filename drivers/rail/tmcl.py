@@ -19,6 +19,7 @@ from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_u
 from drivers.rail.sweep import RailSweep
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.zero import ZeroMark
 
 _AT_START_M = 20e-6
 
@@ -29,6 +30,7 @@ class TmclRail:
     `lead` in m per turn, `travel` (low, high) in m, `max_speed` in m/s, `acceleration` in m/s²; `microsteps` per full
     step, a power of two up to 256. `reference_mode` is the module's axis parameter 193 (5: home switch in negative
     direction, turning round at the left limit switch). The module's serial number, if any, is its user variable 0.
+    A module that was homed under the same settings, and not reset since, stays homed.
     Raises `NotConnectedError` or `DeadlineError` when no module answers, `ConfigError` on impossible parameters.
     """
 
@@ -58,7 +60,8 @@ class TmclRail:
         self._counts = steps_per_turn * microsteps / lead
         self._max_speed = max_speed
         self._acceleration = acceleration
-        self._homed = False
+        self._microsteps = microsteps
+        self._reference_mode = reference_mode
         self._homing = False
         self._motion: RailMotion | None = None
         self._motion_issued = 0
@@ -66,13 +69,11 @@ class TmclRail:
         self._link = TmclLink(
             name, url, address=address, motor=motor, baud=baud, clock=clock, statistics=self.statistics
         )
+        self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode))
         try:
             self._link.firmware()
-            self._link.set(Axis.MICROSTEP_RESOLUTION, microsteps.bit_length() - 1)
-            self._link.set(Axis.MAX_ACCELERATION, self._pulses(acceleration))
-            self._link.set(Axis.REFERENCE_MODE, reference_mode)
-            self._link.set(Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * max_speed))
-            self._link.set(Axis.REFERENCE_SWITCH_SPEED, self._pulses(0.1 * max_speed))
+            self._zero.meet(microsteps.bit_length() - 1, reference_mode)
+            self._set_up()
         except CellError:
             self._link.close()
             raise
@@ -88,14 +89,18 @@ class TmclRail:
         return self._clock.wall(self._link.get_stamped(Axis.POSITION)[2])
 
     def state(self) -> RailState:
-        """Read position, velocity and switches now."""
+        """Read position, velocity, switches and whether it is homed now.
+
+        Raises `DeviceFault` (rail.reset), once, when the module has lost the zero that it had.
+        """
         counts, stamp, _ = self._link.get_stamped(Axis.POSITION)
         velocity = self._link.get(Axis.VELOCITY) / self._counts
         return RailState(
             stamp=stamp,
             position=counts / self._counts,
             velocity=velocity,
-            homed=self._homed,
+            homed=(homed := not self._homing and self._zero.held()),
+            homed_here=homed and self._zero.found_here,
             moving=velocity != 0.0 or self._homing,
             left_switch=bool(self._link.get(Axis.LEFT_SWITCH)),
             right_switch=bool(self._link.get(Axis.RIGHT_SWITCH)),
@@ -106,9 +111,10 @@ class TmclRail:
         length = self.travel[1] - self.travel[0]
         with self._starting:
             issued = self._free()
-            self._homed = False
             self._homing = True
             try:
+                self._zero.searching(issued=issued)
+                self._set_up()
                 self._link.reference_search(Reference.START, issued=issued)
             except CellError:
                 self._homing = False
@@ -127,7 +133,8 @@ class TmclRail:
         check_range(self.name, "position", position, *self.travel, "m")
         speed = check_positive(self.name, "speed", speed or self._max_speed, self._max_speed, "m/s")
         with self._starting:
-            issued, duration = self._start(position, speed)
+            issued = self._free()
+            duration = self._start(position, speed, issued)
             self._motion = RailMotion(
                 self.name,
                 self._clock,
@@ -146,6 +153,8 @@ class TmclRail:
         begin, end = self._sweep_ends(start, stop, speed)
         record: Samples = []
         with self._starting:
+            issued = self._free()
+            self._zero.require()
             here = self._link.get(Axis.POSITION) / self._counts
             if abs(here - begin) > _AT_START_M:
                 raise InterlockError(
@@ -153,7 +162,7 @@ class TmclRail:
                     f"stands at {shown(here, 'm')}, the sweep starts at {shown(begin, 'm')}. "
                     "Move to sweep_start() first",
                 )
-            issued, duration = self._start(end, speed)
+            duration = self._start(end, speed, issued)
             sweep = RailSweep(
                 self.name,
                 self._clock,
@@ -170,8 +179,8 @@ class TmclRail:
 
     def stop(self) -> None:
         """Stop the motor now; every motion and every command still waiting ends with `Aborted`."""
-        searching, self._homing = self._homing, False
-        self._link.stop(searching=searching)
+        self._homing = False
+        self._link.stop()
 
     def close(self) -> None:
         """Stop the motor and close the port."""
@@ -215,20 +224,24 @@ class TmclRail:
             counts=self._counts,
             issued=issued,
             samples=samples,
-            lost_position=self._forget_home,
+            zero=self._zero,
         )
 
-    def _forget_home(self) -> None:
-        self._homed = False
+    def _set_up(self) -> None:
+        """Tell the module what it forgets when it is reset."""
+        self._link.set(Axis.MICROSTEP_RESOLUTION, self._microsteps.bit_length() - 1)
+        self._link.set(Axis.MAX_ACCELERATION, self._pulses(self._acceleration))
+        self._link.set(Axis.REFERENCE_MODE, self._reference_mode)
+        self._link.set(Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * self._max_speed))
+        self._link.set(Axis.REFERENCE_SWITCH_SPEED, self._pulses(0.1 * self._max_speed))
 
-    def _start(self, position: float, speed: float) -> tuple[int, float]:
-        if not self._homed:
-            raise InterlockError(self.name, "is not homed, so positions mean nothing yet. Call home() first")
-        issued = self._free()
+    def _start(self, position: float, speed: float, issued: int) -> float:
+        """Send it there; the seconds that it should take."""
+        self._zero.require()
         here = self._link.get(Axis.POSITION) / self._counts
         self._link.set(Axis.MAX_VELOCITY, self._pulses(speed), issued=issued)
         self._link.move_to(round(position * self._counts), issued=issued)
-        return issued, move_duration(position - here, speed, self._acceleration)
+        return move_duration(position - here, speed, self._acceleration)
 
     def _halt(self, issued: int) -> Callable[[], None]:
         def halt() -> None:
@@ -242,8 +255,9 @@ class TmclRail:
         if self._link.stops != issued:
             raise Aborted(f"{self.name}: stopped while searching the reference switch")
         self._homing = searching
-        self._homed = not searching
-        return self._homed
+        if not searching:
+            self._zero.found(issued=issued)
+        return not searching
 
 
 def _check_parameters(name: str, microsteps: int, travel: tuple[float, float], positive: dict[str, float]) -> None:

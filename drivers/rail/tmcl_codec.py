@@ -32,6 +32,7 @@ class Command(IntEnum):
     MOVE_TO = 4
     SET_AXIS = 5
     GET_AXIS = 6
+    SET_GLOBAL = 9
     GET_GLOBAL = 10
     REFERENCE_SEARCH = 13
     FIRMWARE = 136

@@ -16,6 +16,7 @@ import serial
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
+from drivers.last_words import LastWords, descriptor_of
 from drivers.rail.tmcl_codec import (
     STATUS_OK,
     STATUS_TEXT,
@@ -67,6 +68,12 @@ class TmclLink:
             raise NotConnectedError(
                 name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
             ) from error
+        stops = (
+            Request(address, Command.REFERENCE_SEARCH, Reference.STOP, motor),
+            Request(address, Command.MOTOR_STOP, 0, motor),
+        )
+        self._stop_words = [stop.encode() for stop in stops]
+        self._last_words: LastWords | None = None
 
     @property
     def stops(self) -> int:
@@ -88,18 +95,20 @@ class TmclLink:
 
     def move_to(self, microsteps: int, *, issued: int) -> None:
         """Start a move to an absolute position, unless a stop came after `issued`."""
+        self._stop_after_death()
         self._command(Command.MOVE_TO, 0, microsteps, issued=issued)
 
     def reference_search(self, kind: int, *, issued: int | None = None) -> int:
         """Start, stop or query the reference search; the query's value is 0 once it is done."""
+        if kind == Reference.START:
+            self._stop_after_death()
         return self._command(Command.REFERENCE_SEARCH, kind, issued=issued).value
 
-    def stop(self, *, searching: bool) -> None:
-        """Stop the motor, and the reference search if it is `searching`; commands issued earlier are refused."""
+    def stop(self) -> None:
+        """Stop the reference search, whoever began it, and the motor; commands issued earlier are refused."""
         self._stops += 1
         try:
-            if searching:
-                self.reference_search(Reference.STOP)
+            self.reference_search(Reference.STOP)
         finally:
             self._command(Command.MOTOR_STOP, 0)
 
@@ -113,6 +122,11 @@ class TmclLink:
         request = Request(self._address, Command.GET_GLOBAL, index, _USER_BANK)
         return self._exchange(request, lambda data: self._checked(data, request).value, issued=None)[0]
 
+    def set_user_variable(self, index: int, value: int, *, issued: int | None = None) -> None:
+        """Write the module's user variable `index`; those from 56 on are lost when the module is reset."""
+        request = Request(self._address, Command.SET_GLOBAL, index, _USER_BANK, value)
+        self._exchange(request, lambda data: self._checked(data, request), issued=issued)
+
     @property
     def closed(self) -> bool:
         """True once `close` was called."""
@@ -122,7 +136,15 @@ class TmclLink:
         """Close the port; every later call raises `NotConnectedError`."""
         with self._lock:
             self._closed = True
+            if self._last_words is not None:
+                self._last_words.close()
             self._port.close()
+
+    def _stop_after_death(self) -> None:
+        """From the first motion on: who never moved it has nothing to end."""
+        port = descriptor_of(self._port)
+        if self._last_words is None and port is not None:
+            self._last_words = LastWords(self.name, port, self._stop_words)
 
     def _command(self, command: Command, kind: int, value: int = 0, *, issued: int | None = None) -> Reply:
         request = Request(self._address, command, kind, self._motor, value)

@@ -1,7 +1,8 @@
 """A skid-steered vehicle that speaks AgileX protocol v2 over CAN.
 
 The set velocity is kept alive by a thread of the driver, which falls back to zero when nobody renews it; the vehicle
-itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last.
+itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last, and
+None before this driver has commanded it.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from functools import partial
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, DeadlineError, InterlockError, NotConnectedError
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, VehicleState
 from drivers.quantities import check_range
 from drivers.vehicle.can_link import CanLink, load_database
+from drivers.vehicle.faults import OUT_OF_COMMAND
 from drivers.vehicle.feedback import CAN_MODE, WANTED, Feedback, patience
 
 KEEP_ALIVE_S = 0.020
@@ -60,8 +62,8 @@ class AgilexVehicle:
         self._command = threading.Lock()
         self._velocity = (0.0, 0.0)
         self._renewed = -math.inf
-        self._enabled = False
-        self._braked = False
+        self._enabled = self._took_command = False
+        self._braked: bool | None = None
         self._stopping = 0
         self._closed = threading.Event()
         self._open = partial(
@@ -74,6 +76,7 @@ class AgilexVehicle:
             database=load_database(),
             wanted=WANTED,
             receive=self._feedback.take,
+            idle=self._feedback.idle,
             statistics=self.statistics,
         )
         self._link = self._open()
@@ -106,53 +109,82 @@ class AgilexVehicle:
         self._link.check()
         return self._feedback.state(max_age, self._braked)
 
+    def check(self) -> None:
+        """Raise the `DeviceFault` that the vehicle shows now; see `Feedback.check`. Returns at once otherwise.
+
+        One that somebody else commands or moves is out of command from then on, until it is enabled again.
+        """
+        self._check(driving=False)
+
+    def _check(self, driving: bool) -> None:
+        self._link.check()
+        try:
+            self._feedback.check(in_command=self._enabled, driving=driving)
+        except DeviceFault as fault:
+            if fault.code in OUT_OF_COMMAND:
+                self._enabled = False
+            raise
+
     def enable(self) -> None:
         """Take command over CAN and release the brake; opens the bus again if it had failed.
 
         Raises `DeviceFault` on an emergency stop or an error that does not clear, `DeadlineError` when the vehicle
         does not change to CAN mode.
         """
+        self._take_command()
+        self._link.send("BrakeCommand", Locked=0)
+        with self._command:
+            self._braked = False
+
+    def recover(self) -> None:
+        """As `enable`, but with the brake locked throughout: the vehicle stays where it was measured."""
+        self._take_command()
+        self.brake()
+
+    def _take_command(self) -> None:
         if self._closed.is_set():
             raise NotConnectedError(self.name, "the vehicle was closed. Open it again")
         with self._command:
             self._velocity = (0.0, 0.0)
+            self._enabled = False
             if not self._link.alive:
                 self._link.close()
                 self._link = self._open()
                 self.statistics.count("reopened")
+                self._feedback.interrupt("the CAN bus failed and was opened again")
+        self._feedback.acknowledge()
         deadline = self._clock.now() + patience(self._clock, ENABLE_TIMEOUT_S)
         while True:
             asked = self._clock.now()
             self._link.send("ClearErrorsCommand", Which=0)
             self._link.send("ControlModeCommand", Mode=CAN_MODE)
+            # Standing still is a command as well: a vehicle that misses commands reports that as an error.
+            with self._command:
+                self._send_velocity()
             if self._wait_for(partial(self._feedback.commanded, asked), _ENABLE_RETRY_S):
                 break
             if self._clock.now() > deadline:
-                self._feedback.check()
+                self._feedback.check(in_command=False, driving=True)
                 raise DeadlineError(
                     self.name,
                     f"did not change to CAN mode within {ENABLE_TIMEOUT_S:.0f} s. Is the remote control in charge?",
                 )
-        self._link.send("BrakeCommand", Locked=0)
         with self._command:
-            self._braked = False
-            self._enabled = True
+            self._enabled = self._took_command = True
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity, m/s and rad/s; must be renewed within 0.5 s or it becomes zero.
 
-        Raises `LimitError`, `InterlockError` before `enable()` or when another has taken command, `DeviceFault` on
-        emergency stop, vehicle error or lost feedback, `Aborted` while a stop is under way.
+        Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
+        is under way.
         """
         speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
-        self._link.check()
-        self._feedback.check()
-        in_command = self._enabled and self._feedback.get("SystemState")[1]["Mode"] == CAN_MODE
+        self._check(driving=True)
         with self._command:
             if self._stopping:
                 raise Aborted(f"{self.name}: a stop is under way")
-            if self._braked or not in_command:
+            if self._braked or not self._enabled:
                 reason = "the brake is locked" if self._braked else "it is not under CAN command"
                 raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
             self._velocity = (speed, yaw_rate)
@@ -199,7 +231,9 @@ class AgilexVehicle:
         if self._closed.is_set():
             return
         try:
-            self.stop()
+            # Whoever never commanded it has nothing to end, and another may be driving it.
+            if self._took_command:
+                self.stop()
         finally:
             self._closed.set()
             self._keeper.join(2.0)
@@ -221,6 +255,8 @@ class AgilexVehicle:
     def _send_velocity(self) -> None:
         """Send the set velocity, holding `_command`: else an older velocity could follow the zero of a stop."""
         speed, yaw_rate = self._velocity
+        if self._velocity != (0.0, 0.0):
+            self._feedback.commanded_to_move()
         self._link.send("MotionCommand", Speed=speed, YawRate=yaw_rate, LateralSpeed=0.0, Steering=0.0)
 
     def _versions(self) -> dict[str, float]:

@@ -6,6 +6,7 @@ link raises it.
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -19,6 +20,7 @@ from cantools.database.can import Database, Message
 
 from drivers.errors import ConfigError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
+from drivers.last_words import LastWords, descriptor_of
 from drivers.vehicle.protocol_bufsocket import SCHEME
 
 if "drivers.vehicle" not in serial.protocol_handler_packages:
@@ -35,7 +37,8 @@ def load_database() -> Database:
 
 
 class CanLink:
-    """An open CAN bus; `receive` is called in the receive thread with each known message's name and signal values.
+    """An open CAN bus; `receive` is called in the receive thread with each known message's name and signal values,
+    and `idle` with the seconds on the wall for which it has waited in vain.
 
     `wanted` names the messages that are decoded; others are ignored. Raises `NotConnectedError` when the bus cannot be
     opened, `ConfigError` when python-can has no such interface.
@@ -52,6 +55,7 @@ class CanLink:
         database: Database,
         wanted: frozenset[str],
         receive: Callable[[str, dict[str, float]], None],
+        idle: Callable[[float], None],
         statistics: LinkStatistics,
     ) -> None:
         self._name = name
@@ -61,11 +65,14 @@ class CanLink:
             message.frame_id: message for message in database.messages if message.name in wanted
         }
         self._receive = receive
+        self._idle = idle
         self._statistics = statistics
         self._sending = threading.Lock()
         self._closing = threading.Event()
         self._failure: str | None = None
         self._bus = self._open(interface, channel, bitrate, options)
+        self._interface = interface
+        self._last_words: LastWords | None = None
         self._thread = threading.Thread(target=self._run, name=f"{name} receiver", daemon=True)
         self._thread.start()
 
@@ -91,8 +98,10 @@ class CanLink:
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
         self.check()
-        message = self._database.get_message_by_name(name)
-        frame = can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
+        frame = self._frame(name, **signals)
+        if name == "ControlModeCommand" and self._last_words is None:
+            # Who never commanded it has nothing to end.
+            self._last_words = self._stop_after_death(self._interface)
         try:
             with self._sending:
                 self._bus.send(frame, timeout=SEND_TIMEOUT_S)
@@ -109,6 +118,8 @@ class CanLink:
             self._thread.join(10 * RECEIVE_TIMEOUT_S + SEND_TIMEOUT_S)
         # A bus whose peer is gone cannot say goodbye; its socket is released all the same.
         with suppress(can.CanError, OSError), self._sending:
+            if self._last_words is not None:
+                self._last_words.close()
             self._bus.shutdown()
 
     def _open(self, interface: str, channel: str, bitrate: int, options: Mapping[str, Any]) -> can.BusABC:
@@ -130,6 +141,29 @@ class CanLink:
                 "Check interface, channel and adapter",
             ) from error
 
+    def _stop_after_death(self, interface: str) -> LastWords | None:
+        """Zero velocity, then the brake, when this process is killed; None where the bus has no file of its own.
+
+        There the vehicle stops by itself, 0.5 s after the last command.
+        """
+        zero = self._frame("MotionCommand", Speed=0.0, YawRate=0.0, LateralSpeed=0.0, Steering=0.0)
+        frames = (*[zero] * 3, self._frame("BrakeCommand", Locked=1))
+        bus: Any = self._bus
+        if interface == "slcan":
+            # The first return ends a frame that was cut off.
+            words = [b"\rt%03X%d%s\r" % (f.arbitration_id, f.dlc, f.data.hex().encode()) for f in frames]
+            port = descriptor_of(bus.serialPortOrig)
+        elif interface == "socketcan":
+            words = [struct.pack("=IB3x8s", f.arbitration_id, f.dlc, bytes(f.data)) for f in frames]
+            port = descriptor_of(bus)
+        else:
+            return None
+        return None if port is None else LastWords(self._name, port, words)
+
+    def _frame(self, name: str, **signals: float) -> can.Message:
+        message = self._database.get_message_by_name(name)
+        return can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
+
     def _fail(self, reason: str) -> None:
         if self._failure is None:
             self._failure = reason
@@ -139,7 +173,9 @@ class CanLink:
         while not self._closing.is_set() and self._failure is None:
             try:
                 frame = self._bus.recv(RECEIVE_TIMEOUT_S)
-                if frame is not None:
+                if frame is None:
+                    self._idle(RECEIVE_TIMEOUT_S)
+                else:
                     self._handle(frame)
             except (ValueError, IndexError):
                 self._statistics.count("malformed")

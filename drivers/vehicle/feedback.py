@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
+from drivers.vehicle.faults import command_lost, disturbed, driver_trouble, system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 
 CAN_MODE = 1
@@ -15,11 +17,22 @@ SILENCE_S = 0.5
 """Feedback that stays away for this long is a fault."""
 WALL_FLOOR_S = 0.5
 """No patience with the vehicle is shorter than this on the wall, however fast the clock runs."""
+QUIET_S = 2.0
+"""A vehicle that nothing was heard of for this long, on the wall, while this program did listen, may have been
+restarted meanwhile: its odometry no longer tells where it is."""
+REST_AFTER_S = 4.0
+"""After its last command to move the vehicle stands within this."""
+STANDS_MM = 5
+"""A side that counts more than this without a command has been moved by somebody else."""
 CYCLIC = ("MotionState", "Odometry", "SystemState")
-WANTED = frozenset({*CYCLIC, "VersionResponse"})
+_DRIVERS = {f"MotorDriver{motor}": motor for motor in range(1, 9)}
+_COMMANDS = ("MotionCommand", "BrakeCommand")
+WANTED = frozenset({*CYCLIC, *_DRIVERS, *_COMMANDS, "VersionResponse"})
+"""The vehicle's messages, and the commands of others on the bus; one's own do not come back."""
 _FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
+_JUMP_M = 0.05
 _STILL = 0.002
 """Reported speeds up to this, m/s and rad/s, count as standstill: two steps of the protocol."""
 
@@ -38,20 +51,75 @@ class Feedback:
         self._max_speed = max_speed
         self._statistics = statistics
         self._odometry = PlanarOdometry(track)
-        self._news = threading.Condition()
+        self._news = threading.Condition(threading.RLock())
         self._newest: dict[str, tuple[float, dict[str, float]]] = {}
+        self._commanded = -math.inf
+        self._rest: tuple[int, int] | None = None
+        self._quiet = 0.0
+        self._disturbed = ""
+        self._interruptions = 0
+        self._interruption = ""
 
     def take(self, message: str, signals: dict[str, float]) -> None:
         """Keep a message that has just come in, and count odometry on."""
         now = self._clock.now()
         with self._news:
+            if message in CYCLIC:
+                if self._quiet > QUIET_S:
+                    self.interrupt(f"nothing was heard of it for {self._quiet:.1f} s")
+                self._quiet = 0.0
             if message == "Odometry":
-                gap = now - self._newest[message][0] if message in self._newest else 0.0
-                farthest = 0.5 + 2.0 * self._max_speed * gap
-                if not self._odometry.update(int(signals["Left"]), int(signals["Right"]), farthest):
-                    self._statistics.count("odometry_restarted")
+                self._count(now, int(signals["Left"]), int(signals["Right"]))
+            elif message == "MotionCommand" and (signals["Speed"] or signals["YawRate"]):
+                self._disturb("somebody else on the CAN bus commands it to move")
+            elif message == "BrakeCommand" and not signals["Locked"]:
+                self._disturb("somebody else on the CAN bus released its brake")
             self._newest[message] = (now, signals)
             self._news.notify_all()
+
+    def idle(self, seconds: float) -> None:
+        """The receiver has waited for `seconds` on the wall and nothing came."""
+        with self._news:
+            self._quiet += seconds
+
+    def commanded_to_move(self) -> None:
+        """The driver has just sent a velocity: what moves for the next `REST_AFTER_S` moves by that."""
+        self._commanded = self._clock.now()
+
+    def interrupt(self, why: str) -> None:
+        """From now on odometry does not tell where the vehicle is relative to where it was before."""
+        with self._news:
+            self._interruptions += 1
+            self._interruption = why
+
+    def acknowledge(self) -> None:
+        """Whoever takes command now has heard of what others did before."""
+        with self._news:
+            self._disturbed, self._rest = "", None
+
+    def _count(self, now: float, left: int, right: int) -> None:
+        gap = now - self._newest["Odometry"][0] if "Odometry" in self._newest else 0.0
+        if not self._odometry.update(left, right, _JUMP_M + 2.0 * self._max_speed * gap):
+            self._statistics.count("odometry_restarted")
+            self.interrupt("its odometers jumped, so it was restarted")
+        if now - self._commanded < REST_AFTER_S:
+            self._rest = None
+        elif self._rest is None:
+            self._rest = (left, right)
+        elif (moved := max(abs(left - self._rest[0]), abs(right - self._rest[1]))) > STANDS_MM:
+            self._disturb(f"it moved by {moved} mm without a command")
+            self._rest = (left, right)
+
+    def _disturb(self, what: str) -> None:
+        self._disturbed = what
+        self.interrupt(what)
+
+    def _trouble(self, *, commanded: bool) -> tuple[str, ...]:
+        found = list(system_trouble(int(self._newest["SystemState"][1]["ErrorBits"]), commanded=commanded))
+        for message, motor in _DRIVERS.items():
+            if message in self._newest:
+                found += driver_trouble(motor, int(self._newest[message][1]["DriverStatus"]))
+        return tuple(found)
 
     def wait_for(self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool]) -> bool:
         """Wait until news make `happened` true, at most `timeout` s; False when they do not or `alive` turns false."""
@@ -79,14 +147,15 @@ class Feedback:
     def commanded(self, since: float) -> bool:
         """True when the vehicle has reported CAN mode without fault after host time `since`."""
         system = self._newest["SystemState"][1]
-        return self.newer("SystemState", since) and system["Mode"] == CAN_MODE and system["State"] == _OK
+        fit = system["State"] == _OK and not self._trouble(commanded=False)
+        return self.newer("SystemState", since) and system["Mode"] == CAN_MODE and fit
 
     def stands(self, since: float) -> bool:
         """True when the vehicle has reported standstill after host time `since`."""
         motion = self._newest["MotionState"][1]
         return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= _STILL
 
-    def state(self, max_age: float, braked: bool) -> VehicleState:
+    def state(self, max_age: float, braked: bool | None) -> VehicleState:
         """All as one record; `DeadlineError` when it is older than `max_age` s.
 
         Vehicle state and voltage, which come every 0.1 s, may be 0.2 s older. On a clock that runs faster than the
@@ -97,6 +166,11 @@ class Feedback:
         with self._news:
             (moved, motion), (counted, _), (reported, system) = (self._newest[message] for message in CYCLIC)
             x, y, yaw = self._odometry.x, self._odometry.y, self._odometry.yaw
+            trouble, interruptions, interruption = (
+                self._trouble(commanded=True),
+                self._interruptions,
+                self._interruption,
+            )
         age = self._clock.now() - min(moved, counted, reported + _SYSTEM_STATE_SLACK_S)
         if age > max_age:
             raise DeadlineError(
@@ -114,15 +188,25 @@ class Feedback:
             emergency_stop=system["State"] == _EMERGENCY_STOP,
             error_bits=int(system["ErrorBits"]),
             battery_volts=round(system["BatteryVoltage"], 1),
+            trouble=trouble,
+            interruptions=interruptions,
+            interruption=interruption,
         )
 
-    def check(self) -> None:
-        """Raise the `DeviceFault` that the feedback shows: vehicle.silent, vehicle.emergency_stop or vehicle.error."""
+    def check(self, *, in_command: bool, driving: bool) -> None:
+        """Raise the `DeviceFault` that the feedback shows: vehicle.silent, vehicle.emergency_stop, vehicle.error.
+
+        With `in_command` also vehicle.command_lost and vehicle.disturbed: nobody else may command what this program
+        has enabled. One who is `driving` must have heard of it lately. For a vehicle that stands it is enough that the
+        receiver does not wait in vain: a program that computes reads late.
+        """
         with self._news:
             oldest = min(self._newest["SystemState"][0], self._newest["MotionState"][0])
-            system = self._newest["SystemState"][1]
+            system, disturbance = self._newest["SystemState"][1], self._disturbed
+            trouble = self._trouble(commanded=in_command)
+            quiet = self._quiet
         silent = self._clock.now() - oldest
-        if silent > patience(self._clock, SILENCE_S):
+        if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
             raise DeviceFault(
                 self._name,
                 "vehicle.silent",
@@ -138,11 +222,11 @@ class Feedback:
                 recoverable=False,
                 hint="Release the button when it is safe, then enable() the vehicle.",
             )
-        if system["State"] != _OK:
-            raise DeviceFault(
-                self._name,
-                "vehicle.error",
-                f"reports an exception, error bits 0x{int(system['ErrorBits']):04x}",
-                recoverable=True,
-                hint="enable() clears errors whose cause is gone; else see the vehicle's manual for the bits.",
-            )
+        if system["State"] != _OK or trouble:
+            driven = self._clock.now() - self._commanded < REST_AFTER_S
+            raise vehicle_error(self._name, int(system["ErrorBits"]), trouble, driven=driven)
+        if in_command and system["Mode"] != CAN_MODE:
+            self.interrupt("it left CAN command")
+            raise command_lost(self._name, int(system["Mode"]))
+        if in_command and disturbance:
+            raise disturbed(self._name, disturbance)

@@ -1,0 +1,235 @@
+"""The arm driver's connection over its life: begun, lost, made safe, recovered, stopped as it recovers, closed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from drivers.arm.dashboard import Dashboard
+from drivers.arm.faults import fault, unlock
+from drivers.arm.feed import StateFeed
+from drivers.arm.link import ArmLink
+from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.safing import Safing
+from drivers.arm.wrong_arm import Forward, flange_agrees, require_same_flange
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.interfaces import LinkStatistics
+from drivers.quantities import shown
+
+CALL_S = 5.0
+_STOP_S = 2.0
+"""What the child has for a stop. The other way takes 2.6 s more; together they fit the 5 s of a cell's safe stop."""
+_OUTPUT_S = 1.0
+_CLOSE_S = 4.0
+_TOOL_S = 0.5
+
+
+class ArmSession:
+    """One arm as `setup` says, through one child process after the other; `link` is the present one.
+
+    `on_ended` is told how each motion ended, `on_broken` why none can go on. Times are wall seconds.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        setup: Setup,
+        clock: Clock,
+        connect_timeout: float,
+        forward: Forward | None,
+        on_ended: Callable[[Ended], None],
+        on_broken: Callable[[Exception], None],
+    ) -> None:
+        """Connect. Raises `NotConnectedError`, or `DeviceFault` when the arm is another one than `forward` says."""
+        self.setup = setup
+        self.statistics = LinkStatistics()
+        self.dashboard = Dashboard(name, setup.address)
+        self.feed = StateFeed(name, clock, lambda: self.link.lost is not None, self.require_link, self.statistics)
+        self._name = name
+        self._clock = clock
+        self._connect_timeout = connect_timeout
+        self._forward = forward
+        self._on_ended, self._on_broken = on_ended, on_broken
+        self._safing = Safing(name, setup.address, setup.safe_off, self.statistics)
+        self._closed = False
+        self._stops = 0
+        self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
+        self.link = self._connect(lambda: True)
+        try:
+            self._require_model()
+        except Exception:
+            self.close()
+            raise
+
+    # --- what has to hold ---
+
+    def require_link(self) -> None:
+        """Raise the error that says why nothing can be asked of the arm, if any."""
+        self._require_open()
+        if self.link.lost is not None:
+            raise self.link.lost
+
+    def require_control(self) -> None:
+        """Raise `InterlockError` when the arm is only looked at."""
+        if not self.setup.control:
+            raise InterlockError(
+                self._name, "is connected only to be looked at; nothing was sent. Connect with control=True first."
+            )
+
+    def require_ready(self) -> None:
+        """Raise the `DeviceFault` that keeps the arm from moving, if any."""
+        snapshot, _ = self.feed.fresh(0.1)
+        if code := safety_code(snapshot.safety_bits):
+            raise fault(self._name, code)
+        if snapshot.mode != MODE_RUNNING:
+            raise fault(self._name, "arm.not_powered")
+        if not snapshot.program_running:
+            raise fault(self._name, "arm.program_stopped")
+
+    def require_same_arm(self) -> None:
+        """Raise `DeviceFault` (arm.wrong_kinematics) unless the flange is where the caller's model has it."""
+        if self._forward is not None:
+            with self._comparing:
+                require_same_flange(self._name, self._forward, self.feed.fresh(0.1)[0])
+
+    # --- asking ---
+
+    def ask(self, name: str, *arguments: Any, deadline: float = CALL_S) -> None:
+        """Have the child do something; see `ArmLink.call`. `Aborted` when a stop overtook it."""
+        self.require_control()
+        self.require_link()
+        problem = self.link.call(name, *arguments, deadline=deadline)
+        if problem is not None:
+            if problem[0] == "arm.stopped":
+                raise Aborted(f"{self._name}: {name} was dropped because the arm was stopped")
+            raise fault(self._name, *problem)
+
+    def set_output(self, index: int, value: bool) -> None:
+        """Set a digital output and return once the arm shows it; a safe one goes off without the link as well."""
+        self.require_control()
+        try:
+            self._set_output(index, value)
+        except DeviceFault as error:
+            if value or index not in self.setup.safe_off:
+                raise
+            self._require_safe_without(error)
+
+    def stop(self) -> None:
+        """Bring the arm to rest, and a recovery to its end; without the link by the other way."""
+        self.require_control()
+        with self._counting:
+            self._stops += 1
+        try:
+            self.ask("stop", deadline=_STOP_S)
+        except DeviceFault as error:
+            self._require_safe_without(error)
+
+    # --- ends and new beginnings ---
+
+    def recover(self, confirmed: bool) -> None:
+        """See `UrArm.recover`."""
+        self.require_control()
+        with self._counting:
+            stops = self._stops
+        with self._recovering:
+            self._require_open()
+            self.dashboard.ask("stop")
+            unlock(self._name, self.dashboard, self._clock, confirmed, lambda: self._require_no_stop_since(stops))
+            self.link.close(_CLOSE_S)
+            self._on_broken(fault(self._name, "arm.program_stopped", "the arm was recovered"))
+            self._safing.join()
+            self.feed.forget()
+            self._reconnect(stops)
+            self.require_ready()
+            self._require_model()
+
+    def _reconnect(self, stops: int) -> None:
+        self._require_no_stop_since(stops)
+        try:
+            link = self._connect(lambda: self._stops == stops)
+        except Aborted:
+            # Its script may have been on the way already.
+            self.dashboard.ask("stop")
+            raise
+        with self._counting:
+            if self._stops == stops:
+                self.link = link
+                return
+        link.close(_CLOSE_S)
+        self._require_no_stop_since(stops)
+
+    def _require_no_stop_since(self, stops: int) -> None:
+        if self._stops != stops:
+            raise Aborted(f"{self._name}: recover was ended by a stop; it has to be called anew")
+
+    def close(self) -> None:
+        """End a recovery, stop the arm, switch the safe outputs off and end the child; idempotent, bounded in time."""
+        if self._closed:
+            return
+        self._closed = True
+        with self._counting:
+            self._stops += 1
+        with self._recovering:
+            self.link.close(_CLOSE_S)
+        self._on_broken(NotConnectedError(self._name, "the driver was closed"))
+        self._safing.join()
+        self.dashboard.close()
+
+    # --- inside ---
+
+    def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
+        return ArmLink(
+            self._name, self.setup, self._connect_timeout, self.feed.take, self._on_ended, self._on_lost, wanted
+        )
+
+    def _on_lost(self, error: DeviceFault) -> None:
+        self.statistics.count("link lost")
+        if self.setup.control:
+            self._safing.begin()
+        self._on_broken(error)
+        self.feed.wake()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise NotConnectedError(self._name, "the driver was closed. Open a new one.")
+
+    def _require_model(self) -> None:
+        """As `require_same_arm`, but the first states may still be with another tool than the zero one just set.
+
+        Without the control program the tool may be any, so nothing is compared, but nothing moves then either.
+        """
+        forward = self._forward
+        if forward is None or not self.setup.control or not self.feed.fresh(0.1)[0].program_running:
+            return
+        with self._comparing:
+            self.feed.wait_for(lambda snapshot: flange_agrees(forward, snapshot), _TOOL_S)
+        self.require_same_arm()
+
+    def _require_safe_without(self, error: DeviceFault) -> None:
+        """After a call that failed: return once the arm is safe by the other way, else say that it is not known to be.
+
+        A fault of anything but the link is raised as it is.
+        """
+        if error.code not in ("arm.link_lost", "arm.not_stopped"):
+            raise error
+        if problem := self._safing.confirm():
+            raise fault(self._name, "arm.not_safe", f"{error.message} Without it: {problem}") from error
+
+    def _set_output(self, index: int, value: bool) -> None:
+        called = time.monotonic()
+        self.ask("output", index, value, deadline=_OUTPUT_S)
+
+        def shows(snapshot: Snapshot) -> bool:
+            return snapshot.stamp >= called and bool(snapshot.outputs >> index & 1) == value
+
+        if not self.feed.wait_for(shows, _OUTPUT_S):
+            self.statistics.count("output not shown")
+            raise DeadlineError(
+                self._name,
+                f"output {index} was set to {value}, but the arm did not show it within {shown(_OUTPUT_S, 's')}. "
+                "See that no other program sets this output, and that the control program runs: without it those that "
+                "are switched off for safety are kept low.",
+            )

@@ -1,0 +1,68 @@
+"""What a device is told when this process dies without a goodbye: said by a small process that outlives it.
+
+A stepper module runs on to its target, and a vehicle drives on for half a second, when nobody talks to them any more.
+The helper holds the same port and waits at a pipe. When the pipe ends, the owner is gone: it says the last words and
+ends. It does nothing while the owner lives, and nothing after `close()`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+PAUSE_S = 0.02
+"""Between two of the last words."""
+END_TIMEOUT_S = 2.0
+
+log = logging.getLogger(__name__)
+
+
+def descriptor_of(port: Any) -> int | None:
+    """The file descriptor of a port or a bus; None for one that is no file, which dies with its process."""
+    try:
+        return int(port.fileno())
+    except (AttributeError, OSError, NotImplementedError):
+        return None
+
+
+class LastWords:
+    """Holds the port with the file `descriptor`; writes each of `words` to it by one system call, in their order."""
+
+    def __init__(self, name: str, descriptor: int, words: Sequence[bytes]) -> None:
+        reader, self._pipe = os.pipe()
+        script = Path(__file__).with_name("last_words_child.py")
+        command = [sys.executable, "-I", "-S", str(script), str(reader), str(descriptor), repr(PAUSE_S)]
+        try:
+            self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
+                [*command, *(word.hex() for word in words)],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(reader, descriptor),
+                start_new_session=True,  # what ends the owner's group must not end the helper
+            )
+        except OSError as error:
+            # The device still works, and its own watchdog, if it has one, still stops it.
+            log.warning("%s: nobody will stop it if this process is killed: %s", name, error)
+            self._process = None
+        finally:
+            os.close(reader)
+
+    def close(self) -> None:
+        """Say goodbye: the helper ends without a word. Idempotent."""
+        if self._pipe < 0:
+            return
+        with suppress(OSError):
+            os.write(self._pipe, b"bye")
+        os.close(self._pipe)
+        self._pipe = -1
+        if self._process is not None:
+            try:
+                self._process.wait(END_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait(END_TIMEOUT_S)
