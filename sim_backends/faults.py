@@ -8,7 +8,7 @@ from sim_backends.peers.tmcl import FAULTS as RAIL_FAULTS
 
 __all__ = ["ARM_FAULTS", "CAMERA_FAULTS", "FAULT_NAMES", "RAIL_FAULTS", "TARGET_CAMERA_FAULTS", "VEHICLE_FAULTS"]
 
-ARM_FAULTS = ("arm.protective_stop", "arm.emergency_stop")
+ARM_FAULTS = ("arm.protective_stop", "arm.safeguard_stop", "arm.emergency_stop")
 TARGET_CAMERA_FAULTS = tuple(f"target_{name}" for name in CAMERA_FAULTS)
 """Those of the target camera; a name that says only `camera.` is the scan camera's."""
 

@@ -28,6 +28,7 @@ from sim_backends.faults import (
     TARGET_CAMERA_FAULTS,
     VEHICLE_FAULTS,
 )
+from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
@@ -167,7 +168,7 @@ def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], No
     if options.exit_with_stdin:
         threading.Thread(target=_watch_stdin, args=(ended,), name="stdin", daemon=True).start()
     try:
-        cell = ServedCell(World(options.seed, options.level, options.speed, options.surface))
+        cell = ServedCell(World(options.seed, options.level, options.speed, options.surface, arm=options.arm))
     except OSError as error:
         print(f"no free loopback endpoint: {error}; end other simulated cells and try again", file=sys.stderr)
         return 1
@@ -186,6 +187,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--level", choices=list(LEVELS), default="nominal", help="deviations (default: %(default)s)")
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second (default: %(default)s)")
     parser.add_argument("--surface", choices=sorted(SURFACES), default="pot", help="what lies at the placement area")
+    parser.add_argument("--arm", choices=sorted(TABLES), default="UR10e", help="which arm (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
     parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")
     options = parser.parse_args(argv)

@@ -12,11 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
+from typing import Any
 
 import numpy as np
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics, Matrix, Vector
+from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
 from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
 from sim_backends.models.arm_truth import TruePose
 
@@ -33,6 +34,7 @@ class Safety(Enum):
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
     EMERGENCY_STOP = 7
 
 
@@ -66,6 +68,11 @@ class ArmParams:
     unlock_delay: float = 5.0
     model: str = "UR10e"
     serial: str = "20235500001"
+
+    @classmethod
+    def of(cls, model: str, **others: Any) -> ArmParams:
+        """Those of the maker's `model`, a key of `TABLES`, with `others` as given."""
+        return cls(dh=TABLES[model].copy(), model=model, **others)
 
 
 class ArmModel:
@@ -140,9 +147,15 @@ class ArmModel:
             self.digital_inputs = self.digital_inputs & ~(1 << index) | int(value) << index
 
     def fault(self, name: str) -> None:
-        """Bring about a "protective_stop" or an "emergency_stop"; ValueError for any other name."""
+        """Bring about a "protective_stop", "safeguard_stop" or "emergency_stop"; ValueError for any other name."""
         if name == "protective_stop":
             self.protective_stop("triggered from outside")
+        elif name == "safeguard_stop":
+            with self._lock:
+                if self.safety is Safety.NORMAL:
+                    self.safety = Safety.SAFEGUARD_STOP
+                    self.fault_text = "safeguard open"
+                    self.suspend()
         elif name == "emergency_stop":
             with self._lock:
                 self.safety = Safety.EMERGENCY_STOP
@@ -150,10 +163,12 @@ class ArmModel:
                 self._suspended = []
                 self._replace(Stop(_BRAKE))
         else:
-            raise ValueError(f"arm fault {name!r} is unknown: use 'protective_stop' or 'emergency_stop'")
+            raise ValueError(
+                f"arm fault {name!r} is unknown: use 'protective_stop', 'safeguard_stop' or 'emergency_stop'"
+            )
 
     def clear(self) -> None:
-        """Take away the cause: a protective stop ends at once; after an emergency stop the arm is left powered off."""
+        """Take away the cause: a protective or safeguard stop ends at once, an emergency stop leaves the power off."""
         with self._lock:
             if self.safety is Safety.EMERGENCY_STOP:
                 self.power = Power.OFF

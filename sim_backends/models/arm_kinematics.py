@@ -27,6 +27,18 @@ UR10E_DH: Matrix = np.array(
     ]
 )
 """One row per joint: a in m, d in m, alpha in rad, joint offset in rad."""
+UR5E_DH: Matrix = np.array(
+    [
+        [0.0, 0.1625, math.pi / 2, 0.0],
+        [-0.425, 0.0, 0.0, 0.0],
+        [-0.3922, 0.0, 0.0, 0.0],
+        [0.0, 0.1333, math.pi / 2, 0.0],
+        [0.0, 0.0997, -math.pi / 2, 0.0],
+        [0.0, 0.0996, 0.0, 0.0],
+    ]
+)
+TABLES: dict[str, Matrix] = {"UR10e": UR10E_DH, "UR5e": UR5E_DH}
+"""The makers' table by the name of the model."""
 
 _Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Axes x, y, z and origin of a frame, three numbers each."""
@@ -48,6 +60,10 @@ class Kinematics:
     def forward(self, q: Vector) -> Matrix:
         """base_from_flange (4, 4) at joint angles `q` (6,)."""
         return _matrix(self._chain(q)[-1])
+
+    def frames(self, q: Vector) -> Matrix:
+        """The frames (7, 4, 4) of the base and of the six links in the base at joint angles `q` (6,)."""
+        return np.array([_matrix(frame) for frame in self._chain(q)])
 
     def forward_with_jacobian(self, q: Vector) -> tuple[Matrix, Matrix]:
         """base_from_flange (4, 4) and the Jacobian (6, 6) of flange velocity and rotation rate in base axes."""

@@ -148,6 +148,13 @@ class RailModel:
             self._target, self._target_velocity, self._positioning = position, 0, False
             self._follow(ramp.rest(t, x))
 
+    def reset(self, t: float) -> None:
+        """The controller starts anew, as after a loss of power: it stops dead where it is and calls that place 0."""
+        with self._lock:
+            self.settings = RailSettings()
+            self.set_position(t, 0)
+            self._stalled_at = None
+
     def configure(self, t: float, settings: RailSettings) -> None:
         """Take new settings; a running positioning goes on under them, and the counter keeps its value."""
         with self._lock:

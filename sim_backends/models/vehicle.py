@@ -19,7 +19,11 @@ from sim_backends.history import History
 
 _STEP = 0.005
 FAULTS = ("vehicle.emergency_stop", "vehicle.motor_fault")
-MOTOR_FAULT = 0x0001
+MOTOR_FAULT = 0x0100
+"""Error bit of the system state: a motor driver fails (ugv_sdk, SYSTEM_ERROR_MOTOR_DRIVER_MASK)."""
+DRIVER_FAULT, DRIVER_OVERLOAD = 0x20, 0x04
+"""Bits of a motor driver's status (ugv_sdk, DRIVER_STATE_…)."""
+MOTORS = 4
 
 
 class State(IntEnum):
@@ -66,7 +70,10 @@ class VehicleParams:
 
 @dataclass(frozen=True)
 class Feedback:
-    """What the vehicle knows of itself: speeds in m/s and rad/s of the wheels, odometers of both sides in m."""
+    """What the vehicle knows of itself: speeds in m/s and rad/s of the wheels, odometers of both sides in m.
+
+    `drivers` is the status of each motor's driver.
+    """
 
     state: State
     mode: Mode
@@ -78,19 +85,23 @@ class Feedback:
     yaw_rate: float
     left: float
     right: float
+    drivers: tuple[int, ...] = (0,) * MOTORS
 
 
 class VehicleModel:
     """One vehicle. All times are world seconds; safe between threads.
 
     `sag` may be set to a function that gives roll, pitch (rad) and height (m) of the body on its suspension; it is
-    asked in `tick` and never while the model is locked.
+    asked in `tick` and never while the model is locked. `blocked` may be set to a function that is told the pose (x, y,
+    yaw) that the next step leads to, and says whether something solid is in the way: the vehicle then stays where it
+    is, its motors are overloaded and it reports an exception. It is asked while the model is locked.
     """
 
     def __init__(self, params: VehicleParams, rng: np.random.Generator) -> None:
         """A vehicle that was switched on at world time 0, in standby, brake released."""
         self.params = params
         self.sag: Callable[[], tuple[float, float, float]] = lambda: (0.0, 0.0, 0.0)
+        self.blocked: Callable[[float, tuple[float, float, float]], bool] = lambda t, pose: False
         self._rng = rng
         self._lock = threading.Lock()
         self._history = History()
@@ -106,6 +117,7 @@ class VehicleModel:
         self._braked = False
         self._emergency = False
         self._errors = 0
+        self._drivers = [0] * MOTORS
         self._history.append(0.0, self._pose())
 
     # --- what the world sees ---
@@ -147,6 +159,7 @@ class VehicleModel:
                 self._yaw_rate,
                 self._left,
                 self._right,
+                tuple(self._drivers),
             )
 
     def set_mode(self, t: float, mode: Mode) -> None:
@@ -186,7 +199,7 @@ class VehicleModel:
         """Clear stored errors; an emergency stop stays until its button is released."""
         with self._lock:
             self._advance(t)
-            self._errors = 0
+            self._clear()
 
     def fault(self, name: str, t: float) -> None:
         """Cause a fault of `FAULTS`. Raises ValueError for another name."""
@@ -198,15 +211,20 @@ class VehicleModel:
                 self._emergency = True
             else:
                 self._errors |= MOTOR_FAULT
+                self._drivers[0] |= DRIVER_FAULT
 
     def clear(self, t: float) -> None:
         """Take away all causes of faults: the emergency stop button is released, motors are well again."""
         with self._lock:
             self._advance(t)
             self._emergency = False
-            self._errors = 0
+            self._clear()
 
     # --- inside ---
+
+    def _clear(self) -> None:
+        self._errors = 0
+        self._drivers = [0] * MOTORS
 
     def _state(self) -> State:
         if self._emergency:
@@ -241,8 +259,6 @@ class VehicleModel:
         self._yaw_rate += min(max(yaw_rate - old_yaw_rate, -turning * dt), turning * dt)
         way = 0.5 * (old_speed + self._speed) * dt
         turn = 0.5 * (old_yaw_rate + self._yaw_rate) * dt
-        self._left += way - 0.5 * p.track * turn
-        self._right += way + 0.5 * p.track * turn
         rolled = math.sqrt(abs(way) + 0.5 * p.track * abs(turn))
         true_way, true_turn = way * p.distance_scale, turn * p.yaw_scale
         lateral = 0.0
@@ -251,10 +267,17 @@ class VehicleModel:
         if p.lateral_walk:
             lateral = p.lateral_walk * rolled * float(self._rng.standard_normal())
         heading = self._yaw + 0.5 * true_turn
-        self._x += true_way * math.cos(heading) - lateral * math.sin(heading)
-        self._y += true_way * math.sin(heading) + lateral * math.cos(heading)
-        self._yaw += true_turn
         self._t += dt
+        x = self._x + true_way * math.cos(heading) - lateral * math.sin(heading)
+        y = self._y + true_way * math.sin(heading) + lateral * math.cos(heading)
+        if self.blocked(self._t, (x, y, self._yaw + true_turn)):
+            self._speed = self._yaw_rate = 0.0
+            self._errors |= MOTOR_FAULT
+            self._drivers = [status | DRIVER_OVERLOAD for status in self._drivers]
+            return
+        self._x, self._y, self._yaw = x, y, self._yaw + true_turn
+        self._left += way - 0.5 * p.track * turn
+        self._right += way + 0.5 * p.track * turn
 
     def _pose(self) -> NDArray[np.float64]:
         roll, pitch, height = self._tilt

@@ -25,6 +25,7 @@ MOTOR_MOTION, MOTOR_DRIVER = 0x251, 0x261
 
 _TICK = 0.005
 _FAST, _SLOW = 0.005, 0.020
+_DRIVER_ENABLED = 0x40
 _SIDES = (1, -1, -1, 1)
 """Motors 1…4 are right front, left front, left rear, right rear: +1 right, −1 left."""
 
@@ -160,8 +161,11 @@ def _motor_motion(side: int) -> _Encoder:
     return encode
 
 
-def _motor_driver(f: Feedback, p: VehicleParams, count: int) -> bytes:
-    return struct.pack(">HhbBxx", round(f.volts * 10.0), 31, 33, 0)
+def _motor_driver(motor: int) -> _Encoder:
+    def encode(f: Feedback, p: VehicleParams, count: int) -> bytes:
+        return struct.pack(">HhbBxx", round(f.volts * 10.0), 31, 33, _DRIVER_ENABLED | f.drivers[motor])
+
+    return encode
 
 
 def _amperes(speed: float) -> float:
@@ -181,7 +185,7 @@ _CYCLES: dict[int, tuple[float, float, _Encoder]] = {
     MOTION_STATE: (0.020, _FAST, _motion_state),
     ODOMETRY: (0.020, _FAST, _odometry),
     **{MOTOR_MOTION + i: (0.020, _SLOW, _motor_motion(side)) for i, side in enumerate(_SIDES)},
-    **{MOTOR_DRIVER + i: (0.100, _SLOW, _motor_driver) for i in range(len(_SIDES))},
+    **{MOTOR_DRIVER + i: (0.100, _SLOW, _motor_driver(i)) for i in range(len(_SIDES))},
     MOTION_MODE_STATE: (0.100, _SLOW, _motion_mode_state),
     BATTERY: (0.500, _SLOW, _battery),
 }

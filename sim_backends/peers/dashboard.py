@@ -13,9 +13,16 @@ _MODES = {Power.OFF: "POWER_OFF", Power.IDLE: "IDLE", Power.RUNNING: "RUNNING"}
 _SAFETY = {
     Safety.NORMAL: "NORMAL",
     Safety.PROTECTIVE_STOP: "PROTECTIVE_STOP",
+    Safety.SAFEGUARD_STOP: "SAFEGUARD_STOP",
     Safety.EMERGENCY_STOP: "ROBOT_EMERGENCY_STOP",
 }
-_STATES = {RuntimeState.STOPPED: "STOPPED", RuntimeState.PLAYING: "PLAYING", RuntimeState.PAUSED: "PAUSED"}
+_STATES = {
+    RuntimeState.STOPPED: "STOPPED",
+    RuntimeState.PLAYING: "PLAYING",
+    RuntimeState.PAUSING: "PAUSED",
+    RuntimeState.PAUSED: "PAUSED",
+    RuntimeState.RESUMING: "PLAYING",
+}
 _FIXED = {
     "is in remote control": "true",
     "get loaded program": "No program loaded",

@@ -1,7 +1,7 @@
 """RTDE version 2 over TCP: the simulated arm's controller as a client on the network sees it.
 
-One thread advances the arm and serves the real-time, dashboard and script ports every 2 ms on the wall, in that
-order, on absolute deadlines. Source: the maker's RTDE guide and the protocol sheet, section 1. Physics is elsewhere.
+One thread advances the arm and serves the real-time, dashboard, script and secondary ports every 2 ms on the wall, on
+absolute deadlines. Source: the maker's RTDE guide and the protocol sheet, section 1. Physics is elsewhere.
 """
 
 from __future__ import annotations
@@ -19,18 +19,24 @@ import numpy as np
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.controller_ports import Client, TcpPorts
-from sim_backends.peers.dashboard import BANNER, Dashboard
+from sim_backends.peers.dashboard import BANNER, VERSION, Dashboard
 from sim_backends.peers.rtde_recipes import InputRecipe
 from sim_backends.peers.rtde_registers import Registers, View
 from sim_backends.peers.rtde_session import Session
 from sim_backends.peers.script import ControlProgram, ScriptText
+from sim_backends.peers.script_port import robot_mode, version_message
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
 _CATCH_UP = 100
 """Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
-RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT = 30004, 29999, 30003, 30002
+_HELD_UP_S = 0.02
+"""A tick that begins later than this, in seconds on the wall, is made up for. A real controller is never held up."""
+_REPORT_EVERY = 50
+"""Ticks between two reports on the secondary port, which come ten times a second."""
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +45,7 @@ class RtdePeer:
     """The controller of one simulated arm on its own loopback address."""
 
     def __init__(self, model: ArmModel, clock: WorldClock, host: str | None = None) -> None:
-        """Bind the three ports on `host`, or on the first free 127.0.0.x from 127.0.0.2 upward.
+        """Bind the four ports on `host`, or on the first free 127.0.0.x from 127.0.0.2 upward.
 
         Raises OSError when an address or every address is taken.
         """
@@ -47,13 +53,14 @@ class RtdePeer:
         self._clock = clock
         self._registers = Registers()
         self._view = View(model, self._registers)
-        self._program = ControlProgram(model, self._registers, clock)
+        self._program = ControlProgram(model, self._registers)
         self._dashboard = Dashboard(model, self._program)
         self._owners: dict[str, Session] = {}
         self._sessions: dict[Client, Session] = {}
         self._scripts: dict[Client, ScriptText] = {}
+        self._listeners: set[Client] = set()
         self._lines: dict[Client, bytes] = {}
-        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT), host)
+        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT), host)
         self._tick_count = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm controller", daemon=True)
@@ -84,11 +91,6 @@ class RtdePeer:
         """A recipe that writes to this controller's inputs."""
         return InputRecipe(names, self._model, self._registers)
 
-    @property
-    def wall_time(self) -> float:
-        """Seconds on the wall at the newest tick."""
-        return self._clock.wall(self._model.time)
-
     def _run(self) -> None:
         period = PERIOD * self._clock.speed
         due = self._clock.now() + period
@@ -97,7 +99,7 @@ class RtdePeer:
                 self._clock.sleep_until(due)
                 late = self._clock.now() - due
                 self._note(late)
-                self._tick(due)
+                self._tick(due, held_up=self._clock.wall(late) > _HELD_UP_S)
                 due += period
                 if self._clock.now() - due > _CATCH_UP * period:
                     due = self._clock.now()
@@ -109,7 +111,7 @@ class RtdePeer:
         if len(self.lateness) > 20000:
             del self.lateness[:10000]
 
-    def _tick(self, t: float) -> None:
+    def _tick(self, t: float, held_up: bool) -> None:
         self._tick_count += 1
         waiting = set(self._sessions)
         for port, client, data in self._ports.poll():
@@ -119,15 +121,18 @@ class RtdePeer:
             elif port == DASHBOARD_PORT:
                 self._serve_dashboard(client, data)
             else:
-                self._serve_script(client, data)
+                self._serve_script(client, data, reports=port == SECONDARY_PORT)
         for client in waiting:
             self._sessions[client].feed(b"")
-        self._program.tick()
+        self._program.tick(held_up)
         self._model.tick(t)
         self._view.runtime_state = self._program.runtime_state
         for session in list(self._sessions.values()):
             if session.started:
                 session.send_state(self._view, self._tick_count)
+        if self._tick_count % _REPORT_EVERY == 0:
+            for client in self._listeners:
+                client.send(robot_mode(self._model, self._program.runtime_state))
 
     def _serve_rtde(self, client: Client, data: bytes | None) -> None:
         if data is None:
@@ -152,10 +157,14 @@ class RtdePeer:
             if command == "quit":
                 client.close()
 
-    def _serve_script(self, client: Client, data: bytes | None) -> None:
+    def _serve_script(self, client: Client, data: bytes | None, reports: bool) -> None:
         if data is None:
             self._scripts.pop(client, None)
+            self._listeners.discard(client)
             return
+        if reports and client not in self._listeners:
+            self._listeners.add(client)
+            client.send(version_message(VERSION))
         for text in self._scripts.setdefault(client, ScriptText()).feed(data):
             self._program.load(text)
 
@@ -165,12 +174,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m sim_backends.peers.rtde", description=main.__doc__)
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second")
     parser.add_argument("--host", default=None, help="loopback address, default: the first free one from 127.0.0.2")
+    parser.add_argument("--model", choices=sorted(TABLES), default="UR10e", help="which arm")
     parser.add_argument("--unlock-delay", type=float, default=5.0, help="world seconds before a stop can be unlocked")
     parser.add_argument("--json", action="store_true", help="announce the address as one JSON line")
     parser.add_argument("--until-eof", action="store_true", help="take commands on standard input and end with it")
     options = parser.parse_args(arguments)
     clock = WorldClock(options.speed)
-    model = ArmModel(ArmParams(unlock_delay=options.unlock_delay), np.random.default_rng(0), clock)
+    params = ArmParams.of(options.model, unlock_delay=options.unlock_delay)
+    model = ArmModel(params, np.random.default_rng(0), clock)
     peer = RtdePeer(model, clock, options.host)
     peer.start()
     print(json.dumps({"address": peer.address, "pid": os.getpid()}) if options.json else peer.address, flush=True)

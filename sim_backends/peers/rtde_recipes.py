@@ -36,14 +36,14 @@ class InputRecipe:
                 self._slots.append((registers.double_in, int(match[2])))
             place = len(self._slots)
 
-    def apply(self, payload: bytes, wall_time: float) -> None:
+    def apply(self, payload: bytes) -> None:
         """Write one packet's values; real clients send packets too long or too short, which are cut or padded."""
         size = self._unpacker.size
         numbers = self._unpacker.unpack(payload if len(payload) == size else payload[:size].ljust(size, b"\0"))
         for (bank, index), number in zip(self._slots, numbers, strict=True):
             bank[index] = number
         if self._names & _COMMANDS:
-            self._registers.commanded_at = wall_time
+            self._registers.commands += 1
             self._registers.command_fields = self._names
         if self._others:
             self._write_outputs({name: numbers[place] for name, place in self._others})

@@ -39,7 +39,8 @@ class Registers:
         self.int_out = [0] * REGISTERS
         self.double_out = [0.0] * REGISTERS
         self.bits_out = [0, 0]
-        self.commanded_at = 0.0
+        self.commands = 0
+        """How many packets have carried the command so far."""
         self.command_fields: frozenset[str] = frozenset()
         self.analog_out = [0.0, 0.0]
 
@@ -103,6 +104,7 @@ _ZERO6 = [0.0] * 6
 _SAFETY_BITS = {
     Safety.NORMAL: 1 << 0,
     Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
     Safety.EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
 }
 

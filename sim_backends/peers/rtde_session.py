@@ -21,10 +21,6 @@ _FLOOD = 65536
 class Controller(Protocol):
     """What a connection needs of the controller."""
 
-    @property
-    def wall_time(self) -> float:
-        """Seconds on the wall at the newest tick."""
-
     def claim(self, name: str, session: Session) -> bool:
         """Give an input variable to a connection; False when another one holds it."""
 
@@ -122,7 +118,7 @@ class Session:
     def _on_data(self, payload: bytes) -> None:
         recipe = self._inputs.get(payload[0]) if payload else None
         if recipe is not None:
-            recipe.apply(payload[1:], self._controller.wall_time)
+            recipe.apply(payload[1:])
 
     _HANDLERS: dict[str, Callable[[Session, bytes], None]] = {  # noqa: RUF012
         "V": _on_protocol,

@@ -11,13 +11,18 @@ import re
 from collections.abc import Callable
 from enum import IntEnum
 
-from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.peers.rtde_registers import Registers
-from sim_backends.peers.script_context import Context, Job, ProgramError
+from sim_backends.peers.script_context import CYCLE, Context, Job, ProgramError
 from sim_backends.peers.script_motion import MOTION_COMMANDS, tool_contact
+from sim_backends.peers.script_outputs import HeldOutputs
 from sim_backends.peers.script_queries import QUERY_COMMANDS
-from sim_backends.peers.script_statements import path_statements, run_statement, statements, understood
+from sim_backends.peers.script_statements import (
+    path_statements,
+    run_statement,
+    statements,
+    understood,
+)
 
 COMMANDS: dict[int, Callable[[Context], Job | None]] = {**MOTION_COMMANDS, **QUERY_COMMANDS}
 """Every command that does something; other numbers are answered as done."""
@@ -27,6 +32,7 @@ _STOP_SCRIPT, _CONTACT_DETECTED = 255, 254
 
 _log = logging.getLogger(__name__)
 _TEXT_LIMIT = 1 << 20
+_RESUMING_CYCLES = 50
 _OFFSET = re.compile(r"reg_offset_int\s*=\s*#[^\n]*\n?\s*(\d+)")
 
 
@@ -35,7 +41,9 @@ class RuntimeState(IntEnum):
 
     STOPPED = 1
     PLAYING = 2
+    PAUSING = 3
     PAUSED = 4
+    RESUMING = 5
 
 
 class ScriptText:
@@ -63,24 +71,32 @@ class ScriptText:
 
 
 class ControlProgram:
-    """The controller's program memory: at most one program, playing, paused or stopped."""
+    """The controller's program memory: at most one program, and what its outputs do while none runs."""
 
-    def __init__(self, model: ArmModel, registers: Registers, clock: WorldClock) -> None:
+    def __init__(self, model: ArmModel, registers: Registers) -> None:
         self.runtime_state = RuntimeState.STOPPED
         self.message = ""
         self._model = model
         self._registers = registers
-        self._clock = clock
         self._context = Context(model, registers, 0, [])
+        self._outputs = HeldOutputs(model)
+        self._resumes_at = 0
+        self._by_safeguard = False
+        self._cycles = 0
+        self._commands, self._commanded_at = 0, 0
         self._job: Job | None = None
         self._serves_commands = False
         self._executing = False
 
     def load(self, text: str) -> None:
-        """Run `text` in place of any other program.
+        """Run `text` in place of any other program; a secondary program (`sec`) runs at once, beside it.
 
         Like on the controller, nothing changes while the arm cannot move or when the text does not compile.
         """
+        if text.lstrip().startswith("sec "):
+            if line := self._outputs.run_secondary(self._context, text):
+                self._note(f"a secondary program failed at {line!r}")
+            return
         found = _OFFSET.search(text)
         if not self._model.ready:
             self._note("a script was not started: the arm is not ready")
@@ -95,24 +111,25 @@ class ControlProgram:
         self._context = Context(self._model, self._registers, int(found[1]) if found else 0, path_statements(text))
         self._job = None if self._serves_commands else self._run_text(text)
         self.runtime_state = RuntimeState.PLAYING
+        self._commanded_at = self._cycles
         self.message = ""
         if self._serves_commands:
             self._context.signal_async(-1)
 
     def play(self) -> bool:
-        """Continue a paused program; False when there is none or the arm is not ready."""
+        """Continue a paused program, a moment from now; False when there is none or the arm is not ready."""
         if self.runtime_state is not RuntimeState.PAUSED or not self._model.ready:
             return False
-        self._model.resume()
-        self.runtime_state = RuntimeState.PLAYING
+        self.runtime_state = RuntimeState.RESUMING
+        self._resumes_at = self._cycles + _RESUMING_CYCLES
         return True
 
     def pause(self) -> bool:
-        """Pause a playing program and its motion; False when none plays."""
-        if self.runtime_state is not RuntimeState.PLAYING:
+        """Pause a playing program and its motion, which ends at rest; False when none plays."""
+        if self.runtime_state not in (RuntimeState.PLAYING, RuntimeState.RESUMING):
             return False
         self._model.suspend()
-        self.runtime_state = RuntimeState.PAUSED
+        self.runtime_state = RuntimeState.PAUSING
         return True
 
     def stop(self, reason: str) -> None:
@@ -125,19 +142,42 @@ class ControlProgram:
         self._model.halt()
         self._note(f"program stopped: {reason}")
 
-    def tick(self) -> None:
-        """One cycle of the controller: follow the safety system, then the program."""
-        if self.runtime_state is not RuntimeState.STOPPED and not self._model.ready:
-            if self._model.safety is Safety.PROTECTIVE_STOP:
-                self.runtime_state = RuntimeState.PAUSED
-            else:
-                self.stop(self._model.fault_text or "the arm was switched off")
-        if self.runtime_state is not RuntimeState.PLAYING:
+    def tick(self, held_up: bool = False) -> None:
+        """One cycle of the controller: follow the safety system, then the program.
+
+        `held_up` says that this cycle is made up for: the host did not let the controller run in time, and perhaps its
+        clients neither. Such a cycle does not count as silence, since a real controller runs in real time.
+        """
+        self._cycles += not held_up
+        self._follow_safety()
+        self._change_over()
+        if self.runtime_state is RuntimeState.PLAYING:
+            try:
+                self._cycle()
+            except ProgramError as error:
+                self.stop(str(error))
+        self._outputs.hold(self.runtime_state is RuntimeState.PLAYING)
+
+    def _follow_safety(self) -> None:
+        if self.runtime_state is RuntimeState.STOPPED or self._model.ready:
             return
-        try:
-            self._cycle()
-        except ProgramError as error:
-            self.stop(str(error))
+        safety = self._model.safety
+        if safety not in (Safety.PROTECTIVE_STOP, Safety.SAFEGUARD_STOP):
+            self.stop(self._model.fault_text or "the arm was switched off")
+        elif self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
+            self.runtime_state = RuntimeState.PAUSING
+            self._by_safeguard = safety is Safety.SAFEGUARD_STOP
+
+    def _change_over(self) -> None:
+        """From pausing to paused once the arm stands, from resuming to playing; a closed safeguard resumes."""
+        if self.runtime_state is RuntimeState.PAUSING and not self._model.moving:
+            self.runtime_state = RuntimeState.PAUSED
+        elif self.runtime_state is RuntimeState.PAUSED and self._by_safeguard and self.play():
+            self._by_safeguard = False
+        elif self.runtime_state is RuntimeState.RESUMING and self._cycles >= self._resumes_at:
+            self._model.resume()
+            self.runtime_state = RuntimeState.PLAYING
+            self._commanded_at = self._cycles
 
     def _cycle(self) -> None:
         self._check_watchdog()
@@ -199,11 +239,12 @@ class ControlProgram:
             context.contact_seen = True
 
     def _check_watchdog(self) -> None:
+        """Cycles are counted, which are on the wall's time however fast the world runs."""
+        if self._commands != self._registers.commands:
+            self._commands, self._commanded_at = self._registers.commands, self._cycles
         limit = self._context.watchdog_period
-        if limit is None:
-            return
-        silence = self._clock.wall(self._model.time) - self._registers.commanded_at
-        if silence > limit:
+        silence = CYCLE * (self._cycles - self._commanded_at)
+        if limit is not None and silence > limit:
             raise ProgramError(f"watchdog: no input for {silence:.3f} s, at most {limit:.3f} s allowed")
 
     def _note(self, message: str) -> None:

@@ -18,6 +18,8 @@ from sim_backends.peers.rtde_registers import Registers
 
 Job = Iterator[None]
 
+CYCLE = 0.002
+"""Seconds between two cycles of the controller."""
 _HISTORY = 500
 
 

@@ -7,9 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim_backends.models.arm_kinematics import pose_from_matrix
-from sim_backends.peers.script_context import Context
-
-_CYCLE = 0.002
+from sim_backends.peers.script_context import CYCLE, Context
 
 
 def _inverse_near(c: Context) -> None:
@@ -53,7 +51,7 @@ def _joint_torques(c: Context) -> None:
 QUERY_COMMANDS: dict[int, Callable[[Context], None]] = {
     8: lambda c: c.model.zero_force(),
     17: _set_payload,
-    26: lambda c: c.answer(np.array([_CYCLE])),
+    26: lambda c: c.answer(np.array([CYCLE])),
     27: lambda c: c.answer(c.joints_before(c.integer(1))),
     28: _forward_now,
     29: _set_tcp,

@@ -19,7 +19,9 @@ from sim_backends.models.rail import RailModel
 from sim_backends.peers.server import TcpServer
 from sim_backends.peers.tmcl_module import TmclModule
 
-FAULTS = ("rail.drop_reply",)
+FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset")
+LATE_S = 0.2
+"""Wall seconds by which `rail.late_reply` delays every reply."""
 _REQUEST = 9
 _PAUSE = 0.05
 """Wall seconds of silence after which the rest of an incomplete request is forgotten."""
@@ -34,6 +36,7 @@ class TmclPeer:
         self.url = f"socket://{self._server.address}"
         self.pty: str | None = None
         self._drop = 0
+        self._late = False
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._terminal: tuple[int, int] | None = None
@@ -62,16 +65,27 @@ class TmclPeer:
             self._terminal = None
 
     def fault(self, name: str) -> None:
-        """`rail.drop_reply`: the next request is carried out, but its reply is lost. Raises ValueError otherwise."""
-        if name not in FAULTS:
-            raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
-        with self._lock:
-            self._drop += 1
+        """Cause a fault of `FAULTS`; ValueError for another name.
+
+        `rail.drop_reply`: the next request is carried out, but its reply is lost. `rail.late_reply`: from now on every
+        reply comes `LATE_S` after its request was carried out. `rail.reset`: the module starts anew.
+        """
+        match name:
+            case "rail.drop_reply":
+                with self._lock:
+                    self._drop += 1
+            case "rail.late_reply":
+                self._late = True
+            case "rail.reset":
+                self.module.reset()
+            case _:
+                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
 
     def clear(self) -> None:
-        """Forget faults that have not happened yet."""
+        """Take away all faults; a module that was reset stays so."""
         with self._lock:
             self._drop = 0
+        self._late = False
 
     def _serve_socket(self, connection: socket.socket) -> None:
         self._serve(connection.fileno(), lambda: connection.recv(4096), connection.sendall)
@@ -94,6 +108,8 @@ class TmclPeer:
             while len(pending) >= _REQUEST:
                 reply = self.module.handle(pending[:_REQUEST])
                 pending = pending[_REQUEST:]
+                if self._late:
+                    self._stopping.wait(LATE_S)
                 if reply is not None and not self._lost():
                     write(reply)
 

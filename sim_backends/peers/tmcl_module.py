@@ -21,6 +21,7 @@ from sim_backends.peers.tmcl_parameters import (
     PLAIN,
     SEARCH_MODES,
     SETTINGS,
+    STORED_VARIABLES,
     UNLOCK,
     USER_VARIABLES,
 )
@@ -45,12 +46,10 @@ class TmclModule:
         self.rail = rail
         self._clock = clock
         self._lock = threading.Lock()
-        self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
         self._globals = {number: value for number, (value, _, _) in GLOBALS.items()}
-        self._variables = [0] * USER_VARIABLES
-        self._variables[SERIAL_VARIABLE] = rail.params.serial & 0x7FFFFFFF
         self._stored: dict[int, int] = {}
-        self._outputs = [0, 0]
+        self._stored_variables = {SERIAL_VARIABLE: rail.params.serial & 0x7FFFFFFF}
+        self._power_on()
         self._locked = False
         self._commands: dict[int, Callable[[int, int, int], int]] = {
             1: lambda kind, motor, value: self._rotate(kind, motor, value),
@@ -64,11 +63,24 @@ class TmclModule:
             9: self._set_global,
             10: self._get_global,
             11: self._store_global,
-            12: self._get_global,
+            12: self._restore_global,
             13: self._search,
             14: self._set_output,
             15: self._get_input,
         }
+
+    def _power_on(self) -> None:
+        self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
+        self._variables = [self._stored_variables.get(number, 0) for number in range(USER_VARIABLES)]
+        self._outputs = [0, 0]
+
+    def reset(self) -> None:
+        """Lose all that is not in the EEPROM: counter, motion, outputs, settings and variables that were not stored."""
+        with self._lock:
+            self.rail.reset(self._clock.now())
+            self._power_on()
+            for kind, value in self._stored.items():
+                self._set_axis(kind, 0, value)
 
     def handle(self, request: bytes) -> bytes | None:
         """The reply to nine bytes, or None when they are addressed to another module."""
@@ -226,6 +238,15 @@ class TmclModule:
     def _store_global(self, kind: int, bank: int, value: int) -> int:
         if self._locked:
             raise Refused(LOCKED)
+        if bank == 2:
+            if kind >= STORED_VARIABLES:
+                raise Refused(BAD_TYPE)
+            self._stored_variables[kind] = self._variables[kind]
+        return self._get_global(kind, bank, 0)
+
+    def _restore_global(self, kind: int, bank: int, value: int) -> int:
+        if bank == 2 and kind < STORED_VARIABLES:
+            self._variables[kind] = self._stored_variables.get(kind, 0)
         return self._get_global(kind, bank, 0)
 
     # --- inputs and outputs ---

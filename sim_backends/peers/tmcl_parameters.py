@@ -57,6 +57,8 @@ GLOBALS: dict[int, tuple[int, int, int]] = {
 EEPROM_LOCK, UNLOCK, LOCK = 73, 4321, 1234
 """The global parameter that locks the EEPROM, and its two values."""
 USER_VARIABLES = 256
-"""Number of variables in bank 2."""
+"""Number of variables in bank 2, all of them in RAM and 0 at power-on but for those that were stored."""
+STORED_VARIABLES = 56
+"""The first so many of them can be stored in the EEPROM, from where they come back at power-on."""
 INPUTS = 4
 """Number of digital inputs."""

@@ -100,6 +100,12 @@ class PartContact:
         height, normals = self._surface.sample(local[:, 0], local[:, 1])
         return np.where(on_table, height, -nominal.TABLE_HEIGHT) - local[:, 2], normals
 
+    def below(self, points: Vector) -> tuple[Vector, NDArray[np.bool_]]:
+        """How deep (n,), m, world `points` (n, 3) are below the ground, and where that is the table."""
+        depth, _ = self._below(points)
+        local = _moved(points, self._surface_from_world)
+        return depth, np.abs(local[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+
     def wrench(self, world_from_flange: Pose) -> Vector:
         """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
         points = _moved(nominal.FLANGE_FINGERTIPS, world_from_flange)

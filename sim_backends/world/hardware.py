@@ -19,10 +19,11 @@ _TORQUE_PER_FORCE = 0.05
 """Noise of the measured torque, Nm, per newton of noise in the force."""
 
 
-def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
-    """The arm at rest, with its claw closed."""
+def make_arm(scene: Scene, clock: WorldClock, model: str = "UR10e") -> ArmModel:
+    """The arm of the maker's `model` at rest, with its claw closed."""
     sigma = scene.deviations
-    params = ArmParams(
+    params = ArmParams.of(
+        model,
         dh_error=scene.dh_error,
         repeatability=(sigma.arm_repeatability / math.sqrt(3.0), sigma.arm_repeatability_rotation),
         force_noise=(sigma.arm_force_noise, _TORQUE_PER_FORCE * sigma.arm_force_noise),

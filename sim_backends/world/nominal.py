@@ -45,7 +45,8 @@ LARGE_BOARD = ("marked_dots", 9, 7, 0.020)
 """Kind, columns, rows and pitch (m) of the station's board and of the deck's large board."""
 FINE_BOARD = ("marked_dots", 11, 9, 0.003)
 """Kind, columns, rows and pitch (m) of the deck's fine plate."""
-_LARGE_SIZE = (0.160, 0.120)
+LARGE_BOARD_SIZE = (0.160, 0.120)
+"""From the first dot to the last, m."""
 _FINE_SIZE = (0.030, 0.024)
 _C45 = math.sqrt(0.5)
 
@@ -54,11 +55,11 @@ TABLE_HEIGHT = 0.60
 TABLE_HALF = 0.25
 """The table reaches this far, m, along x and y around the surface's origin."""
 WORLD_FROM_PLACE = pose((0.0, 0.0, TABLE_HEIGHT), (1, 0, 0), (0, 0, 1))
-PLACE_FROM_BOARD = board_pose((0.10, 0.32, 0.12), (0, -1, 0), (_C45, 0, -_C45), _LARGE_SIZE)
+PLACE_FROM_BOARD = board_pose((0.10, 0.32, 0.12), (0, -1, 0), (_C45, 0, -_C45), LARGE_BOARD_SIZE)
 WORLD_FROM_VEHICLE_START = pose((-3.05, 0.0, 0.0), (1, 0, 0), (0, 0, 1))
 VEHICLE_FROM_BASE = pose((0.30, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
 BASE_FROM_FINE_BOARD = board_pose((-0.55, 0.25, 0.02), (1, 0, 0), (0, 0, -1), _FINE_SIZE)
-BASE_FROM_DECK_BOARD = board_pose((-0.60, -0.25, 0.02), (1, 0, 0), (0, 0, -1), _LARGE_SIZE)
+BASE_FROM_DECK_BOARD = board_pose((-0.60, -0.25, 0.02), (1, 0, 0), (0, 0, -1), LARGE_BOARD_SIZE)
 
 FLANGE_FROM_SCAN_CAMERA = pose((0.09, -0.05, 0.08), (0, 1, 0), (0, 0, 1))
 """The scan camera with the carriage at home."""

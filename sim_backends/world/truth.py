@@ -5,6 +5,7 @@ Lengths in m, angles in rad, poses as nested 4×4 lists named `a_from_b`; frames
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ def truth(world: World) -> dict[str, Any]:
             "safety": world.arm.safety.name.lower(),
             "fault": world.arm.fault_text,
         },
+        "collisions": [asdict(collision) for collision in world.collisions.found],
         "rail_moving": world.rail.velocity(t) != 0,
     }
 

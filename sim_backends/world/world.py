@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.history import SwitchHistory
+from sim_backends.models.arm import Safety
 from sim_backends.world import hardware, nominal
 from sim_backends.world.cameras import Cameras
+from sim_backends.world.collisions import ArmPoints, Collisions
 from sim_backends.world.contact import PartContact
 from sim_backends.world.scene import draw
 from sim_backends.world.surfaces import surface as named_surface
@@ -30,23 +32,27 @@ class World:
         speed: float = 1.0,
         surface: str = "pot",
         clock: WorldClock | None = None,
+        arm: str = "UR10e",
     ) -> None:
-        """Draw the world and let its clock run, at `speed` unless it is given one.
+        """Draw the world and let its clock run, at `speed` unless it is given one; `arm` is the maker's model.
 
         Raises ValueError for an unknown level or surface, or a bad number.
         """
         shape = named_surface(surface)
         self.surface = surface
+        self._solid = ArmPoints(shape.half_x, shape.half_y)
         self.scene = draw(seed, level)
         self.clock = WorldClock(speed) if clock is None else clock
-        self.arm = hardware.make_arm(self.scene, self.clock)
+        self.arm = hardware.make_arm(self.scene, self.clock, arm)
         self.rail = hardware.make_rail(self.scene, self.clock)
         self.vehicle = hardware.make_vehicle(self.scene)
         self.part = PartContact(shape, self.scene.world_from_surface, self.scene.flange_from_part)
+        self.collisions = Collisions(self.scene, self.part)
         self.laser = SwitchHistory()
         self._cameras = Cameras(self.scene, surface)
         self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
         self.vehicle.sag = self._sag
+        self.vehicle.blocked = self.collisions.blocks
         self.arm.contact = self._touch
 
     # --- where things are ---
@@ -95,9 +101,23 @@ class World:
         self.laser.record(t, bool(outputs >> nominal.LASER_OUTPUT & 1))
         self.part.set_claw(bool(outputs >> nominal.CLAW_OUTPUT & 1), world_from_flange)
         self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
+        self._meet(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
+        if np.linalg.norm(wrench[:3]) > self.arm.params.force_limit and self.arm.safety is Safety.NORMAL:
+            self.collisions.note(t, "part" if self.part.held else "claw", "ground")
         base_from_world = world_from_base[:3, :3].T
         return np.concatenate([base_from_world @ wrench[:3], base_from_world @ wrench[3:]])
+
+    def _meet(self, t: float, world_from_base: Pose) -> None:
+        """Stop the arm as its safety system does when a link or the tool meets something solid."""
+        joints = self.arm.drive.q
+        if not self.collisions.due(t, joints, world_from_base):
+            return
+        frames = self.arm.kinematics.frames(joints)
+        points = self._solid.at(frames, self.flange_from_camera("scan", t), self.part.held)
+        points = points @ world_from_base[:3, :3].T + world_from_base[:3, 3]
+        if (met := self.collisions.arm(t, points, self.vehicle.world_from_vehicle(t))) is not None:
+            self.arm.protective_stop(met)
 
     def _sag(self) -> tuple[float, float, float]:
         """Roll, pitch (rad) and height (m) of the body: it leans towards where the arm reaches out."""
