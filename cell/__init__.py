@@ -1,6 +1,7 @@
 """The cell: configuration, geometry, vision, calibration, reconstruction, inversion, motion, steps, supervisor.
 
-`from cell import Cell` is the supervisor's way in; it is imported when it is first asked for.
+`from cell import Cell` is the supervisor's way in, and `from cell import RefusedError` gets any error of the one tree
+in `drivers.errors`; both are imported when they are first asked for.
 """
 
 from __future__ import annotations
@@ -10,11 +11,44 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cell.job_run import RunOutcome as RunOutcome
     from cell.supervisor import Cell as Cell
+    from drivers.errors import (
+        Aborted,
+        CalibrationStale,
+        CellError,
+        ConfigError,
+        DeadlineError,
+        DeviceError,
+        DeviceFault,
+        InterlockError,
+        Interrupted,
+        LimitError,
+        NotConnectedError,
+        NotObservable,
+        RefusedError,
+    )
 
-__all__ = ["Cell", "RunOutcome"]
+__all__ = [
+    "Aborted",
+    "CalibrationStale",
+    "Cell",
+    "CellError",
+    "ConfigError",
+    "DeadlineError",
+    "DeviceError",
+    "DeviceFault",
+    "InterlockError",
+    "Interrupted",
+    "LimitError",
+    "NotConnectedError",
+    "NotObservable",
+    "RefusedError",
+    "RunOutcome",
+]
 
 
 def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module 'cell' has no attribute {name!r}")
     match name:
         case "Cell":
             from cell.supervisor import Cell
@@ -24,4 +58,10 @@ def __getattr__(name: str) -> object:
             from cell.job_run import RunOutcome
 
             return RunOutcome
-    raise AttributeError(f"module 'cell' has no attribute {name!r}")
+    from drivers import errors
+
+    return getattr(errors, name)
+
+
+def __dir__() -> list[str]:
+    return __all__

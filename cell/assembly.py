@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from cell.config import CameraConfig, CellConfig
 from cell.gate import Gate, GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
+from cell.geometry.poses import to_ur
+from cell.motion.kinematics import ArmKinematics
 from drivers.arm.limits import ArmLimits
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
@@ -87,8 +89,12 @@ def connect(config: CellConfig) -> Devices:
     return Devices(clock, gate, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
 
 
-def connect_arm(config: CellConfig, clock: Clock) -> GatedArm:
-    """The arm; its own process switches the laser's output off when this one dies."""
+def connect_arm(config: CellConfig, clock: Clock, control: bool = True) -> GatedArm:
+    """The arm; its own process switches the laser's output off when this one dies.
+
+    Without `control` it is only looked at: a program that runs on it runs on.
+    """
+    kinematics = ArmKinematics()
     return GatedArm(
         "arm",
         config.arm.address,
@@ -100,6 +106,8 @@ def connect_arm(config: CellConfig, clock: Clock) -> GatedArm:
         ),
         payload=(config.arm.payload, config.arm.payload_centre),
         safe_off_outputs=(config.laser.output,),
+        forward=lambda joints: to_ur(kinematics.fk(joints)),
+        control=control,
     )
 
 
@@ -149,9 +157,10 @@ def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
     problems: list[str] = []
 
     def run(what: str, action: Callable[[], None]) -> None:
+        # Whatever ends the thread: what it was to confirm is not confirmed.
         try:
             action()
-        except Exception as error:
+        except BaseException as error:
             problems.append(f"{what}: not confirmed, {error}")
 
     threads = {

@@ -23,8 +23,8 @@ from cell.geometry.poses import transform
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.planning import base_from_place_at_target, scan_plans
+from cell.report.bound import part_points
 from cell.report.calibration_pictures import camera_picture, influence_picture
-from cell.report.truth import part_points
 from cell.stored_calibration import Solved
 
 

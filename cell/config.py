@@ -11,149 +11,63 @@ import json
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self
 
-import numpy as np
-import pinocchio as pin
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, model_validator
 
-from cell.units import quantity
+from cell.addresses import Folder, Name, checked_endpoint, is_example
+from cell.device_config import (
+    ArmConfig,
+    CalibrationConfig,
+    CameraConfig,
+    ClawConfig,
+    LaserConfig,
+    RailConfig,
+    VehicleConfig,
+)
+from cell.toml_file import Table, read_toml, validate
+from cell.units import number
 from drivers.errors import ConfigError
 
-T = TypeVar("T", bound=BaseModel)
-Length = Annotated[float, quantity("mm", -20_000, 20_000)]
-Angle = Annotated[float, quantity("deg", -360, 360)]
-Mass = Annotated[float, quantity("kg", 0, 50)]
-Output = Annotated[int, Field(ge=0, le=17)]
-Sigma = Annotated[float, quantity("mm", 0, 100)]
+__all__ = [
+    "ArmConfig",
+    "CameraConfig",
+    "CellConfig",
+    "RailConfig",
+    "VehicleConfig",
+    "default_toml",
+    "find_config",
+    "load_config",
+    "validate",
+]
+
+CONFIGURATION = "cell.toml"
 
 
-class Table(BaseModel):
-    """A TOML table: frozen, and with no keys but the known ones."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Pose(Table):
-    """A pose as translation and roll-pitch-yaw about the fixed axes x, y, z (R = Rz Ry Rx)."""
-
-    translation: tuple[Length, Length, Length]
-    rotation: tuple[Angle, Angle, Angle]
-
-    def se3(self) -> pin.SE3:
-        """The pose as `pin.SE3`, m."""
-        return pin.SE3(pin.rpy.rpyToMatrix(*self.rotation), np.array(self.translation))
-
-
-class RailConfig(Table):
-    """The stepper rail, a TMCL module on a serial line."""
-
-    driver: Literal["tmcl"] = "tmcl"
-    url: str = Field(min_length=1)
-    address: Annotated[int, Field(ge=1, le=255)] = 1
-    motor: Annotated[int, Field(ge=0, le=5)] = 0
-    lead: Annotated[float, quantity("mm", 0.1, 50)]
-    steps_per_turn: Annotated[int, Field(ge=20, le=2000)]
-    microsteps: Literal[1, 2, 4, 8, 16, 32, 64, 128, 256]
-    travel: tuple[Length, Length]
-    max_speed: Annotated[float, quantity("mm/s", 0.1, 500)]
-    acceleration: Annotated[float, quantity("mm/s^2", 1, 10_000)]
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if not self.travel[0] < self.travel[1]:
-            raise ValueError(
-                f"travel {self.travel[0] * 1e3:g} to {self.travel[1] * 1e3:g} mm: the first must be smaller"
-            )
-        return self
-
-
-class ArmConfig(Table):
-    """The arm and where it stands on the vehicle."""
-
-    driver: Literal["ur"] = "ur"
-    model: Literal["UR10e"] = "UR10e"
-    address: str = Field(min_length=1)
-    max_joint_speed: Annotated[float, quantity("deg/s", 1, 120)]
-    max_joint_acceleration: Annotated[float, quantity("deg/s^2", 1, 800)]
-    max_joint_jerk: Annotated[float, quantity("deg/s^3", 10, 40_000)]
-    max_tool_speed: Annotated[float, quantity("mm/s", 1, 1500)]
-    payload: Mass
-    payload_centre: tuple[Length, Length, Length]
-    vehicle_from_base: Pose
-    settle_time: Annotated[float, quantity("s", 0, 5)]
-    repeatability: Sigma
-    repeatability_angle: Annotated[float, quantity("mrad", 0, 10)]
-    kinematic_sigma: Sigma
-    kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
-
-
-class VehicleConfig(Table):
-    """The carrier, AgileX protocol v2 on CAN."""
-
-    driver: Literal["agilex"] = "agilex"
-    interface: str = Field(min_length=1)
-    channel: str = Field(min_length=1)
-    bitrate: Annotated[float, quantity("kbit/s", 10, 1000)]
-    track: Annotated[float, quantity("mm", 100, 3000)]
-    max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]
-    max_yaw_rate: Annotated[float, quantity("deg/s", 1, 90)]
-    lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0004
-
-
-class CameraConfig(Table):
-    """A camera on the frame stream protocol, with its nominal optics and mounting."""
-
-    driver: Literal["stream"] = "stream"
-    address: str = Field(min_length=1)
-    width: Annotated[int, Field(ge=64, le=8192)]
-    height: Annotated[int, Field(ge=64, le=8192)]
-    pixel: Annotated[float, quantity("um", 0.5, 30)]
-    focal_length: Annotated[float, quantity("mm", 1, 200)]
-    flange_from_camera: Pose
-    photo_exposure: Annotated[float, quantity("ms", 0.01, 1000)]
-
-
-class LaserConfig(Table):
-    """The line laser: the arm's output that switches it, and its nominal place in the scan camera's frame."""
-
-    output: Output
-    baseline: Annotated[float, quantity("mm", 5, 500)]
-    tan_theta: Annotated[float, Field(ge=0.2, le=20)]
-
-
-class ClawConfig(Table):
-    """The claw: the arm's output that closes it and the input that shows a held part."""
-
-    output: Output
-    feedback: Annotated[int, Field(ge=0, le=17)]
-
-
-class PlateConfig(Table):
-    """A calibration board fixed on the vehicle's deck."""
-
-    board: Annotated[str, AfterValidator(lambda text: checked_board(text))]
-    base_from_board: Pose
-
-
-class CalibrationConfig(Table):
-    """How the cell calibrates itself."""
-
-    fine: PlateConfig
-    large: PlateConfig
-    max_age: Annotated[float, quantity("day", 0.01, 3650)]
-    stripe_exposure: Annotated[float, quantity("ms", 0.01, 1000)]
-    rail_sigma: Sigma
+Confirm = Literal["person", "simulated"]
+"""Who confirms what a person has to: a person, or the simulated cell itself."""
 
 
 class CellSection(Table):
     """The cell as a whole."""
 
-    name: str = Field(min_length=1, max_length=64)
-    runs: str = "runs"
-    calibrations: str = "calibrations"
-    time_scale: Annotated[float, Field(gt=0, le=100)] = 1.0
-    truth: str = ""
+    name: Annotated[str, Name]
+    runs: Annotated[str, Folder] = "runs"
+    calibrations: Annotated[str, Folder] = "calibrations"
+    time_scale: Annotated[float, number(0.01, 100)] = 1.0
+    truth: Annotated[str, AfterValidator(lambda text: text and checked_endpoint(text))] = ""
+    confirm: Confirm = "person"
+
+    @model_validator(mode="after")
+    def _real_time(self) -> Self:
+        if self.runs == self.calibrations:
+            raise ValueError(f'runs and calibrations are both "{self.runs}"; each needs a folder of its own')
+        if self.time_scale != 1.0 and not self.truth:
+            raise ValueError(
+                f"time_scale {self.time_scale:g} is only for a simulated cell, whose truth has an address; "
+                "real devices need time_scale = 1"
+            )
+        return self
 
 
 class CellConfig(Table):
@@ -170,11 +84,23 @@ class CellConfig(Table):
     calibration: CalibrationConfig
 
     @model_validator(mode="after")
-    def _distinct_outputs(self) -> Self:
+    def _distinct(self) -> Self:
         if self.laser.output == self.claw.output:
             raise ValueError(
                 f"laser.output and claw.output are both {self.laser.output}; each needs an output of its own"
             )
+        found: dict[str, str] = {}
+        for name, address in (
+            ("rail.url", self.rail.url),
+            ("arm.address", self.arm.address),
+            ("vehicle.channel", self.vehicle.channel.partition("@")[0]),
+            ("scan_camera.address", self.scan_camera.address),
+            ("target_camera.address", self.target_camera.address),
+            ("cell.truth", self.cell.truth),
+        ):
+            other = found.setdefault(address.lower(), name)
+            if address and other != name:
+                raise ValueError(f'{other} and {name} are both "{address}"; each device has an address of its own')
         return self
 
     def calibration_hash(self) -> str:
@@ -190,20 +116,34 @@ class CellConfig(Table):
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def checked_board(text: str) -> str:
-    """A board's name, once it is known to be well formed."""
-    from cell.vision.board_spec import parse_board
-
-    try:
-        parse_board(text)
-    except ConfigError as error:
-        raise ValueError(str(error)) from error
-    return text
-
-
 def default_toml() -> str:
     """Text of the configuration that ships, with the simulated cell's nominal geometry."""
     return files("cell").joinpath("defaults", "cell.toml").read_text(encoding="utf-8")
+
+
+def find_config(path: Path | None, *, simulated: bool = False) -> Path | None:
+    """The configuration's file: the one that is given, else `cell.toml` of the present folder.
+
+    Where there is neither, None (the configuration that ships) if `simulated`, that is, if no real device will be
+    asked for anything; else `ConfigError`: nothing moves at an address that nobody gave.
+    """
+    if path is not None:
+        return path
+    here = Path(CONFIGURATION)
+    if here.exists() or here.is_symlink():
+        return here
+    if simulated:
+        return None
+    raise ConfigError(
+        f"there is no {CONFIGURATION} in {Path.cwd()}, and nothing is done at an address that nobody gave: name your "
+        "configuration with -c FILE, or let `cell init` write one and put your addresses into it. `cell dry-run`, or "
+        "--sim all, simulates a cell"
+    )
+
+
+def beside(path: Path | None) -> Path:
+    """The folder of a configuration, where runs and calibrations go; without a file, the present folder."""
+    return Path.cwd() if path is None else path.resolve().parent
 
 
 def load_config(path: Path | None) -> CellConfig:
@@ -213,36 +153,49 @@ def load_config(path: Path | None) -> CellConfig:
     return validate(CellConfig, read_toml(path, "configuration", "cell init"), str(path))
 
 
-def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, Any]:
-    """Parse a TOML file; every way that this fails is a `ConfigError` that names the file."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{what} {path} does not exist; `{how_to_make}` writes one to start from") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{what} {path} cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{what} {path} is not valid TOML: {error}") from error
+def example_addresses(config: CellConfig) -> list[str]:
+    """The keys whose addresses are still those of the example, which no device has."""
+    addresses = {
+        "arm.address": config.arm.address,
+        "scan_camera.address": config.scan_camera.address,
+        "target_camera.address": config.target_camera.address,
+    }
+    return [f'{key} = "{address}"' for key, address in addresses.items() if is_example(address)]
 
 
-def validate(kind: type[T], data: dict[str, Any], where: str) -> T:
-    """Check parsed data against a record type; all problems go into one `ConfigError`, a line each."""
-    try:
-        return kind.model_validate(data)
-    except ValidationError as error:
-        lines = []
-        for problem in error.errors():
-            key = ".".join(str(part) for part in problem["loc"]) or "(whole file)"
-            lines.append(f"  {key}: {_wording(problem)}")
-        raise ConfigError(f"{where} is not valid:\n" + "\n".join(lines)) from error
+def require_real_addresses(config: CellConfig) -> None:
+    """Raise `ConfigError` when an address is still the example's: before devices are connected."""
+    if found := example_addresses(config):
+        raise ConfigError(f"{', '.join(found)}: still the example's, where no device is; write your cell's own")
 
 
-def _wording(problem: Any) -> str:
-    kind, value, context = problem["type"], problem.get("input"), problem.get("ctx", {})
-    if kind == "extra_forbidden":
-        return "unknown key; check its spelling or remove it"
-    if kind == "missing":
-        return "missing; `cell init` writes a complete file to compare with"
-    if kind == "value_error":
-        return str(context.get("error", problem["msg"]))
-    return f"{value!r} is not accepted: {problem['msg']}"
+def require_confirm(config: CellConfig) -> None:
+    """Raise `ConfigError` when a cell that is not simulated is to confirm by itself what a person has to."""
+    if config.cell.confirm == "simulated" and not config.cell.truth:
+        raise ConfigError(
+            'cell.confirm = "simulated" is only for a simulated cell (one that gives cell.truth, or --sim all): at a '
+            'real one a person looks and confirms; write confirm = "person" or leave it out'
+        )
+    if config.cell.confirm == "simulated" and not config.arm.address.startswith(("127.", "localhost")):
+        raise ConfigError(
+            f'cell.confirm = "simulated", but the arm at {config.arm.address} is not on this machine, so it '
+            'may be a real one; write confirm = "person" or leave it out'
+        )
+
+
+def config_to_open(
+    path: Path | None, *, simulated: bool, confirm: Confirm | None = None
+) -> tuple[Path | None, CellConfig]:
+    """The file (None: the one that ships) and the configuration to connect devices with, or a simulated cell.
+
+    `confirm`, if given, stands for `cell.confirm`. Raises `ConfigError` as `find_config`, `load_config`, and, where
+    devices are real, `require_real_addresses` and `require_confirm` do.
+    """
+    source = find_config(path, simulated=simulated)
+    config = load_config(source)
+    if confirm is not None:
+        config = config.model_copy(update={"cell": config.cell.model_copy(update={"confirm": confirm})})
+    if not simulated:
+        require_real_addresses(config)
+        require_confirm(config)
+    return source, config

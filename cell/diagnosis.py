@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from cell import assembly
-from cell.config import CellConfig, load_config
+from cell.config import CellConfig, config_to_open
 from cell.runs import CellLock
 from cell.simulation import SimulatedCell, with_endpoints
 from drivers.clock import Clock
-from drivers.errors import CellError
+from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
 
 PINGS = 100
@@ -62,7 +62,9 @@ class Diagnosis:
 
 def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
     """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or held cell."""
-    config = load_config(path)
+    if sim not in (None, "all"):
+        raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
+    _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
         return _diagnose(config)
     simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
@@ -75,7 +77,9 @@ def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed
 def _diagnose(config: CellConfig) -> list[Diagnosis]:
     clock = Clock(config.cell.time_scale)
     with CellLock(config):
-        rows, arm = _open_and_ask("arm", config.arm.address, partial(assembly.connect_arm, config, clock), _arm_state)
+        rows, arm = _open_and_ask(
+            "arm", config.arm.address, partial(assembly.connect_arm, config, clock, control=False), _arm_state
+        )
         scan, target = config.scan_camera, config.target_camera
         connect_camera = assembly.connect_camera
         try:
@@ -155,7 +159,10 @@ def _vehicle_state(vehicle: Vehicle) -> str:
     state = vehicle.state()
     if state.emergency_stop:
         return "emergency stop"
-    return f"{'braked' if state.braked else 'brake open'}, {state.battery_volts:.1f} V, errors {state.error_bits:#06x}"
+    # The brake's feedback is not on the bus.
+    brake = {None: "brake unknown", True: "braked", False: "brake open"}[state.braked]
+    errors = "; ".join(state.trouble) or f"errors {state.error_bits:#06x}"
+    return f"{brake}, {state.battery_volts:.1f} V, {errors}"
 
 
 def _camera_state(camera: Camera) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections import deque
 from pathlib import Path
 from types import TracebackType
 
@@ -17,6 +18,8 @@ CAPACITY = 64
 
 
 WRITE_TIMEOUT_S = 5.0
+RECENT = 12
+"""Names of a step's frames that are remembered, the newest."""
 PNG = (
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
@@ -25,22 +28,35 @@ PNG = (
 
 
 class FrameStore:
-    """Writes frames into `folder` as `<what>-<frame id>.png`, lossless."""
+    """Writes frames into `folder` as `<what>-<frame id>.png`, lossless.
+
+    `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
+    there was looking at.
+    """
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
+        self.begin()
         self._folder = folder
-        self._waiting: queue.Queue[tuple[str, Frame] | None] = queue.Queue(CAPACITY)
+        self._waiting: queue.Queue[tuple[Path, Frame] | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
         self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
         self._thread.start()
+
+    def begin(self) -> None:
+        """A step begins: what the steps before it looked at is no longer recent."""
+        self.recent: deque[str] = deque(maxlen=RECENT)
+        self.last: tuple[str, Frame] | None = None
 
     def keep(self, what: str, frame: Frame) -> None:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""
         if self._failure is not None:
             raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
+        name = f"{what}-{frame.frame_id:06d}.png"
+        self.recent.append(name)
+        self.last = what, frame
         try:
-            self._waiting.put((what, frame), timeout=WRITE_TIMEOUT_S)
+            self._waiting.put((self._folder / name, frame), timeout=WRITE_TIMEOUT_S)
         except queue.Full:
             self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
             raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
@@ -52,8 +68,7 @@ class FrameStore:
 
     def _write(self) -> None:
         while (item := self._waiting.get()) is not None:
-            what, frame = item
-            path = self._folder / f"{what}-{frame.frame_id:06d}.png"
+            path, frame = item
             try:
                 if not cv2.imwrite(str(path), frame.image, PNG):
                     self._failure = f"{path} could not be written"
@@ -69,5 +84,8 @@ class FrameStore:
         try:
             self._waiting.put(None, timeout=WRITE_TIMEOUT_S)
         except queue.Full:
+            self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
             return
         self._thread.join(2 * WRITE_TIMEOUT_S)
+        if self._thread.is_alive():
+            self._failure = f"frames were still to be written after {2 * WRITE_TIMEOUT_S:.0f} s"

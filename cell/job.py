@@ -5,19 +5,24 @@ Frames: place P (table top, z up), board D, nominal surface S, part Q. A mesh is
 
 from __future__ import annotations
 
+import re
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import pinocchio as pin
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
-from cell.config import CellConfig, Length, Pose, Table, checked_board, read_toml, validate
-from cell.units import quantity
+from cell.addresses import Name
+from cell.device_config import Exposure, Mounting, Pose, checked_board
+from cell.toml_file import Table, read_toml, validate
+from cell.units import number, quantity, shown, whole
 from drivers.errors import ConfigError
 
-RAMP_MARGIN = 0.0005
-"""What the rail's driver adds to each ramp of a sweep, m."""
+LEAST_LINES, MOST_LINES = 10, 20_000
+"""Lines of one sweep: fewer show no surface, more do not fit into memory."""
+LONGEST_SWEEP_S = 100.0
+"""The step of the laser sweep has 120 s."""
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 
@@ -25,7 +30,7 @@ Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 class JobSection(Table):
     """The job as a whole."""
 
-    name: str = Field(min_length=1, max_length=64)
+    name: Annotated[str, Name]
 
 
 class BoardSection(Table):
@@ -42,8 +47,8 @@ class ApproachSection(Table):
     staging: Pose
     target: Pose
     speed: Annotated[float, quantity("m/s", 0.02, 1.5)]
-    tolerance: Annotated[float, quantity("mm", 1, 200)]
-    tolerance_angle: Annotated[float, quantity("deg", 0.1, 10)]
+    tolerance: Annotated[float, quantity("mm", 1, 100)]
+    tolerance_angle: Annotated[float, quantity("deg", 0.3, 10)]
 
 
 class PhotoSection(Table):
@@ -52,14 +57,20 @@ class PhotoSection(Table):
     stand_off: Annotated[float, quantity("mm", 100, 5000)]
     look_down: Annotated[float, quantity("deg", 0, 90)]
     max_obliquity: Annotated[float, quantity("deg", 5, 80)]
-    max_residual: Annotated[float, Field(gt=0, le=10)]
-    count: Annotated[int, Field(ge=1, le=100)]
+    max_residual: Annotated[float, number(0.01, 10)]
+    count: Annotated[int, whole(1, 100)]
+
+
+def _checked_mesh_name(text: str) -> str:
+    if not text.strip() or not text.isprintable():
+        raise ValueError(f"{shown(text)} is no file; name an STL or PLY beside the job")
+    return text
 
 
 class SurfaceSection(Table):
     """The nominal surface that the part is placed onto, and how well the board tells where it is."""
 
-    mesh: str = Field(min_length=1)
+    mesh: Annotated[str, AfterValidator(_checked_mesh_name)]
     mesh_unit: Literal["m", "mm"]
     place_from_surface: Pose
     prior_sigma: Annotated[float, quantity("mm", 0.01, 100)]
@@ -82,17 +93,40 @@ class ScanSection(Table):
     length: Annotated[float, quantity("mm", 1, 2000)]
     speed: Speed
     frame_rate: Annotated[float, quantity("Hz", 1, 1000)]
-    exposure: Annotated[float, quantity("ms", 0.01, 1000)]
+    exposure: Exposure
     mode: Literal["rail", "arm"] = "rail"
     largest_hole: Annotated[float, quantity("mm", 0, 10)] = 0.0015
     swath: Annotated[tuple[SwathSection, ...], Field(min_length=1, max_length=20)] = (SwathSection(),)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.exposure * self.frame_rate > 1.0:
+            raise ValueError(
+                f"exposure {1e3 * self.exposure:g} ms is longer than a frame at {self.frame_rate:g} Hz (allowed: at "
+                f"most {1e3 / self.frame_rate:.4g} ms); shorten it or lower frame_rate"
+            )
+        lines = self.length * self.frame_rate / self.speed
+        if not LEAST_LINES <= lines <= MOST_LINES:
+            raise ValueError(
+                f"length, speed and frame_rate make {lines:.0f} lines (allowed: {LEAST_LINES} to {MOST_LINES}); "
+                "change speed or frame_rate"
+            )
+        if (time := len(self.swath) * self.length / self.speed) > LONGEST_SWEEP_S:
+            raise ValueError(
+                f"{len(self.swath)} sweeps of {1e3 * self.length:g} mm at {1e3 * self.speed:g} mm/s take {time:.0f} s "
+                f"(allowed: at most {LONGEST_SWEEP_S:.0f} s); raise speed or take fewer"
+            )
+        return self
+
+
+Edge = Annotated[float, quantity("mm", 1, 1_000)]
 
 
 class GraspSection(Table):
     """How the claw holds the part."""
 
-    flange_from_part: Pose
-    size: tuple[Length, Length, Length]
+    flange_from_part: Mounting
+    size: tuple[Edge, Edge, Edge]
 
 
 class PlaceSection(Table):
@@ -104,8 +138,22 @@ class PlaceSection(Table):
     contact_speed: Annotated[float, quantity("mm/s", 0.1, 50)]
     contact_force: Annotated[float, quantity("N", 2, 120)]
     contact_travel: Annotated[float, quantity("mm", 0.1, 10)]
-    tolerance: Annotated[float, quantity("mm", 0.01, 50)]
-    tolerance_angle: Annotated[float, quantity("mrad", 0.1, 200)]
+    tolerance: Annotated[float, quantity("mm", 0.01, 10)]
+    tolerance_angle: Annotated[float, quantity("mrad", 0.1, 100)]
+
+    @model_validator(mode="after")
+    def _descends(self) -> Self:
+        if not self.approach > self.contact_travel:
+            raise ValueError(
+                f"approach {1e3 * self.approach:g} mm is not above contact_travel {1e3 * self.contact_travel:g} mm, "
+                "where contact is looked for; raise approach"
+            )
+        if self.contact_speed > self.speed:
+            raise ValueError(
+                f"contact_speed {1e3 * self.contact_speed:g} mm/s exceeds speed {1e3 * self.speed:g} mm/s; the part is "
+                "set down slower than it is brought"
+            )
+        return self
 
 
 class Job(Table):
@@ -132,13 +180,21 @@ def shipped_jobs() -> list[str]:
 
 
 def job_path(name: str | Path) -> Path:
-    """The file of a job: a path, or the name of a job that ships."""
+    """The file of a job: a path, or a name: `NAME.toml` of the present folder, else the job of that name that ships.
+
+    So the `pot.toml` that `cell init` wrote is the job `pot` in its folder.
+    """
     path = Path(name)
-    if path.suffix == ".toml" or path.exists():
+    if path.suffix == ".toml" or path.is_file():
         return path
+    if re.fullmatch(r"[\w.+-]+", str(name)) and Path(f"{name}.toml").is_file():
+        return Path(f"{name}.toml")
     if str(name) in shipped_jobs():
         return _job_folder() / f"{name}.toml"
-    raise ConfigError(f"job {name} is neither a file nor one that ships ({', '.join(shipped_jobs())})")
+    raise ConfigError(
+        f"job {shown(str(name))} is neither a file, nor {shown(f'{name}.toml')} in the present folder, nor one that "
+        f"ships ({', '.join(shipped_jobs())})"
+    )
 
 
 def load_job(name: str | Path) -> tuple[Job, Path]:
@@ -151,28 +207,6 @@ def load_job(name: str | Path) -> tuple[Job, Path]:
             f"{path}: surface.mesh {job.surface.mesh!r} is not a file (looked for {mesh}); name an STL or PLY"
         )
     return job, mesh
-
-
-def require_fit(job: Job, config: CellConfig) -> None:
-    """Raise `ConfigError` when the job asks for more than the cell's devices may do; nothing has moved yet."""
-    rail = config.rail
-    ramps = job.scan.speed**2 / rail.acceleration + 2 * RAMP_MARGIN
-    room = rail.travel[1] - rail.travel[0]
-    problems = []
-    if job.scan.mode == "rail" and job.scan.length + ramps > room:
-        problems.append(
-            f"scan.length {1e3 * job.scan.length:g} mm and its ramps of {1e3 * ramps:.2f} mm exceed rail.travel, "
-            f"{1e3 * room:g} mm"
-        )
-    for name, asked, allowed, limit in (
-        ("scan.speed", job.scan.speed, rail.max_speed, "rail.max_speed"),
-        ("approach.speed", job.approach.speed, config.vehicle.max_speed, "vehicle.max_speed"),
-        ("place.speed", job.place.speed, config.arm.max_tool_speed, "arm.max_tool_speed"),
-    ):
-        if asked > allowed:
-            problems.append(f"{name} {1e3 * asked:g} mm/s exceeds {limit}, {1e3 * allowed:g} mm/s")
-    if problems:
-        raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 
 
 def _job_folder() -> Path:

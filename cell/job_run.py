@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import sys
+import logging
+import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from cell.assembly import Devices
 from cell.config import CellConfig
 from cell.frames import FrameStore
-from cell.guard import stop_not_confirmed
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.logs import run_log
+from cell.report.figures import told
+from cell.report.html import table
 from cell.report.report import make_report
 from cell.report.truth import Witness
+from cell.run import Run
 from cell.runs import new_run, write_json
-from cell.steps.approach import Odometry
 from cell.steps.stored_sweep import StoredSweep
+from cell.steps.whereabouts import Whereabouts
+from cell.stopping import require_healthy, stop_cell
 from cell.stored_calibration import CellCalibration, save_calibration
 from cell.work import JobWork
 from drivers.errors import (
@@ -27,19 +32,22 @@ from drivers.errors import (
     CalibrationStale,
     CellError,
     ConfigError,
-    DeadlineError,
     DeviceError,
     DeviceFault,
     RefusedError,
 )
-from drivers.interfaces import ArmSafety
+from statemachine.cancel import CancelToken
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy
 from statemachine.runner import Event, Runner
 from statemachine.sequence import Sequence
-from statemachine.watch import SignalWatch
 
 Observer = Callable[[Event], None]
+
+CONFIRMED_BY_A_PERSON = frozenset(("arm.protective_stop",))
+"""Faults that no program may clear by itself: the maker asks that a person looks at the arm first."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,45 +65,54 @@ class RunOutcome:
         """0 placed, 130 interrupted, 1 otherwise."""
         return 0 if self.outcome == "placed" else 130 if self.interrupted else 1
 
+    def __str__(self) -> str:
+        return f"{self.outcome}: {self.reason}"
+
+    def __repr__(self) -> str:
+        return f"<RunOutcome {self.outcome}, run {self.folder.name}>"
+
+    def _repr_html_(self) -> str:
+        measured = ((str(row["name"]), told(row)) for row in self.report.get("measured") or ())
+        return table(f"{self.outcome}: run {self.folder.name}", [("reason", self.reason), *measured])
+
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
     """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report.
 
-    `earlier` is the sweep of a run that this one resumes.
+    `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
+    faults or look at the truth. `earlier` is the sweep of a run that this one resumes.
     """
 
+    run: Run[Any]
     config: CellConfig
     devices: Devices
     job: Job
     nominal: NominalSurface
     calibration: CellCalibration
     info: Mapping[str, Any]
-    observer: Observer | None = None
+    inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
 
-    def perform(self, root: Path, odometry: Odometry | None) -> tuple[RunOutcome, Odometry | None]:
-        """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there.
+    def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
+        """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
+        try:
+            folder = new_run(root)
+            self._keep_inputs(folder)
+            journal = Journal(folder, folder.name, self._facts())
+        except (OSError, JournalError) as error:
+            raise CellError(f"no run can be recorded in {root}: {error}") from error
+        self.run.folder = folder
+        try:
+            with run_log(folder):
+                return self._recorded(folder, journal, whereabouts)
+        finally:
+            journal.close()
 
-        `odometry` is where earlier runs left the vehicle; where this one leaves it is returned with the outcome.
-        """
-        with SignalWatch() as signals:
-            try:
-                folder = new_run(root)
-                self._keep_inputs(folder)
-                journal = Journal(folder, folder.name, self._facts())
-            except (OSError, JournalError) as error:
-                raise CellError(f"no run can be recorded in {root}: {error}") from error
-            try:
-                return self._recorded(folder, journal, odometry, signals)
-            finally:
-                journal.close()
-
-    def _recorded(
-        self, folder: Path, journal: Journal, odometry: Odometry | None, signals: SignalWatch
-    ) -> tuple[RunOutcome, Odometry | None]:
+    def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
         started = time.time()
         witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
+        observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames") as frames:
             work = JobWork(
                 self.config,
@@ -105,25 +122,36 @@ class JobRun:
                 self.devices,
                 frames,
                 folder,
-                odometry,
+                whereabouts,
                 self.earlier,
             )
             runner = Runner(
-                Sequence(), work.steps(), Policy(), journal, self.devices.clock, classify,
-                lambda reason: stop_cell(self.devices), both(self.observer, witness), self._recover, self._health,
-            )  # fmt: skip
-            if signals.reason is not None:
-                runner.abort(signals.reason)
+                sequence=Sequence(),
+                steps=work.steps(),
+                policy=replace(Policy(), simulated_person=self.config.cell.confirm == "simulated"),
+                journal=journal,
+                clock=self.devices.clock,
+                classify=classify,
+                safe_stop=lambda reason: stop_cell(self.devices),
+                observer=each_of(observers),
+                recover=self._recover,
+                health=lambda: require_healthy(self.devices),
+                control=self.run.control,
+            )
             result = runner.run()
+        if result.outcome is not Outcome.PLACED:
+            result = replace(result, reason=work.part.told(result.reason))
+        facts = {**self._facts(), "part": work.part.state.value}
         report = make_report(
-            folder, self.config, self.job, self.nominal, work.repeatability, result, self._facts(), started, witness,
-            frames.failure,
+            folder, self.config, self.job, self.nominal, work.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
-        interrupted = result.signal is not None or signals.reason is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted), work.odometry
+        interrupted = self.run.control.signal is not None
+        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
 
     def _facts(self) -> dict[str, Any]:
         return {
+            "kind": "job",
+            "pid": os.getpid(),
             "cell": self.config.cell.name,
             "job": self.job.job.name,
             **self.info,
@@ -138,72 +166,49 @@ class JobRun:
         write_json(folder / "job.json", self.job.model_dump(mode="json"))
         save_calibration(self.calibration, folder / "calibration.json")
 
-    def _health(self) -> None:
-        """Raise when a safety system has stopped the arm or the vehicle, whichever device is being waited for.
-
-        A reading that is too old says nothing here: the next command to that device finds a silent link.
-        """
-        try:
-            safety = self.devices.arm.state().safety
-            if safety is not ArmSafety.NORMAL:
-                raise DeviceFault(
-                    "arm",
-                    f"arm.{safety.name.lower()}",
-                    f"the arm is in {safety.value}",
-                    recoverable=safety is ArmSafety.PROTECTIVE_STOP,
-                    hint="Look for the reason and clear the way.",
-                )
-            if self.devices.vehicle.state().emergency_stop:
-                raise DeviceFault(
-                    "vehicle",
-                    "vehicle.emergency_stop",
-                    "the vehicle's emergency stop is pressed",
-                    recoverable=False,
-                    hint="Release it when it is safe, then run the job again.",
-                )
-        except DeadlineError:
-            return
-
-    def _recover(self, error: BaseException) -> None:
+    def _recover(self, error: BaseException, token: CancelToken, confirmed: bool) -> None:
         """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
+        self.devices.gate.enter(token)
+        token.check()
         if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-            self.devices.arm.recover()
+            arm = self.devices.arm
+            self.devices.gate.begin(lambda: arm.recover(confirmed=confirmed), arm.stop)
         elif isinstance(error, DeviceError) and error.device == "vehicle":
-            self.devices.gate.enter()
-            self.devices.vehicle.enable()
-            self.devices.vehicle.brake()
+            self.devices.vehicle.recover()
 
 
-def stop_cell(devices: Devices) -> None:
-    """Bring every device to rest; raises `DeviceFault` that lists what could not be confirmed."""
-    if problems := devices.stop():
-        raise stop_not_confirmed("; ".join(problems))
-
-
-def both(first: Observer | None, second: Observer | None) -> Observer:
-    """One observer that tells two."""
-    observers = [observer for observer in (first, second) if observer is not None]
+def each_of(observers: tuple[Observer, ...]) -> Observer:
+    """One observer that tells all; one that fails is told nothing more and keeps no other from listening."""
+    listening = list(observers)
 
     def tell(event: Event) -> None:
-        for observer in list(observers):
+        for observer in list(listening):
             try:
                 observer(event)
-            except Exception as error:  # one who cannot listen any more must not keep the other from listening
-                observers.remove(observer)
-                print(f"an observer of the run failed and is told nothing more: {error}", file=sys.stderr)
+            except Exception as error:
+                listening.remove(observer)
+                log.warning("an observer of the run failed and is told nothing more: %s", error)
 
     return tell
 
 
 def classify(error: BaseException) -> Failure:
-    """What a step's exception means for the run."""
+    """What a step's exception means for the run; what failed besides, as it was ended, is told after it."""
+    failure = _classify(error)
+    if notes := getattr(error, "__notes__", ()):
+        return replace(failure, reason="; ".join([failure.reason, *notes]))
+    return failure
+
+
+def _classify(error: BaseException) -> Failure:
     match error:
         case RefusedError() | CalibrationStale() | ConfigError():
             return Failure(Outcome.REFUSED, str(error), type(error).__name__)
         case Aborted():
             return Failure(Outcome.ABORTED, str(error), "aborted")
         case DeviceFault():
-            return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable)
+            person = error.code in CONFIRMED_BY_A_PERSON
+            return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable, person)
         case CellError():
             return Failure(Outcome.FAULTED, str(error), type(error).__name__)
     return Failure(Outcome.FAULTED, f"unexpected {type(error).__name__}: {error}", "internal")

@@ -12,7 +12,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur
-from cell.steps.approach import Odometry, Planar, drive_line, turn_to
+from cell.recorded_work import Hands
+from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
 from cell.units import parse_quantity
 from drivers.errors import ConfigError, LimitError
 
@@ -62,25 +63,27 @@ def _amount(text: str, unit: str) -> float:
 def jog(cell: Cell, wish: Jog) -> dict[str, str]:
     """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell."""
 
-    def work(check: Callable[[], None]) -> dict[str, str]:
+    def work(hands: Hands) -> dict[str, str]:
         match wish.device:
             case "rail":
                 return _jog_rail(cell, wish)
             case "arm":
                 return _jog_arm(cell, wish)
             case _:
-                return _jog_vehicle(cell, wish, check)
+                return _jog_vehicle(cell, wish, hands.check)
 
-    return cell.guarded(f"jog {wish.device}", work)
+    return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()})
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
     rail = cell.devices.rail
-    if not rail.state().homed:
+    here = rail.state()
+    said = {} if here.homed else {"homing": "the rail was not homed: searched its switch first"}
+    if not here.homed:
         rail.home().wait(60.0)
-    start = rail.state().position
-    rail.move_to(start + wish.amount).wait(60.0)
-    return {"rail": f"{1e3 * start:.3f} mm → {1e3 * rail.state().position:.3f} mm"}
+        here = rail.state()
+    rail.move_to(here.position + wish.amount).wait(60.0)
+    return {**said, "rail": f"{1e3 * here.position:.3f} mm → {1e3 * rail.state().position:.3f} mm"}
 
 
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
@@ -116,7 +119,7 @@ def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
 def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, str]:
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
     vehicle.enable()
-    odometry = Odometry(vehicle, Planar(0.0, 0.0, 0.0))
+    odometry = RelativeOdometry(vehicle)
     try:
         if wish.axis == "yaw":
             turn_to(vehicle, odometry, wish.amount, clock, check)

@@ -27,13 +27,19 @@ class UnfinishedRun:
     def find(cls, folder: Path) -> UnfinishedRun:
         """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now."""
         try:
-            run = read(folder).run
+            record = read(folder)
         except JournalError as error:
             raise ConfigError(f"{folder} cannot be resumed: {error}") from error
+        run = record.run
         if run.outcome in ("placed", "refused"):
             raise ConfigError(
                 f"run {folder.name} has ended {run.outcome} ({run.reason}); only a run that was aborted, faulted or "
                 "cut short can be resumed. Run its job again"
+            )
+        if any(event.kind == "note" and event.data.get("part") == "released" for event in record.events):
+            raise ConfigError(
+                f"run {folder.name} had put its part down already, only the retreat failed: there is nothing to "
+                "resume. Look at the part, fold the arm with `cell home`, then run the job with the next part"
             )
         if "job_file" not in run.info:
             raise ConfigError(f"run {folder.name} does not say which file its job was; run the job again")
@@ -59,10 +65,12 @@ class UnfinishedRun:
         return stored, f"the sweep of run {self.folder.name} is used if the board has not moved"
 
 
-def job_source(name: str | Path) -> dict[str, str]:
-    """For the journal: the job's file and its hash."""
+def job_source(name: str | Path) -> dict[str, object]:
+    """For journal and report: the job's file and its hash, and the file and the hash of its mesh alone."""
     path = str(job_path(name).resolve())
-    return {"job_file": path, "job_hash": job_hash(path)}
+    _, mesh = load_job(path)
+    shape = {"file": str(mesh.resolve()), "sha256": hashlib.sha256(mesh.read_bytes()).hexdigest()}
+    return {"job_file": path, "job_hash": job_hash(path), "mesh": shape}
 
 
 def job_hash(name: str | Path) -> str:

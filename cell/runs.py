@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
+import hashlib
 import json
 import os
 import re
 import secrets
+import socket
+import struct
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from cell.config import CellConfig
-from drivers.errors import ConfigError, InterlockError
-from statemachine.journal import JournalError, read
+from drivers.errors import CellError, ConfigError, InterlockError
+from statemachine.journal import JournalError, Record, read
 
 REPORT = "report.json"
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
@@ -39,42 +42,175 @@ def list_runs(root: Path) -> list[Path]:
     return sorted(entry for entry in root.iterdir() if entry.is_dir() and _NAME.fullmatch(entry.name))
 
 
-def find_run(root: Path, name: str | None) -> Path:
-    """A run by its folder, its name or its id; without a name the newest. Raises `ConfigError`."""
+def find_run(root: Path, name: str | None, kind: str | None = None) -> Path:
+    """A run by its folder, name or id; without a name the newest, of one kind if given. Raises `ConfigError`."""
     if name is not None and (Path(name) / "journal.sqlite").exists():
         return Path(name)
     runs = list_runs(root)
-    matching = runs[-1:] if name is None else [run for run in runs if run.name == name or run.name.endswith(f"-{name}")]
+    if name is None:
+        matching = [run for run in runs if kind is None or _info(run).get("kind", "job") == kind][-1:]
+    else:
+        matching = [run for run in runs if run.name == name or run.name.endswith(f"-{name}")]
     if not matching:
-        wanted = "no run at all" if name is None else f"no run {name}"
+        wanted = f"no {kind or 'run'} at all" if name is None else f"no run {name}"
         raise ConfigError(f"{wanted} in {root}; `cell runs` lists them")
     return matching[-1]
 
 
+def find_going(root: Path, name: str | None) -> Path:
+    """The run that is going on below `root`, by name or the only one; `ConfigError` that says what there is instead."""
+    if name is not None:
+        folder = find_run(root, name)
+        if not is_going(folder):
+            raise ConfigError(f"run {folder.name} has ended already, or its process died; nothing is going on there")
+        return folder
+    going = [folder for folder in list_runs(root) if is_going(folder)]
+    if len(going) == 1:
+        return going[0]
+    if going:
+        listed = ", ".join(f"{folder.name} ({_info(folder).get('kind', 'job')})" for folder in going)
+        raise ConfigError(f"more than one is going on in {root}: {listed}; name the one that you mean")
+    raise ConfigError(
+        f"nothing is going on in {root}: no run, calibration, verification, homing or jog. Run this in the folder of "
+        "the cell that moves, or name its configuration with -c; `cell runs` lists what was run"
+    )
+
+
+def is_going(folder: Path) -> bool:
+    """Whether a run has not ended and its process lives."""
+    try:
+        run = read(folder).run
+    except (JournalError, ValueError, TypeError):
+        return False
+    return run.ended is None and _lives(run.info.get("pid"), run.started)
+
+
+def _lives(pid: object, since: float) -> bool:
+    """Whether the process `pid` lives and is the one that did at `since`, seconds since the epoch."""
+    if not isinstance(pid, int):
+        return False
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ticks = float(words[19]) / os.sysconf("SC_CLK_TCK")
+        begun = time.time() - float(Path("/proc/uptime").read_text().split()[0]) + ticks
+    except (OSError, ValueError, IndexError):
+        return False
+    return words[0] != "Z" and begun < since + 1.0
+
+
+def awaited_word(folder: Path) -> str | None:
+    """What a person has to confirm before the run in `folder` goes on; None when it waits for nobody."""
+    try:
+        return _awaited(read(folder))
+    except JournalError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _awaited(record: Record) -> str | None:
+    kinds = ("confirm_needed", "confirmed", "state")
+    last = next((event for event in reversed(record.events) if event.kind in kinds), None)
+    return str(last.data["reason"]) if last is not None and last.kind == "confirm_needed" else None
+
+
+def _info(folder: Path) -> dict[str, Any]:
+    try:
+        return read(folder).run.info
+    except (JournalError, ValueError, TypeError):
+        return {}
+
+
 def read_report(folder: Path) -> dict[str, Any]:
-    """The report of a run; for a run that has none yet, what the journal tells."""
+    """The report of a run; for a run that has none yet, what the journal tells.
+
+    Raises `CellError` for a report or a journal that cannot be read, `ConfigError` where there is neither.
+    """
     path = folder / REPORT
-    if path.exists():
-        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return report
+    if not path.exists():
+        return _from_journal(folder)
+    try:
+        report: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise CellError(
+            f"{path} cannot be read ({error}): it was cut off or is none of ours; what else is left of the run lies "
+            "beside it"
+        ) from error
+    if not isinstance(report, dict) or not isinstance(report.get("outcome"), str) or not all(
+        _rows(report.get(key)) for key in ("steps", "measured", "faults")
+    ):  # fmt: skip
+        raise CellError(f"{path} is not the report of a run: it does not tell an outcome, or not as a report does")
+    return report
+
+
+def _rows(value: object) -> bool:
+    return value is None or (isinstance(value, list) and all(isinstance(row, dict) for row in value))
+
+
+def _from_journal(folder: Path) -> dict[str, Any]:
     try:
         record = read(folder)
     except JournalError as error:
-        raise ConfigError(f"{folder} holds neither a report nor a journal: {error}") from error
+        raise ConfigError(f"{folder} holds neither a report nor a journal that can be read: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise CellError(f"{folder} holds a journal that is none of ours: {error}") from error
+    run = record.run
+    waits = _awaited(record)
+    going = "the run is still going on, or its process died" if waits is None else f"waits for a person: {waits}"
+    steps: dict[str, dict[str, Any]] = {}
+    for row in record.steps:
+        before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
+        steps[row.name] = {
+            "name": row.name,
+            "state": row.state,
+            "duration_s": before["duration_s"] + (row.duration_s or 0.0),
+            "wall_s": before["wall_s"] + max(0.0, (row.ended or row.started) - row.started),
+            "retries": before["retries"] + 1,
+        }
     return {
-        "outcome": record.run.outcome or "not ended",
-        "reason": record.run.reason or "the run is still going on, or its process died",
-        "steps": [{"name": step.name, "state": step.state, "duration_s": step.duration_s} for step in record.steps],
-        **record.run.info,
+        "run": folder.name,
+        "kind": "job",
+        "outcome": run.outcome or "not ended",
+        "reason": run.reason or going,
+        "started": when(run.started),
+        "ended": None if run.ended is None else when(run.ended),
+        "wall_s": None if run.ended is None else round(run.ended - run.started, 2),
+        "steps": list(steps.values()),
+        **run.info,
     }
 
 
+def run_row(folder: Path) -> dict[str, Any]:
+    """A run in a few facts, for a list; one that cannot be read has the outcome "unreadable" and says why."""
+    try:
+        report = read_report(folder)
+    except (CellError, OSError) as error:
+        report = {"outcome": "unreadable", "reason": str(error)}
+    keys = ("outcome", "job", "seed", "level", "reason", "started")
+    kind = report.get("kind", "job") if report["outcome"] != "unreadable" else None
+    return {
+        "run": folder.name,
+        **{key: report.get(key) for key in keys},
+        "kind": kind,
+        "duration_s": report.get("wall_s"),
+    }
+
+
+def when(seconds: float) -> str:
+    """A time since the epoch as ISO 8601, local, with its offset."""
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(seconds))
+
+
 def write_json(path: Path, data: Any) -> None:
-    """Write JSON so that a reader finds the old file or the new one, never half of one."""
+    """Write strict JSON so that a reader finds the old file or the new one, never half of one.
+
+    Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
+    """
+    try:
+        text = json.dumps(data, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise CellError(f"{path} is not written: {error}; one of its figures is no number") from error
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        json.dump(data, file, indent=2)
-        file.write("\n")
+        file.write(f"{text}\n")
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
@@ -83,44 +219,64 @@ def write_json(path: Path, data: Any) -> None:
 class CellLock:
     """Held by the process that has the cell's devices open; the kernel drops it when that process ends.
 
-    Two cells are told apart by their devices' addresses, so a run against one cell does not block another.
+    Each device's address is held by itself, whoever the users are, so that neither two cells nor two configurations
+    share a device. A name in the kernel's abstract socket space has no owner, no rights and nothing to clean up.
     """
 
     def __init__(self, config: CellConfig) -> None:
-        name = re.sub(r"[^A-Za-z0-9]+", "-", f"{config.arm.address}-{config.rail.url}")
-        folder = Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp"))
-        self.path = folder / f"cell-{os.getuid()}-{name}.lock"
         self._name = config.cell.name
-        self._file = -1
+        self._addresses = {
+            "arm": config.arm.address,
+            "rail": _real(config.rail.url),
+            "vehicle": f"{config.vehicle.interface}:{_real(config.vehicle.channel)}",
+            "scan_camera": config.scan_camera.address,
+            "target_camera": config.target_camera.address,
+        }
+        self._held: list[socket.socket] = []
 
     def __enter__(self) -> CellLock:
-        while True:
-            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+        for device, address in self._addresses.items():
+            name = "\0assembly-cell." + hashlib.sha256(f"{device} {address}".encode()).hexdigest()
+            held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                holder = os.pread(self._file, 64, 0).decode(errors="replace").strip() or "unknown"
-                os.close(self._file)
+                held.bind(name)
+                held.listen(8)
+            except OSError as error:
+                held.close()
+                self.__exit__(None, None, None)
+                if error.errno != errno.EADDRINUSE:
+                    raise
                 raise InterlockError(
-                    self._name, f"the cell is held by process {holder}; wait for its end, or end it with `cell abort`"
+                    self._name,
+                    f"the {device} at {address} is held by {_holder(name)}; wait for its end. `cell abort` ends a run, "
+                    "a calibration, a verification, a homing or a jog; anything else is ended in its own shell",
                 ) from None
-            if self._is_current():
-                break
-            os.close(self._file)  # the holder before removed the file after it was opened here
-        os.ftruncate(self._file, 0)
-        os.pwrite(self._file, str(os.getpid()).encode(), 0)
+            self._held.append(held)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._file >= 0:
-            self.path.unlink(missing_ok=True)
-            os.close(self._file)
-            self._file = -1
+        while self._held:
+            self._held.pop().close()
 
-    def _is_current(self) -> bool:
+
+def _real(address: str) -> str:
+    """A device file by the name of what it is, whichever link to it the configuration names."""
+    return os.path.realpath(address) if address.startswith("/") else address
+
+
+def _holder(name: str) -> str:
+    """The process that listens at an abstract socket name, in words."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+        link.settimeout(1.0)
         try:
-            return os.path.samestat(os.fstat(self._file), self.path.stat())
-        except FileNotFoundError:
-            return False
+            link.connect(name)
+            pid = struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        except (BlockingIOError, TimeoutError):
+            return "another process"
+        except OSError:
+            return "a process that has just ended"
+    command = " ".join(word.decode(errors="replace") for word in words if word)
+    return f"process {pid} ({command[-80:].strip()})" if command else f"process {pid}"

@@ -24,6 +24,7 @@ from cell.calibration.joint import Joint
 from cell.calibration.results import Quality, adjust_scan, adjust_target, sigmas
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
+from cell.report.html import table
 from cell.runs import write_json
 from drivers.errors import CalibrationStale
 
@@ -53,6 +54,19 @@ class CellCalibration:
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
         return solve_observations(gathered(scan, target, identities, config)).calibration
+
+    def __str__(self) -> str:
+        return f"calibration of {self.date}, hash {self.hash()}"
+
+    def __repr__(self) -> str:
+        return f"<CellCalibration of {self.date}, hash {self.hash()}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(device, serial) for device, serial in sorted(self.identities.items())]
+        for name, quality in (("scan head", self.scan.quality), ("target camera", self.target.quality)):
+            fit = f"χ²/dof {quality.chi2_per_dof:.3f}, {quality.views} views, dots {quality.dots_rms_px:.4f} px RMS"
+            rows.append((name, fit))
+        return table(f"calibration of {self.date}", [*rows, ("hash", self.hash())])
 
     @property
     def date(self) -> str:
@@ -192,6 +206,10 @@ def read_calibration(path: Path) -> CellCalibration:
         raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
 
 
+CLOCK_SLACK_S = 3600.0
+"""How far a calibration's date may lie in the future: clocks of two machines differ."""
+
+
 def find_calibration(folder: Path, identities: dict[str, str], configuration: str, max_age: float) -> CellCalibration:
     """The stored calibration of these devices under this configuration, not older than `max_age` s.
 
@@ -223,6 +241,11 @@ def find_calibration(folder: Path, identities: dict[str, str], configuration: st
         raise CalibrationStale(
             f"the calibration of {newest.date} is {age / 86400:.1f} days old, allowed are {max_age / 86400:.1f}; run "
             "`cell calibrate`"
+        )
+    if age < -CLOCK_SLACK_S:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} lies {-age / 3600:.1f} hours in the future, so its age is not known; "
+            "set this machine's clock, or run `cell calibrate`"
         )
     return newest
 

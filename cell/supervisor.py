@@ -2,32 +2,42 @@
 
 with Cell.open("cell.toml", sim="all", seed=7) as cell:
     result = cell.run(job="pot")
+
+    run = cell.start(job="pot")  # or hold it while it goes on
+    run.pause()
+    run.go_on()
+    result = run.result()
 """
 
 from __future__ import annotations
 
-import sys
+import logging
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
 from cell.assembly import Devices, connect
 from cell.calibration.archive import Observations
-from cell.config import CellConfig, load_config
-from cell.guard import guarded
+from cell.config import CellConfig, Confirm, beside, config_to_open
+from cell.fit import require_fit
 from cell.injection import Injection, Injector
 from cell.inversion import NominalSurface
-from cell.job import Job, load_job, require_fit
-from cell.job_run import JobRun, Observer, RunOutcome, both, stop_cell
+from cell.job import Job, load_job
+from cell.job_run import JobRun, Observer, RunOutcome
+from cell.recorded_work import Hands, RecordedWork
 from cell.resumption import UnfinishedRun, job_source
+from cell.run import Run
 from cell.runs import CellLock, find_run
 from cell.simulation import SimulatedCell, with_endpoints
-from cell.steps.approach import Odometry
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.moves import HOME, Mover
 from cell.steps.verification import Verification
 from cell.steps.verify import collect_verification
+from cell.steps.whereabouts import Whereabouts
+from cell.stopping import require_healthy, require_no_emergency_stop, stop_cell
 from cell.stored_calibration import (
     CellCalibration,
     find_calibration,
@@ -35,18 +45,27 @@ from cell.stored_calibration import (
     save_with_observations,
     solve_observations,
 )
-from drivers.errors import CalibrationStale, ConfigError
+from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
-from statemachine.watch import SignalWatch
+from statemachine.watch import EndSignals, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
 
+CLOSE_WAIT_S = 20.0
+"""Wall seconds that a run has to end when the cell is closed."""
+
 Made = TypeVar("Made")
+
+log = logging.getLogger(__name__)
 
 
 class Cell:
-    """One cell, held by this process until `close()`. Its methods are called by one thread; `stop()` by any."""
+    """One cell, held by this process until `close()`. One run at a time; `stop()` and `close()` end it.
+
+    Its methods are called by one thread, `stop()`, `close()` and those of a run's handle by any. While it is open
+    SIGTERM and SIGHUP end the program as Ctrl-C does: through the safe stop.
+    """
 
     def __init__(
         self, config: CellConfig, folder: Path, lock: CellLock, devices: Devices, simulated: SimulatedCell | None
@@ -56,8 +75,15 @@ class Cell:
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
-        self._odometry: Odometry | None = None
+        self.whereabouts = Whereabouts(devices.vehicle)
+        if simulated is not None:
+            # The world that this process has just started puts the vehicle there.
+            self.whereabouts.say_at_start()
+        self._beginning = threading.Lock()
+        self._run: Run[Any] | None = None
+        self._stops = 0
         self._closed = False
+        self._signals = EndSignals()
 
     @classmethod
     def open(
@@ -69,10 +95,13 @@ class Cell:
         level: str = "nominal",
         speed: float = SIM_SPEED,
         surface: str = "pot",
+        confirm: Confirm | None = None,
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
 
-        Without `config` the configuration that ships is used, and runs and calibrations go below the present folder.
+        Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
+        with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
+        `confirm`, if given, stands for `cell.confirm`: "simulated" only for a simulated cell.
         Raises `ConfigError` before anything is started, `InterlockError` when another process holds the cell,
         `NotConnectedError` or `DeviceFault` that names the device that does not answer.
         """
@@ -80,25 +109,23 @@ class Cell:
             raise ConfigError(
                 f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices'
             )
-        path = None if config is None else Path(config)
-        loaded = load_config(path)
-        folder = Path.cwd() if path is None else path.resolve().parent
-        simulated = None
-        if sim == "all":
-            simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface=surface)
-            loaded = with_endpoints(loaded, simulated.endpoints)
-        try:
-            lock = CellLock(loaded)
-            lock.__enter__()
-            try:
-                return cls(loaded, folder, lock, connect(loaded), simulated)
-            except BaseException:
-                lock.__exit__(None, None, None)
-                raise
-        except BaseException:
-            if simulated is not None:
-                simulated.close()
-            raise
+        path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
+        folder = beside(path)
+        with EndSignals(), ExitStack() as opened:
+            if sim == "all":
+                simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface=surface)
+                opened.callback(simulated.close)
+                loaded = with_endpoints(loaded, simulated.endpoints)
+            else:
+                simulated = None
+            lock = opened.enter_context(CellLock(loaded))
+            devices = connect(loaded)
+            opened.callback(devices.close)
+            cell = cls(loaded, folder, lock, devices, simulated)
+            opened.pop_all()
+        # After the context above has given the handlers back: of two that are nested the outer one would win.
+        cell._signals.__enter__()
+        return cell
 
     def __enter__(self) -> Cell:
         return self
@@ -118,36 +145,133 @@ class Cell:
         """Where calibrations are stored."""
         return self.folder / self.config.cell.calibrations
 
-    def mover(self, job: Job | None) -> Mover:
-        """Planned moves of the arm, for jogging and calibration; with a job, its part is in the claw."""
-        return Mover(self.devices.arm, self.devices.clock, self.config, job)
+    def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
+        """Planned moves of the arm, for jogging and calibration; with a job, its part is in the claw.
+
+        `hold` is called before each free motion: a paused run waits in it.
+        """
+        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold)
+
+    @property
+    def current(self) -> Run[Any] | None:
+        """The run that is going on, or None."""
+        run = self._run
+        return None if run is None or run.done else run
 
     def stop(self) -> None:
-        """Bring the whole cell to rest: laser off, vehicle stopped and braked, rail and arm stopped.
+        """End the run that is going on, and bring the whole cell to rest now, whatever it does.
 
-        Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
+        Laser off, vehicle stopped and braked, rail and arm stopped. Callable from any thread; the run then ends as
+        aborted. Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
         """
+        with self._beginning:
+            self._stops += 1
+            run = self.current
+        if run is not None:
+            run.abort("stopped with Cell.stop()")
         stop_cell(self.devices)
 
     def close(self) -> None:
-        """Stop and disconnect everything and let go of the cell. Idempotent, and shielded from interrupts."""
-        if self._closed:
-            return
-        self._closed = True
+        """End the run that is going on, stop and disconnect everything, let go of the cell.
+
+        Idempotent, callable from any thread, shielded from interrupts.
+        """
         with SignalWatch():
+            with self._beginning:
+                if self._closed:
+                    return
+                self._closed = True
             try:
+                if (run := self.current) is not None:
+                    run.abort("the cell is being closed")
+                    try:
+                        run.ended(CLOSE_WAIT_S)
+                    except DeadlineError as error:
+                        log.warning("closing the cell: %s", error)
                 problems = self.devices.stop() + self.devices.close()
             finally:
                 self._lock.__exit__(None, None, None)
                 if self.simulated is not None:
                     self.simulated.close()
+        self._signals.__exit__(None, None, None)
         for problem in problems:
-            print(f"closing the cell: {problem}", file=sys.stderr)
+            log.warning("closing the cell: %s", problem)
+
+    def begin(
+        self,
+        kind: str,
+        work: Callable[[Run[Made]], Made],
+        observer: Observer | None = None,
+        stops: int | None = None,
+    ) -> Run[Made]:
+        """Begin a run of a kind; `InterlockError` while another one is going on or the cell is closed.
+
+        `stops` is the count of stops when it was asked for: `Aborted` when another one came since.
+        """
+        with self._beginning:
+            self._require_free()
+            if stops not in (None, self._stops):
+                raise Aborted(f"the cell was stopped before the {kind} began; nothing was begun")
+            run = Run(kind, work, observer)
+            self._run = run
+            return run
+
+    def _require_free(self) -> None:
+        if self._closed:
+            raise InterlockError(self.config.cell.name, "the cell was closed; open it again")
+        if (going := self.current) is not None:
+            raise InterlockError(
+                self.config.cell.name, f"a {going.kind} is going on; wait for its end or abort it, then begin again"
+            )
+
+    def perform(
+        self,
+        kind: str,
+        work: Callable[[Hands], Made],
+        observer: Observer | None = None,
+        info: dict[str, Any] | None = None,
+    ) -> Made:
+        """Do work outside a job, such as a jog, as a recorded run, and wait for its end."""
+        return self.begin(kind, lambda run: self._recorded(run, kind, work, info), observer).result()
+
+    def _recorded(
+        self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
+    ) -> Made:
+        facts = {"cell": self.config.cell.name, **self._world(), **(info or {})}
+        health = require_no_emergency_stop if kind == "jog" else require_healthy
+        return RecordedWork(run, kind, self.devices, self.runs_folder, facts, health).perform(work)
+
+    def _world(self) -> dict[str, Any]:
+        """Whether this cell is simulated, and which world."""
+        if self.simulated is None:
+            return {"simulated": False, "seed": None, "level": None}
+        return {"simulated": True, **{key: self.simulated.endpoints[key] for key in ("seed", "level")}}
 
     # --- jobs ---
 
-    def run(self, job: str | Path = "pot", observer: Observer | None = None, inject: Sequence[str] = ()) -> RunOutcome:
-        """Run a job to its end and write its folder. Raises only for what is wrong before anything moves.
+    def run(
+        self,
+        job: str | Path = "pot",
+        observer: Observer | None = None,
+        inject: Sequence[str] = (),
+        *,
+        at_start: bool = False,
+    ) -> RunOutcome:
+        """`start` a job and wait for its end. Raises only for what is wrong before anything moves."""
+        return self.start(job, observer, inject, at_start=at_start).result()
+
+    def start(
+        self,
+        job: str | Path = "pot",
+        observer: Observer | None = None,
+        inject: Sequence[str] = (),
+        *,
+        at_start: bool = False,
+    ) -> Run[RunOutcome]:
+        """Begin a job and hold it: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
+
+        `at_start` is somebody's word that the vehicle stands at the job's start pose. Without it a run drives only when
+        the vehicle sees the board, or when this `Cell` has seen it before.
 
         A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
@@ -156,48 +280,69 @@ class Cell:
         if injections and self.simulated is None:
             raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
         info: dict[str, Any] = {}
+        inline: tuple[Observer, ...] = ()
         if injections:
             info["injected"] = [str(injection) for injection in injections]
-            observer = both(observer, Injector(self.config.cell.truth, injections))
-        return self._perform(job, observer, info, None)
+            inline = (Injector(self.config.cell.truth, injections),)
+        return self._start(job, observer, info, None, inline, at_start=at_start)
 
-    def resume(self, run: str | Path | None = None, observer: Observer | None = None) -> RunOutcome:
+    def resume(
+        self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
+    ) -> RunOutcome:
         """Do the job of a run that was aborted, faulted or cut short, as a new run; without `run` the newest.
 
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
-        the board has not moved. Raises `ConfigError` when there is nothing to resume.
+        the board has not moved. `at_start` as in `run`. Raises `ConfigError` when there is nothing to resume.
         """
-        before = UnfinishedRun.find(find_run(self.runs_folder, None if run is None else str(run)))
-        return self._perform(before.job, observer, {"resumed_from": before.folder.name}, before)
+        before = UnfinishedRun.find(find_run(self.runs_folder, None if run is None else str(run), "job"))
+        info = {"resumed_from": before.folder.name}
+        return self._start(before.job, observer, info, before, at_start=at_start).result()
 
-    def _perform(
-        self, job: str | Path, observer: Observer | None, info: dict[str, Any], before: UnfinishedRun | None
-    ) -> RunOutcome:
+    def _start(
+        self,
+        job: str | Path,
+        observer: Observer | None,
+        info: dict[str, Any],
+        before: UnfinishedRun | None,
+        inline: tuple[Observer, ...] = (),
+        *,
+        at_start: bool,
+    ) -> Run[RunOutcome]:
+        self._require_free()
+        stops = self._stops
         loaded, mesh = load_job(job)
-        require_fit(loaded, self.config)
+        require_fit(loaded, self.config, mesh)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
-
-        def note(text: str) -> None:
-            if observer is not None:
-                observer(Event("note", None, {"text": text}))
-
+        stored: CellCalibration | None = None
         try:
-            calibration = self.calibration()
+            stored = self.calibration()
         except CalibrationStale:
             if self.simulated is None:
                 raise
-            note("this simulated cell has no calibration yet: calibrating first")
-            calibration = self.calibrate(observer, job)
-        info |= {"simulated": self.simulated is not None, "seed": None, "level": None, **job_source(job)}
-        if self.simulated is not None:
-            info |= {key: self.simulated.endpoints[key] for key in ("seed", "level")}
-        earlier = None
-        if before is not None:
-            earlier, why = before.sweep(loaded, self.config, calibration)
-            note(why if earlier is not None else f"{why}: sweeping again")
-        job_run = JobRun(self.config, self.devices, loaded, nominal, calibration, info, observer, earlier)
-        outcome, self._odometry = job_run.perform(self.runs_folder, self._odometry)
-        return outcome
+        info |= {**self._world(), **job_source(job)}
+
+        def work(run: Run[RunOutcome]) -> RunOutcome:
+            def note(text: str) -> None:
+                run.tell(Event("note", None, {"text": text}))
+
+            if at_start:
+                self.whereabouts.say_at_start()
+            calibration = stored
+            if calibration is None:
+                note("this simulated cell has no calibration yet: calibrating first")
+                calibration = self._calibrate(run, job)
+            earlier = None
+            if before is not None:
+                earlier, why = before.sweep(loaded, self.config, calibration)
+                note(why if earlier is not None else f"{why}: sweeping again")
+            job_run = JobRun(run, self.config, self.devices, loaded, nominal, calibration, info, inline, earlier)
+            try:
+                return job_run.perform(self.runs_folder, self.whereabouts)
+            finally:
+                if at_start:
+                    self.whereabouts.forget_word()
+
+        return self.begin("job", work, observer, stops)
 
     # --- calibration ---
 
@@ -226,22 +371,25 @@ class Cell:
 
         `job` names the part that may be in the claw, so that it does not touch anything on the way.
         """
+        load_job(job)
+        return self.begin("calibration", lambda run: self._calibrate(run, job), observer).result()
+
+    def _calibrate(self, run: Run[Any], job: str | Path) -> CellCalibration:
         part_of, _ = load_job(job)
 
         def tell(fraction: float, text: str) -> None:
-            if observer is not None:
-                observer(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
+            run.tell(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
 
-        def work(check: Callable[[], None]) -> tuple[Observations, CellCalibration]:
-            mover = self.mover(part_of)
+        def work(hands: Hands) -> tuple[Observations, CellCalibration]:
+            mover = self.mover(part_of, hands.safe_point)
             self.devices.vehicle.brake()
-            scan = collect_scan(self.config, self.devices, mover, check, lambda f, t: tell(0.65 * f, t))
-            target = collect_target(self.config, self.devices, mover, check, lambda f, t: tell(0.65 + 0.3 * f, t))
+            scan = collect_scan(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 * f, t))
+            target = collect_target(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 + 0.3 * f, t))
             tell(0.96, "solving")
             observations = gathered(scan, target, self._identities(), self.config)
             return observations, solve_observations(observations).calibration
 
-        observations, calibration = self.guarded("calibration", work)
+        observations, calibration = self._recorded(run, "calibration", work)
         save_with_observations(calibration, observations, self.calibrations_folder)
         tell(1.0, "stored")
         return calibration
@@ -255,29 +403,27 @@ class Cell:
         loaded, _ = load_job(job)
         calibration = self.calibration()
 
-        def tell(fraction: float, text: str) -> None:
-            if observer is not None:
-                observer(Event("progress", "verify", {"fraction": fraction, "text": text}))
+        def verification(run: Run[Verification]) -> Verification:
+            def tell(fraction: float, text: str) -> None:
+                run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
 
-        def work(check: Callable[[], None]) -> Verification:
-            self.devices.vehicle.brake()
-            mover = self.mover(loaded)
-            seen = collect_verification(self.config, self.devices, mover, calibration, check, tell)
-            return Verification.of(calibration, loaded, seen)
+            def work(hands: Hands) -> Verification:
+                self.devices.vehicle.brake()
+                mover = self.mover(loaded, hands.safe_point)
+                seen = collect_verification(self.config, self.devices, mover, calibration, hands.check, tell)
+                return Verification.of(calibration, loaded, seen)
 
-        verification = self.guarded("verification", work)
-        tell(1.0, "done")
-        return verification
+            made = self._recorded(run, "verification", work)
+            tell(1.0, "done")
+            return made
+
+        return self.begin("verification", verification, observer).result()
 
     def home(self) -> None:
         """Home the rail and fold the arm above the deck."""
 
-        def work(check: Callable[[], None]) -> None:
+        def work(hands: Hands) -> None:
             self.devices.rail.home().wait(60.0)
-            self.mover(None).to_joints(HOME)
+            self.mover(None, hands.safe_point).to_joints(HOME)
 
-        self.guarded("homing", work)
-
-    def guarded(self, what: str, work: Callable[[Callable[[], None]], Made]) -> Made:
-        """Do `work` outside a job; see `cell.guard.guarded`."""
-        return guarded(self.devices, what, work)
+        self.perform("homing", work)

@@ -1,7 +1,7 @@
 """Quantities with their unit, as configuration, jobs and the command line write them ("35 mm", "5 deg").
 
-A bare number where a unit belongs is refused, and so is a value outside its allowed range. Inside the program
-everything is SI.
+A bare number where a unit belongs is refused, and so is a value outside its allowed range, or a unit of another kind:
+an angle is no frequency here. Inside the program everything is SI.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BeforeValidator
@@ -16,15 +17,24 @@ from pydantic import BeforeValidator
 if TYPE_CHECKING:
     import pint
 
-
-_QUANTITY = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[a-zA-Zµ°/^*0-9]*")
+_UNIT = r"[a-zA-Zµ°]{1,24}((\^|\*\*)[1-4])?"
+_QUANTITY = re.compile(rf"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{{1,3}})?\s*({_UNIT}([/*]{_UNIT}){{0,3}})?", re.ASCII)
 
 
 @lru_cache(maxsize=1)
 def _registry() -> pint.UnitRegistry[float]:
     import pint
 
-    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    # Without a file at first: only then do later definitions count everywhere.
+    registry: pint.UnitRegistry[float] = pint.UnitRegistry(
+        None, autoconvert_offset_to_baseunit=True, on_redefinition="ignore"
+    )
+    registry.load_definitions(str(files("pint").joinpath("default_en.txt")))
+    registry.default_system = "mks"
+    # By itself the library takes both for plain numbers, and so "5 percent" for an angle and "5 Hz" for deg/s.
+    registry.define("radian = [angle] = rad")
+    registry.define("bit = [information]")
+    return registry
 
 
 def parse_quantity(text: object, unit: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -33,43 +43,80 @@ def parse_quantity(text: object, unit: str, low: float = -math.inf, high: float 
     `low` and `high` are inclusive and given in `unit`, which is also the unit that an error is worded in. Raises
     `ValueError` with the value, the expected kind of unit and the allowed range.
     """
-    import pint
-
-    allowed = _range_text(unit, low, high)
+    allowed = range_text(low, high, unit)
+    example = _example(unit, low, high)
     if isinstance(text, bool) or not isinstance(text, str):
-        raise ValueError(
-            f'{text!r} has no unit; write it as text with a unit, such as "{_example(unit, low)}"{allowed}'
-        )
-    if not _QUANTITY.fullmatch(text.strip()):
-        raise ValueError(f'"{text}" is not a number and a unit, such as "{_example(unit, low)}"{allowed}')
+        raise ValueError(f"{shown(text)} has no unit; write it as text with a unit, such as {example}{allowed}")
+    match = _QUANTITY.fullmatch(text.strip().replace("μ", "µ"))
+    if match is None:
+        raise ValueError(f"{shown(text)} is not a number and a unit, such as {example}{allowed}")
+    if match[3] is None:
+        raise ValueError(f"{shown(text)} has no unit; write it with one, such as {example}{allowed}")
     ureg = _registry()
     try:
         parsed: Any = ureg.Quantity(text.strip())
-        if parsed.units == ureg.dimensionless and unit != "":
-            raise ValueError(f'"{text}" has no unit; write it with one, such as "{_example(unit, low)}"{allowed}')
-        shown = float(parsed.to(unit).magnitude)
+        shown_in_unit = float(parsed.to(unit).magnitude)
         value = float(parsed.to(unit).to_base_units().magnitude)
-    except (pint.errors.PintError, AttributeError, TypeError, AssertionError, SyntaxError) as error:
-        raise ValueError(f'"{text}" is not a quantity in {unit}, such as "{_example(unit, low)}"{allowed}') from error
-    if not math.isfinite(shown) or not low <= shown <= high:
-        raise ValueError(f'"{text}" is outside the allowed range{allowed}')
+    except Exception as error:  # the library's parser raises whatever its tokens lead to
+        raise ValueError(f"{shown(text)} is not a quantity in {unit}, such as {example}{allowed}") from error
+    if not math.isfinite(shown_in_unit) or not low <= shown_in_unit <= high:
+        raise ValueError(f"{shown(text)} is outside the allowed range{allowed}")
     return value
 
 
 def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> Any:
-    """Pydantic validator for a field of type float that is written with a unit; bounds as in `parse_quantity`."""
+    """Validator for a field of type float that is written with a unit; bounds as in `parse_quantity`."""
     return BeforeValidator(lambda text: parse_quantity(text, unit, low, high))
 
 
-def _range_text(unit: str, low: float, high: float) -> str:
+def number(low: float, high: float) -> Any:
+    """Validator for a field of type float that is a plain number from `low` to `high`."""
+
+    def check(value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(
+                f"{shown(value)} is no plain number{range_text(low, high)}; write it without quotes or unit"
+            )
+        if not low <= value <= high:
+            raise ValueError(f"{shown(value)} is outside the allowed range{range_text(low, high)}")
+        return float(value)
+
+    return BeforeValidator(check)
+
+
+def whole(low: int, high: int, *allowed: int, meaning: str = "") -> Any:
+    """Validator for a field of type int from `low` to `high`, or one of `allowed`; `meaning` tells what they are."""
+    text = f" (allowed: {', '.join(map(str, allowed))})" if allowed else range_text(low, high)
+
+    def check(value: object) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ValueError(f"{shown(value)} is no whole number{text}{meaning}; write it without quotes or unit")
+        if not low <= value <= high or (allowed and value not in allowed):
+            raise ValueError(f"{shown(value)} is outside the allowed range{text}{meaning}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def shown(value: object) -> str:
+    """A value as a file would show it, cut where it is long."""
+    text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else str(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def range_text(low: float, high: float, unit: str = "") -> str:
+    """The allowed range for a message, empty when there is none."""
+    after = f" {unit}" if unit else ""
     if math.isinf(low) and math.isinf(high):
         return ""
     if math.isinf(high):
-        return f" (at least {low:g} {unit})"
+        return f" (at least {low:.10g}{after})"
     if math.isinf(low):
-        return f" (at most {high:g} {unit})"
-    return f" (allowed: {low:g} to {high:g} {unit})"
+        return f" (at most {high:.10g}{after})"
+    return f" (allowed: {low:.10g} to {high:.10g}{after})"
 
 
-def _example(unit: str, low: float) -> str:
-    return f"{low if math.isfinite(low) and low > 0 else 1:g} {unit}"
+def _example(unit: str, low: float, high: float) -> str:
+    value = low if math.isfinite(low) and low > 0 else min(1.0, high)
+    return f'"{value:g} {unit}"'

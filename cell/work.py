@@ -15,20 +15,21 @@ import numpy as np
 from cell.assembly import Devices
 from cell.config import CellConfig
 from cell.frames import FrameStore
+from cell.geometry.poses import to_ur
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, ScanSection
 from cell.planning import look_pose, photo_pose, scan_plans
-from cell.steps.approach import Odometry, Planar
 from cell.steps.board_photo import board_photo
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.invert_pose import invert_pose
 from cell.steps.laser_sweep import SweepRecord, laser_sweep
 from cell.steps.moves import HOME, Mover
 from cell.steps.photograph import BoardFix, photograph
-from cell.steps.place import PlaceResult, place
+from cell.steps.place import PartProgress, PlaceResult, place
 from cell.steps.reconstruct import Reconstruction, reconstruct
 from cell.steps.stored_sweep import StoredSweep, save_sweep
 from cell.steps.swath import SweepErrors
+from cell.steps.whereabouts import Whereabouts
 from cell.stored_calibration import CellCalibration
 from cell.vision import parse_board
 from drivers.errors import CalibrationStale, RefusedError
@@ -37,6 +38,11 @@ from statemachine.runner import StepContext
 
 CHANCE_SCATTER = 1.3
 """Found over configured scatter of the arm that the few views of a calibration show by chance."""
+
+SHIFT_SHARE = 0.25
+"""Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
+it to one side without any scatter; what else the place may be off by has the other three quarters.
+"""
 
 
 def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
@@ -60,7 +66,7 @@ class JobWork:
         devices: Devices,
         frames: FrameStore,
         folder: Path,
-        odometry: Odometry | None = None,
+        whereabouts: Whereabouts,
         earlier: StoredSweep | None = None,
     ) -> None:
         self._config = config
@@ -73,8 +79,10 @@ class JobWork:
         self._board = parse_board(job.board.spec)
         self._mover = Mover(devices.arm, devices.clock, config, job)
         self._earlier = earlier
+        self._photographs = 0
         # Kept over retries and runs: the vehicle may stand anywhere when the step is done again.
-        self.odometry = odometry
+        self._whereabouts = whereabouts
+        self.part = PartProgress()
 
     def steps(self) -> dict[str, Callable[[StepContext], object]]:
         """The work by step name; each attempt enters the gate anew."""
@@ -89,8 +97,10 @@ class JobWork:
         return {step.__name__: partial(self._enter, step) for step in steps}
 
     def _enter(self, step: Callable[[StepContext], object], context: StepContext) -> object:
-        self._devices.gate.enter()
+        self._devices.gate.enter(context.token)
         context.check()
+        self._mover.hold = context.safe_point
+        self._frames.begin()
         return step(context)
 
     def drive_to_target(self, context: StepContext) -> Arrival:
@@ -102,11 +112,13 @@ class JobWork:
                 "placed already"
             )
         vehicle = self._devices.vehicle
+        if trouble := vehicle.state().trouble:
+            context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
         vehicle.enable()
         vehicle.brake()
-        if self.odometry is None:
-            self.odometry = Odometry(vehicle, Planar.of(self._job.approach.start.se3()))
+        if not self._whereabouts.anchored:
             self._mover.to_joints(HOME)
+        self._whereabouts.enter(self._job)
         camera = self._calibration.target.flange_from_camera
         self._mover.to(look_pose(self._config, self._job, self._board, camera), "the looking pose")
         self._devices.target_camera.configure(self._config.target_camera.photo_exposure, 10.0)
@@ -115,11 +127,13 @@ class JobWork:
             self._job,
             self._config.arm.vehicle_from_base.se3(),
             vehicle,
-            self.odometry,
+            self._whereabouts,
             self._photograph,
             self._devices.clock,
             context.check,
             context.progress,
+            lambda text: context.note(text=text),
+            context.safe_point,
         )
 
     def board_photo(self, context: StepContext) -> BoardFix:
@@ -152,14 +166,19 @@ class JobWork:
         base_from_place = fix.base_from_board * self._job.place_from_board.inverse()
         base_from_surface = base_from_place * self._job.surface.place_from_surface.se3()
         devices = self._devices
-        if not devices.rail.state().homed:
+        if not devices.rail.state().homed_here:
             context.progress(0.0, "homing the rail")
             devices.rail.home().wait(60.0)
         return laser_sweep(
             scan_plans(self._config, self._job, base_from_surface, self._calibration.scan),
             unhurried(self._job.scan, context.attempt),
             self._calibration.scan.geometry(),
-            SweepErrors(self.repeatability, self._config.calibration.rail_sigma, devices.clock.rate),
+            SweepErrors(
+                self.repeatability,
+                self._config.calibration.rail_sigma,
+                SHIFT_SHARE * self._job.place.tolerance,
+                devices.clock.rate,
+            ),
             self._mover,
             devices,
             lambda frame: self._frames.keep("stripe", frame),
@@ -194,8 +213,10 @@ class JobWork:
             self._mover,
             self._devices.arm,
             self._devices.claw,
+            self.part,
             context.check,
             context.progress,
+            lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
         )
 
     @property
@@ -220,7 +241,10 @@ class JobWork:
         return ratio if ratio > CHANCE_SCATTER else 1.0
 
     def _photograph(self, count: int = 1) -> BoardFix:
-        fix = photograph(
+        # Numbered, since a camera may count its frames anew: a later photograph must not take an earlier one's place.
+        self._photographs += 1
+        what = f"board-{self._photographs:02d}"
+        return photograph(
             self._devices.arm,
             self._devices.target_camera,
             self._calibration.target,
@@ -228,7 +252,5 @@ class JobWork:
             self._job.photo,
             self.repeatability,
             count,
+            lambda frame: self._frames.keep(what, frame),
         )
-        for frame in fix.frames:
-            self._frames.keep("board", frame)
-        return fix

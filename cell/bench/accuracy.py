@@ -25,7 +25,8 @@ from cell.config import CellConfig, load_config
 from cell.geometry.poses import difference, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
-from cell.report.truth import part_points, pose_of
+from cell.report.bound import part_points
+from cell.report.truth import pose_of
 from drivers.interfaces import Vector
 from sim_backends.world.levels import deviations
 

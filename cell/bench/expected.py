@@ -26,7 +26,7 @@ from cell.inversion import NominalSurface
 from cell.job import Job
 from cell.reconstruction import Cloud, calibration_motions, flange_motions
 from cell.reconstruction.build import ScanGeometry
-from cell.report.truth import part_points
+from cell.report.bound import part_points
 from cell.steps.laser_sweep import SweepRecord
 from cell.stored_calibration import nominal_camera
 from drivers.interfaces import Vector

@@ -33,6 +33,7 @@ _FORCE_SAMPLES, _FORCE_SAMPLE_S = 10, 0.006
 _SAFETY = {
     Safety.NORMAL: ArmSafety.NORMAL,
     Safety.PROTECTIVE_STOP: ArmSafety.PROTECTIVE_STOP,
+    Safety.SAFEGUARD_STOP: ArmSafety.SAFEGUARD_STOP,
     Safety.EMERGENCY_STOP: ArmSafety.EMERGENCY_STOP,
 }
 
@@ -127,8 +128,10 @@ class LockstepArm:
         """What is wired to input `index`."""
         return bool(self.model.digital_inputs >> index & 1)
 
-    def recover(self) -> None:
-        """Unlock a protective stop, which takes its time."""
+    def recover(self, *, confirmed: bool = False) -> None:
+        """Unlock a protective stop that a person has `confirmed`, which takes its time."""
+        if self.model.safety is Safety.PROTECTIVE_STOP and not confirmed:
+            raise fault(self.name, "arm.protective_stop", "nobody has confirmed that it may be unlocked")
         self._clock.sleep(self.model.params.unlock_delay)
         if not self.model.unlock() or not self.model.ready:
             raise fault(self.name, f"arm.{self.model.safety.name.lower()}", self.model.fault_text)

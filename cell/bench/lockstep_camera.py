@@ -46,16 +46,23 @@ class LockstepCamera:
         self._world = world
         self._clock = clock
         self._wire = wire
-        self._model = CameraModel(camera_spec(world.scene, camera))
+        self.model = CameraModel(camera_spec(world.scene, camera))
         self._map = ClockMap()
-        self.shape = (self._model.spec.height, self._model.spec.width)
+        self.late = 0.0
+        """By how many seconds each latch comes later than the camera answers."""
+        self.shape = (self.model.spec.height, self.model.spec.width)
         self.shots: dict[int, Shot] = {}
         """The truth at each exposure so far, by the frame's id."""
 
     def identity(self) -> Identity:
         """The model's own plate."""
-        spec = self._model.spec
+        spec = self.model.spec
         return Identity(spec.model, spec.serial, spec.firmware, "in this process")
+
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of a frame's host time."""
+        return self._map.uncertainty
 
     def ping(self) -> float:
         """No wire: 0 s."""
@@ -63,25 +70,27 @@ class LockstepCamera:
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """Set exposure in s and frame rate in Hz; `LimitError` when they clash or the camera cannot."""
-        spec = self._model.spec
+        spec = self.model.spec
         if not (
             spec.exposure_min <= exposure <= spec.exposure_max
             and 0 < frame_rate <= spec.frame_rate_max
             and exposure * frame_rate <= 1.0
         ):
             raise LimitError(self.name, f"exposure {exposure:g} s at {frame_rate:g} Hz is not possible")
-        self._model.exposure, self._model.frame_rate = exposure, frame_rate
+        self.model.exposure, self.model.frame_rate = exposure, frame_rate
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """One frame whose exposure begins now."""
         self._compare_clocks()
-        return self._expose(self._clock.now())
+        while (frame := self._expose(self._clock.now())) is None:
+            pass
+        return frame
 
     @contextmanager
     def stream(self) -> Iterator[LockstepStream]:
         """Free-running acquisition for as long as the context is open."""
         self._compare_clocks()
-        stream = LockstepStream(self, self._clock.now(), 1.0 / (self._model.frame_rate * self._model.spec.rate))
+        stream = LockstepStream(self, self._clock.now(), 1.0 / (self.model.frame_rate * self.model.spec.rate))
         try:
             yield stream
         finally:
@@ -97,17 +106,19 @@ class LockstepCamera:
         now = self._clock.now()
         latches = []
         for k in range(LATCHES):
-            before = now + k * ROUND_TRIP_S
+            before = now + k * (ROUND_TRIP_S + self.late)
             answered = before + float(self._wire.uniform(0.0, ROUND_TRIP_S))
-            latches.append(Latch(before, 1e-9 * self._model.spec.device_ns(answered), before + ROUND_TRIP_S))
+            latches.append(Latch(before, 1e-9 * self.model.spec.device_ns(answered), before + ROUND_TRIP_S + self.late))
         self._map.add(latches)
-        self._clock.sleep(LATCHES * ROUND_TRIP_S)
+        self._clock.sleep(LATCHES * (ROUND_TRIP_S + self.late))
 
-    def _expose(self, begin: float) -> Frame:
-        """The frame whose exposure begins at `begin`, once that is over."""
-        exposure, spec = self._model.exposure, self._model.spec
+    def _expose(self, begin: float) -> Frame | None:
+        """The frame whose exposure begins at `begin`, once that is over; None when its picture is lost."""
+        exposure, spec = self.model.exposure, self.model.spec
         self._clock.sleep_until(begin + exposure)
-        frame_id, _ = self._model.expose()
+        frame_id, lost = self.model.expose()
+        if lost:
+            return None
         stamp = 1e-9 * spec.device_ns(begin + spec.latency)
         image = self._world.render(self._camera, begin + 0.5 * exposure, exposure)
         self.shots[frame_id] = self._shot(begin + 0.5 * exposure)
@@ -131,9 +142,12 @@ class LockstepStream:
 
     def next(self, timeout: float) -> Frame:
         """The next frame."""
-        frame = self._camera._expose(self._next)
-        self._next += self._period
-        return frame
+        while True:
+            frame = self._camera._expose(self._next)
+            self._next += self._period
+            if frame is not None:
+                return frame
+            self.lost += 1
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames until the stream is closed."""

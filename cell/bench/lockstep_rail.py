@@ -13,7 +13,7 @@ from drivers.errors import DeadlineError, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, RailState, Vector
 from drivers.quantities import check_range
 from drivers.rail.motion import POLL_S, SWEEP_MARGIN_M, run_up_distance
-from drivers.rail.sweep import fit_line
+from drivers.rail.timing import EvenMotion
 from sim_backends.models.rail import RailModel
 
 ROUND_TRIP_S = 0.0005
@@ -38,6 +38,8 @@ class LockstepRail:
         self._wire = wire
         self._counts = config.steps_per_turn * config.microsteps / config.lead
         self._homed = False
+        self.late = 0.0
+        """By how many seconds each reply comes later than the module answers."""
         self.model.configure(
             clock.now(),
             dataclasses.replace(
@@ -58,6 +60,11 @@ class LockstepRail:
         """No wire: 0 s."""
         return 0.0
 
+    @property
+    def round_trip(self) -> float:
+        """Seconds from a request to its reply."""
+        return ROUND_TRIP_S + self.late
+
     def counted(self, t: float) -> float:
         """Position in m as the step counter has it at world time `t`."""
         return self.model.position(t) / self._counts
@@ -65,7 +72,7 @@ class LockstepRail:
     def read(self, t: float) -> tuple[float, float]:
         """Host time in s and position in m of a reading that is asked for at `t`."""
         answered = t + float(self._wire.uniform(0.0, ROUND_TRIP_S))
-        return t + 0.5 * ROUND_TRIP_S, self.counted(answered)
+        return t + 0.5 * self.round_trip, self.counted(answered)
 
     def state(self) -> RailState:
         """Read position, velocity and switches now."""
@@ -77,6 +84,7 @@ class LockstepRail:
             position=position,
             velocity=velocity,
             homed=self._homed,
+            homed_here=self._homed,
             moving=velocity != 0.0 or self.model.searching(now),
             left_switch=self.model.left_switch(now),
             right_switch=self.model.right_switch(now),
@@ -162,36 +170,46 @@ class LockstepSweep(RailMove):
         super().__init__(rail, clock)
         self._start, self._stop = start, stop
         self._readings: list[tuple[float, float]] = []
-        self._line: tuple[float, float] | None = None
+        self._motion: EvenMotion | None = None
 
     @property
     def samples(self) -> Vector:
         """Recorded (n, 2) array of host time in s and position in m, so far."""
         # The model knows its past exactly: what was to be read meanwhile is read now.
-        while (due := self._begun + len(self._readings) * POLL_S) + ROUND_TRIP_S <= self._clock.now():
+        while (due := self._begun + len(self._readings) * POLL_S) + self._rail.round_trip <= self._clock.now():
             self._readings.append(self._rail.read(due))
         return np.array(self._readings, dtype=np.float64).reshape(-1, 2)
 
     @property
     def window(self) -> tuple[float, float]:
         """Host times between which the velocity is constant; `InterlockError` while the sweep runs."""
-        origin, velocity = self._fitted()
-        return (self._start - origin) / velocity, (self._stop - origin) / velocity
+        motion = self._even()
+        return motion.time_at(self._start), motion.time_at(self._stop)
 
     def position_at(self, host_time: float) -> float:
         """Position in m at a host time inside `window`; `ValueError` outside."""
         begin, end = self.window
         if not begin <= host_time <= end:
             raise ValueError(f"{host_time:.4f} s is outside the sweep's window, {begin:.4f} to {end:.4f} s")
-        origin, velocity = self._fitted()
-        return origin + velocity * host_time
+        return self._even().position_at(host_time)
 
-    def _fitted(self) -> tuple[float, float]:
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of the times behind `position_at`; see `drivers.interfaces.Sweep`."""
+        return self._even().time_bound
+
+    @property
+    def unevenness(self) -> float:
+        """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
+        return self._even().unevenness
+
+    def _even(self) -> EvenMotion:
         if not self.done:
             raise InterlockError(self._rail.name, "the sweep still runs. wait() first")
-        if self._line is None:
+        if self._motion is None:
             readings = self.samples
             low, high = sorted((self._start, self._stop))
             inside = readings[(readings[:, 1] >= low) & (readings[:, 1] <= high)]
-            self._line = fit_line(inside[:, 0], inside[:, 1], np.full(len(inside), ROUND_TRIP_S))
-        return self._line
+            trips = np.full(len(inside), self._rail.round_trip)
+            self._motion = EvenMotion.of(inside[:, 0], inside[:, 1], trips)
+        return self._motion

@@ -8,6 +8,7 @@ from drivers.errors import DeadlineError, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, VehicleState
 from drivers.quantities import check_range
 from drivers.vehicle.agilex import DEAD_MAN_S, KEEP_ALIVE_S, STOP_TIMEOUT_S
+from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.models.vehicle import Mode, State, VehicleModel
 
@@ -53,7 +54,24 @@ class LockstepVehicle:
             emergency_stop=feedback.state is State.EMERGENCY_STOP,
             error_bits=feedback.errors,
             battery_volts=round(feedback.volts, 1),
+            trouble=system_trouble(feedback.errors, commanded=True),
         )
+
+    def check(self) -> None:
+        """Nobody causes faults here but a collision, whose error bits tell."""
+        feedback = self.model.feedback(self._clock.now())
+        if feedback.state is not State.OK:
+            raise vehicle_error(
+                self.name, feedback.errors, system_trouble(feedback.errors, commanded=True), driven=True
+            )
+
+    def recover(self) -> None:
+        """Clear errors and take command, braked."""
+        now = self._clock.now()
+        self.model.clear_errors(now)
+        self.model.set_mode(now, Mode.CAN)
+        self._enabled = True
+        self.brake()
 
     def enable(self) -> None:
         """Take command and release the brake."""
@@ -65,6 +83,7 @@ class LockstepVehicle:
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity that is kept alive for 0.5 s; `InterlockError` when braked or not enabled."""
+        self.check()
         limit, turn = self._config.max_speed, self._config.max_yaw_rate
         speed = check_range(self.name, "speed", speed, -limit, limit, "m/s")
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -turn, turn, "rad/s")

@@ -24,7 +24,8 @@ from cell.geometry.poses import from_matrix, transform
 from cell.inversion import NominalSurface
 from cell.reconstruction import Cloud
 from cell.reconstruction.build import ScanGeometry
-from cell.report.truth import SENSOR_POINTS, part_points, pose_of
+from cell.report.bound import part_points
+from cell.report.truth import SENSOR_POINTS, pose_of
 from cell.steps.reconstruct import Reconstruction
 from drivers.interfaces import Vector
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics

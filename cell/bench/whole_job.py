@@ -24,6 +24,7 @@ from cell.job_run import classify
 from cell.steps.collect import collect_scan, collect_target
 from cell.steps.laser_sweep import SweepRecord
 from cell.steps.moves import Mover
+from cell.steps.whereabouts import Whereabouts
 from cell.stored_calibration import CellCalibration
 from cell.work import JobWork
 from drivers.errors import CellError
@@ -130,7 +131,9 @@ def _steps(
     tell: Progress,
 ) -> None:
     assert record.calibration is not None
-    work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder)
+    whereabouts = Whereabouts(cell.devices.vehicle)
+    whereabouts.say_at_start()
+    work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder, whereabouts)
     record.kinematic = work.kinematic
     policy = Policy()
     for k, (name, step) in enumerate(work.steps().items()):

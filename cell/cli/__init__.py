@@ -13,8 +13,20 @@ EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
 def main() -> None:
     """Entry point of the console script: runs a command and turns errors into a message and an exit code."""
+    from statemachine.watch import EndSignals, SignalInterrupt
+
+    try:
+        with EndSignals(keyboard=True):
+            _run()
+    except (SignalInterrupt, KeyboardInterrupt) as error:
+        _complain(str(error) or "interrupted from the keyboard")
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _run() -> None:
     from cell.cli.app import app
     from drivers.errors import CellError, ConfigError, Interrupted
+    from statemachine.journal import JournalError
 
     try:
         app(standalone_mode=True)
@@ -24,7 +36,7 @@ def main() -> None:
     except ConfigError as error:
         _complain(str(error))
         sys.exit(EXIT_USAGE)
-    except (CellError, OSError) as error:
+    except (CellError, JournalError, OSError) as error:
         _complain(str(error))
         sys.exit(EXIT_FAILED)
 

@@ -64,10 +64,6 @@ def calibrate(
     from cell.stored_calibration import archive_of, solve_observations
     from cell.supervisor import Cell
 
-    if config is None and sim is None:
-        raise ConfigError(
-            "`cell calibrate` needs --config for a real cell, --sim all for a simulated one, or --from FOLDER"
-        )
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
         calibration = cell.calibrate(display, job)
         where, loaded = cell.calibrations_folder, cell.config

@@ -32,11 +32,11 @@ def solve(
     from cell.calibration_report import examine
     from cell.cli.calibration_tables import print_examination
     from cell.cli.display import print_calibration
-    from cell.config import load_config
+    from cell.config import find_config, load_config
     from cell.stored_calibration import gathered, solve_observations
 
     observations = read_archive(archive)
-    loaded = load_config(config)
+    loaded = load_config(find_config(config, simulated=True))
     if config is not None:
         o = observations
         observations = replace(gathered(o.scan, o.target, o.identities, loaded), made=o.made)

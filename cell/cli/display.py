@@ -1,8 +1,9 @@
-"""Progress bars while a run goes on and the table at its end."""
+"""Progress bars while a run goes on, the screen at its end, and the tables that are asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -10,13 +11,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from cell.cli.end_screen import duration, end_screen
 from statemachine.runner import Event
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
 """How a standard deviation in SI is shown to people, by its unit."""
 
-COLOURS = {"placed": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
+SAID = ("note", "paused", "going_on")
+"""Kinds of events whose text is shown as it is."""
+
+COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 
 
 class ProgressDisplay:
@@ -46,8 +50,13 @@ class ProgressDisplay:
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""
         step = event.step
-        if event.kind == "note" and "text" in event.data:
+        if event.kind in SAID and "text" in event.data:
             self.console.print(str(event.data["text"]), markup=False)
+        elif event.kind == "confirm_needed":
+            self.console.print(f"waiting for a person: {event.data['reason']}", style="bold yellow", markup=False)
+            self.console.print("when that is done, in another shell here: cell confirm (or cell abort)", markup=False)
+        elif event.kind == "confirmed":
+            self.console.print(f"confirmed by {event.data['by']}", markup=False)
         elif step is None:
             return
         elif event.kind == "step_started":
@@ -69,26 +78,39 @@ class ProgressDisplay:
         return self._tasks[step]
 
 
-def print_report(report: Mapping[str, Any], folder: str) -> None:
-    """The end of a run for people: outcome, steps, place error beside the paper's Table 1 and the expected bound."""
-    console = Console()
+def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False) -> None:
+    """The end of a run for people, on one screen; with `noise` the noise that is assumed and the seams below it."""
+    console = Console(highlight=False)
     outcome = str(report["outcome"])
-    console.print(f"[bold {COLOURS.get(outcome, 'white')}]{outcome}[/]", end=" ")
-    console.print(str(report["reason"]), markup=False, soft_wrap=True)
-    steps = Table(title="steps")
-    for name, right in (("step", False), ("state", False), ("duration in s", True), ("retries", True)):
-        steps.add_column(name, justify="right" if right else "left")
-    for row in report["steps"]:
-        duration = row.get("duration_s")
-        shown = "" if duration is None else f"{duration:.2f}"
-        steps.add_row(row["name"], row["state"], shown, str(row.get("retries", "")))
-    console.print(steps)
+    first, *others = end_screen(report, Path(folder), console.width)
+    console.print(f"[bold {COLOURS.get(outcome, 'white')}]{outcome}[/]", end="")
+    console.print(first.removeprefix(outcome), markup=False, soft_wrap=True)
+    for line in others:
+        console.print(line, markup=False, soft_wrap=True, style="bold red" if line.startswith("! ") else None)
+    if not noise:
+        return
     if seams := (report.get("scan") or {}).get("seams"):
         _print_seams(console, seams)
-    if (truth := report.get("truth")) is not None:
-        _print_error(console, truth)
-        _print_noise(console, report["assumed_noise"])
-    console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+    _print_noise(console, report.get("assumed_noise") or {})
+
+
+def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
+    """A line for each of the rows of `cell.runs.run_row`, its reason cut to the width of the screen."""
+    console = Console(highlight=False)
+    if not rows:
+        console.print("no run yet")
+    whats = [" ".join(str(word) for word in (row["kind"], row["job"]) if word) for row in rows]
+    wide = max(map(len, whats), default=0)
+    for row, what in zip(rows, whats, strict=True):
+        begun = str(row["started"] or "")[:16].replace("T", " ")
+        ended = f"{row['outcome']:<10}"
+        name = str(row["run"]).split("-")[-1]
+        before = f"{begun:<17}{name:<6}{what:<{wide}}  "
+        after = f" {duration(row['duration_s']):>6}  {' '.join(str(row['reason'] or '').split())}"
+        room = console.width - len(before) - len(ended)
+        console.print(before, end="", markup=False)
+        console.print(ended, end="", style=COLOURS.get(str(row["outcome"])), markup=False)
+        console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
 
 
 def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
@@ -101,28 +123,6 @@ def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
         first, second = (str(number + 1) for number in seam["sweeps"])
         table.add_row(f"{first} and {second}", str(seam["points"]), *(f"{value:.4f}" for value in values))
     console.print(table)
-
-
-def _print_error(console: Console, truth: Mapping[str, Any]) -> None:
-    table = Table(
-        title=f"place error over {truth['points']} points in mm (simulated; the paper's figures are hardware)"
-    )
-    table.add_column("axis")
-    for source in ("this run", "paper, optimised", "paper, Handscan"):
-        table.add_column(f"{source}: mean", justify="right")
-        table.add_column("max", justify="right")
-    for axis in ("x", "y", "z", "d"):
-        own = truth["error_mm"][axis]
-        paper, scan = TABLE_1_OPTIMISED[axis], TABLE_1_HANDSCAN[axis]
-        values = (own["mean"], own["max"], *paper, *scan)
-        table.add_row(axis.upper() if axis == "d" else axis, *(f"{value:.4f}" for value in values))
-    console.print(table)
-    sensor = truth.get("sensor_mm")
-    console.print(
-        f"expected mean D for the assumed noise: {truth['bound_mm']:.4f} mm · D at 95 %: {truth['d_p95']:.4f} mm"
-        + ("" if sensor is None else f" · cloud: mean {sensor['mean']:.4f} mm, 85 % below {sensor['p85']:.4f} mm")
-    )
-    console.print("Table 1 as printed; its largest D is more than its largest x, y and z allow together (1.795 mm).")
 
 
 def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:

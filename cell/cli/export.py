@@ -39,7 +39,7 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
-    from cell.config import load_config
+    from cell.config import beside, find_config, load_config
     from cell.report.export import SUFFIXES, export_run
     from cell.runs import find_run
     from cell.units import parse_quantity
@@ -49,11 +49,13 @@ def export(
         end = parse_quantity(limit, "mm", 0.001, 100)
     except ValueError as error:
         raise ConfigError(f"--limit: {error}") from error
-    root = Path.cwd() if config is None else config.resolve().parent
-    folder = find_run(root / load_config(config).cell.runs, name)
+    source = find_config(config, simulated=True)
+    folder = find_run(beside(source) / load_config(source).cell.runs, name, "job")
     path = out or folder / f"export-{kind.value}{SUFFIXES[kind.value]}"
     if path.suffix.lower() != SUFFIXES[kind.value]:
         raise ConfigError(f"--out {path}: a file of format {kind.value} ends in {SUFFIXES[kind.value]}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"--out {path}: there is no folder {path.parent}; make it first")
     written = export_run(folder, kind.value, path, job, end)
     if json:
         print_json(written)

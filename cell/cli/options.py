@@ -18,11 +18,28 @@ class Level(StrEnum):
     harsh = "harsh"
 
 
+class Confirm(StrEnum):
+    """Who confirms what a person has to."""
+
+    person = "person"
+    simulated = "simulated"
+
+
 ConfigOption = Annotated[
     Path | None,
-    typer.Option("--config", "-c", help="The cell's configuration, cell.toml. Without it, the one that ships."),
+    typer.Option(
+        "--config",
+        "-c",
+        help="The cell's configuration. Without it, cell.toml of the present folder; where there is none, real devices "
+        "are not touched, and a simulated cell has the configuration that ships.",
+    ),
 ]
-JobOption = Annotated[str, typer.Option("--job", "-j", help="A job file, or the name of a job that ships.")]
+JobOption = Annotated[
+    str,
+    typer.Option(
+        "--job", "-j", help="A job file, or a name: NAME.toml of the present folder, else the job that ships."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, nothing else.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, max=999_999, help="Which simulated world.")]
 LevelOption = Annotated[Level, typer.Option("--level", help="How far that world deviates from the drawing.")]

@@ -10,6 +10,7 @@ import typer
 
 from cell.cli.options import (
     ConfigOption,
+    Confirm,
     JobOption,
     JsonOption,
     Level,
@@ -22,6 +23,13 @@ if TYPE_CHECKING:
     from cell.job_run import Observer, RunOutcome
 
 RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
+NoiseOption = Annotated[
+    bool, typer.Option("--noise", help="Also show the noise that is assumed, and how several sweeps agree.")
+]
+
+AtStartOption = Annotated[
+    bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -30,21 +38,28 @@ def register(app: typer.Typer) -> None:
     app.command("dry-run")(dry_run)
     app.command()(resume)
     app.command()(abort)
+    app.command()(pause)
+    app.command("go-on")(go_on)
+    app.command()(confirm)
     app.command()(runs)
     app.command()(report)
 
 
-def run(job: JobOption = "pot", config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Run a job on the cell that the configuration describes."""
-    from cell.supervisor import Cell
-    from drivers.errors import ConfigError
+def run(
+    job: JobOption = "pot",
+    config: ConfigOption = None,
+    at_start: AtStartOption = False,
+    json: JsonOption = False,
+    noise: NoiseOption = False,
+) -> None:
+    """Run a job on the cell that the configuration describes.
 
-    if config is None:
-        raise ConfigError(
-            "`cell run` moves real devices and needs --config; `cell init` writes one, `cell dry-run` simulates"
-        )
+    The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
+    """
+    from cell.supervisor import Cell
+
     with Cell.open(config) as cell:
-        code = _perform(lambda display: cell.run(job, display), json)
+        code = _perform(lambda display: cell.run(job, display, at_start=at_start), json, noise)
     raise typer.Exit(code)
 
 
@@ -60,16 +75,22 @@ def dry_run(
         list[str] | None,
         typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
     ] = None,
+    confirm: Annotated[
+        Confirm | None,
+        typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
+    ] = None,
     json: JsonOption = False,
+    noise: NoiseOption = False,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
-    from cell.config import load_config
+    from cell.config import find_config, load_config
+    from cell.fit import require_fit
     from cell.injection import Injection
-    from cell.job import load_job, require_fit
+    from cell.job import load_job
     from cell.supervisor import SIM_SPEED, Cell
 
-    loaded, _ = load_job(job)
-    require_fit(loaded, load_config(config))
+    loaded, mesh = load_job(job)
+    require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
     for text in inject or ():
         Injection.parse(text)
     with Cell.open(
@@ -79,12 +100,19 @@ def dry_run(
         level=level.value,
         speed=speed or SIM_SPEED,
         surface=Path(loaded.surface.mesh).stem,
+        confirm=None if confirm is None else confirm.value,
     ) as cell:
-        code = _perform(lambda display: cell.run(job, display, inject or ()), json)
+        code = _perform(lambda display: cell.run(job, display, inject or ()), json, noise)
     raise typer.Exit(code)
 
 
-def resume(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+def resume(
+    name: RunArgument = None,
+    config: ConfigOption = None,
+    at_start: AtStartOption = False,
+    json: JsonOption = False,
+    noise: NoiseOption = False,
+) -> None:
     """Go on with a run that was aborted, faulted or cut short: its job again, without sweeping what still holds.
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
@@ -93,12 +121,9 @@ def resume(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
     from cell.resumption import UnfinishedRun
     from cell.runs import find_run
     from cell.supervisor import SIM_SPEED, Cell
-    from drivers.errors import ConfigError
 
-    before = UnfinishedRun.find(find_run(_runs_folder(config), name))
+    before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
     simulated = before.info["simulated"]
-    if not simulated and config is None:
-        raise ConfigError(f"run {before.folder.name} moved real devices: `cell resume` needs their --config")
     with Cell.open(
         config,
         sim="all" if simulated else None,
@@ -107,11 +132,11 @@ def resume(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
         speed=before.info["speed"] if simulated else SIM_SPEED,
         surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
     ) as cell:
-        code = _perform(lambda display: cell.resume(before.folder, display), json)
+        code = _perform(lambda display: cell.resume(before.folder, display, at_start=at_start), json, noise)
     raise typer.Exit(code)
 
 
-def _perform(work: Callable[[Observer], RunOutcome], json: bool) -> int:
+def _perform(work: Callable[[Observer], RunOutcome], json: bool, noise: bool) -> int:
     from cell.cli.display import ProgressDisplay, print_report
 
     with ProgressDisplay() as display:
@@ -119,7 +144,7 @@ def _perform(work: Callable[[Observer], RunOutcome], json: bool) -> int:
     if json:
         print_json(outcome.report)
     else:
-        print_report(outcome.report, str(outcome.folder))
+        print_report(outcome.report, str(outcome.folder), noise=noise)
     return outcome.exit_code
 
 
@@ -128,40 +153,78 @@ def abort(
     config: ConfigOption = None,
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
 ) -> None:
-    """End a run that is going on in another process: it stops the cell and reports `aborted`."""
-    from cell.runs import find_run
-    from drivers.errors import ConfigError
-    from statemachine.journal import JournalError, read, request
+    """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
+    from cell.runs import is_going, list_runs
 
-    folder = find_run(_runs_folder(config), name)
+    going = [run for run in list_runs(_runs_folder(config)) if is_going(run)] if name is None else []
+    if not going:
+        _ask(name, config, "abort", reason, "asked {} to end")
+    # Whoever says stop does not choose: everything that goes on here ends.
+    for run in going:
+        _ask(str(run), config, "abort", reason, "asked {} to end")
+
+
+def pause(name: RunArgument = None, config: ConfigOption = None) -> None:
+    """Hold what is going on in another process: at its next safe point, that is before its next free motion or step."""
+    _ask(name, config, "pause", "asked for with `cell pause`", "asked {} to hold before its next motion")
+
+
+def go_on(name: RunArgument = None, config: ConfigOption = None) -> None:
+    """Let a paused run go on."""
+    _ask(name, config, "go-on", "asked for with `cell go-on`", "asked {} to go on")
+
+
+def confirm(
+    name: RunArgument = None,
+    config: ConfigOption = None,
+    by: Annotated[str | None, typer.Option(help="Who has looked; without it, the user's name.")] = None,
+) -> None:
+    """Say that you have looked at the cell and that the waiting run may clear its fault and go on."""
+    import getpass
+
+    from cell.runs import awaited_word
+    from drivers.errors import ConfigError
+
+    folder = _going(name, config)
+    if (what := awaited_word(folder)) is None:
+        raise ConfigError(f"{folder.name} waits for nobody's word; there is nothing to confirm")
+    typer.echo(f"confirmed: {what}")
+    _ask(str(folder), config, "confirm", by or getpass.getuser(), "{} goes on")
+
+
+def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str) -> None:
+    from drivers.errors import ConfigError
+    from statemachine.journal import JournalError, request
+
+    folder = _going(name, config)
     try:
-        if read(folder).finished:
-            raise ConfigError(f"run {folder.name} has ended already; there is nothing to abort")
-        request(folder, "abort", reason)
+        request(folder, kind, reason)
     except JournalError as error:
         raise ConfigError(str(error)) from error
-    typer.echo(f"asked run {folder.name} to end")
+    typer.echo(answer.format(folder.name))
+
+
+def _going(name: str | None, config: Path | None) -> Path:
+    from cell.runs import find_going
+
+    return find_going(_runs_folder(config), name)
 
 
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """List the runs, newest last."""
-    from cell.runs import list_runs, read_report
+    """List what was run, newest last, a line each: when, what, how it ended, how long it took, and why."""
+    from cell.cli.display import print_runs
+    from cell.runs import list_runs, run_row
 
-    rows = [{"run": folder.name, **read_report(folder)} for folder in list_runs(_runs_folder(config))]
-    keys = ("run", "outcome", "job", "seed", "level", "reason")
+    rows = [run_row(folder) for folder in list_runs(_runs_folder(config))]
     if json:
-        print_json([{key: row.get(key) for key in keys} for row in rows])
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(*keys)
-    for row in rows:
-        table.add_row(*("" if row.get(key) is None else str(row.get(key)) for key in keys))
-    Console().print(table)
+        print_json(rows)
+    else:
+        print_runs(rows)
 
 
-def report(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+def report(
+    name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False, noise: NoiseOption = False
+) -> None:
     """Show the report of a run."""
     from cell.cli.display import print_report
     from cell.runs import find_run, read_report
@@ -171,11 +234,11 @@ def report(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
     if json:
         print_json(data)
     else:
-        print_report(data, str(folder))
+        print_report(data, str(folder), noise=noise)
 
 
 def _runs_folder(config: Path | None) -> Path:
-    from cell.config import load_config
+    from cell.config import beside, find_config, load_config
 
-    folder = Path.cwd() if config is None else config.resolve().parent
-    return folder / load_config(config).cell.runs
+    path = find_config(config, simulated=True)
+    return beside(path) / load_config(path).cell.runs

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from cell.cli import EXIT_USAGE
 from cell.cli.options import ConfigOption, JobOption, JsonOption, print_json
 
 
@@ -30,28 +31,59 @@ def init(
     _, mesh = load_job(job)
     source = job_path(job)
     targets = {folder / "cell.toml": None, folder / source.name: source, folder / mesh.name: mesh}
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder} is no folder; name another one")
     for target in targets:
         if target.exists():
             raise ConfigError(f"{target} exists already; move it away or name another folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    for target, origin in targets.items():
-        if origin is None:
-            target.write_text(default_toml(), encoding="utf-8")
-        else:
-            shutil.copyfile(origin, target)
-        typer.echo(f"wrote {target}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for target, origin in targets.items():
+            if origin is None:
+                target.write_text(default_toml(), encoding="utf-8")
+            else:
+                shutil.copyfile(origin, target)
+            typer.echo(f"wrote {target}")
+    except OSError as error:
+        raise ConfigError(f"nothing can be written to {folder}: {error.strerror}; name another folder") from error
 
 
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
-    from cell.config import load_config
-    from cell.job import load_job, require_fit
+    from cell.config import example_addresses, find_config, load_config, require_confirm
+    from cell.fit import require_fit
+    from cell.job import job_path, load_job
+    from drivers.errors import ConfigError
 
-    loaded = load_config(config)
-    checked, mesh = load_job(job)
-    require_fit(checked, loaded)
+    source = find_config(config, simulated=True)
+    told: dict[str, object] = {"ok": False, "configuration": "the one that ships" if source is None else str(source)}
+    try:
+        loaded = load_config(source)
+        require_confirm(loaded)
+        checked, mesh = load_job(job)
+        told["job_file"] = str(job_path(job))
+        require_fit(checked, loaded, mesh)
+    except ConfigError as error:
+        if json:
+            print_json({**told, "problems": [line.strip() for line in str(error).splitlines()]})
+            raise typer.Exit(EXIT_USAGE) from error
+        raise
+    notes = [f"{key} is the example's, where no device is: write your own" for key in example_addresses(loaded)]
+    told |= {
+        "ok": True,
+        "cell": loaded.cell.name,
+        "configuration_hash": loaded.calibration_hash(),
+        "simulated": bool(loaded.cell.truth),
+        "confirm": loaded.cell.confirm,
+        "job": checked.job.name,
+        "mesh": str(mesh),
+        "problems": [],
+        "notes": notes,
+    }
     if json:
-        print_json({"cell": loaded.cell.name, "job": checked.job.name, "mesh": str(mesh), "ok": True})
-    else:
-        typer.echo(f"cell {loaded.cell.name}: configuration is valid")
-        typer.echo(f"job {checked.job.name}: valid, mesh {mesh}")
+        print_json(told)
+        return
+    typer.echo(f"cell {loaded.cell.name}: configuration is valid ({told['configuration']})")
+    typer.echo(f"job {checked.job.name}: valid and in reach ({told['job_file']}), mesh {mesh}")
+    for note in notes:
+        typer.echo(f"note: {note}")

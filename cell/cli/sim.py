@@ -23,6 +23,7 @@ def serve(
     level: LevelOption = Level.nominal,
     speed: SpeedOption = 1.0,
     surface: Annotated[str, typer.Option(help="What stands on the place: pot, seat or panel.")] = "pot",
+    arm: Annotated[str, typer.Option(help="Which arm: UR10e or UR5e.")] = "UR10e",
     json: JsonOption = False,
     config_out: Annotated[
         Path | None, typer.Option(help="Also write a configuration that names the simulated endpoints.")
@@ -33,9 +34,15 @@ def serve(
 
     from drivers.errors import ConfigError
     from sim_backends import serve as server
+    from sim_backends.world.surfaces import SURFACES
+
+    if surface not in SURFACES:
+        raise ConfigError(f'--surface "{surface}" is none of {", ".join(sorted(SURFACES))}')
 
     if config_out is not None and config_out.exists():
         raise ConfigError(f"{config_out} exists already; move it away or name another file")
+    if config_out is not None and not config_out.parent.is_dir():
+        raise ConfigError(f"--config-out: there is no folder {config_out.parent}; make it first")
 
     def ready(endpoints: dict[str, object]) -> None:
         if config_out is not None:
@@ -44,4 +51,5 @@ def serve(
             config_out.write_text(endpoint_toml(endpoints), encoding="utf-8")
 
     arguments = ["--seed", str(seed), "--level", level.value, "--speed", repr(speed), "--surface", surface]
+    arguments += ["--arm", arm]
     sys.exit(server.main([*arguments, *(["--json"] if json else [])], ready=ready))

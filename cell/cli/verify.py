@@ -38,10 +38,7 @@ def verify(
     """
     from cell.cli.display import ProgressDisplay
     from cell.supervisor import Cell
-    from drivers.errors import ConfigError
 
-    if config is None and sim is None:
-        raise ConfigError("`cell calibrate verify` needs --config for a real cell or --sim all for a simulated one")
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
         verification = cell.verify(display, job)
     if json:

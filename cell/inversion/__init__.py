@@ -2,7 +2,7 @@
 
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict
-from cell.inversion.place_pose import Demands, PlacePose, invert_pose
+from cell.inversion.place_pose import Demands, PlacePose, fit_figures, invert_pose
 from cell.inversion.registration import Prior
 
-__all__ = ["Demands", "NominalSurface", "PlacePose", "Prior", "Tolerance", "Verdict", "invert_pose"]
+__all__ = ["Demands", "NominalSurface", "PlacePose", "Prior", "Tolerance", "Verdict", "fit_figures", "invert_pose"]

@@ -68,22 +68,7 @@ class NominalSurface:
     @classmethod
     def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> NominalSurface:
         """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh."""
-        import trimesh
-
-        try:
-            mesh = trimesh.load_mesh(path, process=True)
-            vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-        except Exception as error:  # every reader of trimesh raises its own
-            raise ConfigError(
-                f"nominal surface {path} cannot be read as a mesh ({error}); give an STL or PLY"
-            ) from error
-        vertices *= 1.0 if unit == "m" else 1e-3
-        extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
-        if not 0.001 < extent < 5.0:
-            raise ConfigError(
-                f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r}, allowed is "
-                "1 to 5000 mm; check surface.mesh_unit in the job"
-            )
+        vertices, faces = read_mesh(path, unit)
         return cls(vertices, faces, rim)
 
     @property
@@ -136,6 +121,33 @@ class NominalSurface:
     def _sample_weights(self) -> Array:
         counts = np.bincount(self.sample_triangles, minlength=len(self.areas))
         return np.asarray(self.areas[self.sample_triangles] / counts[self.sample_triangles])
+
+
+def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (n, 3) in m and triangles (m, 3) of a mesh file in `unit`, "m" or "mm".
+
+    Raises `ConfigError` when it is no mesh, or none of a size that a part can be placed onto.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=True)
+        vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    except Exception as error:  # every reader of trimesh raises its own
+        raise ConfigError(f"nominal surface {path} cannot be read as a mesh; give an STL or PLY") from error
+    if vertices.ndim != 2 or not len(faces) or not np.isfinite(vertices).all():
+        raise ConfigError(
+            f"nominal surface {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY "
+            "of the surface"
+        )
+    vertices *= 1.0 if unit == "m" else 1e-3
+    extent = float(np.ptp(vertices, axis=0).max())
+    if not 0.001 < extent < 5.0:
+        raise ConfigError(
+            f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
+            "check surface.mesh_unit in the job"
+        )
+    return vertices, faces
 
 
 def _samples(corners: Array, areas: Array) -> tuple[Array, Indices]:

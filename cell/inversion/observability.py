@@ -12,7 +12,7 @@ import numpy as np
 
 from cell.inversion.closest import Array
 from cell.inversion.motions import name, sorted_out
-from drivers.errors import NotObservable
+from drivers.errors import Measured, NotObservable
 
 FREE = 1e-3
 """Smallest eigenvalue of the scan's information, per point and σ, below which a motion counts as not determined by the
@@ -44,6 +44,11 @@ class Motion:
     excess: float
     words: str
 
+    def measured(self) -> Measured:
+        """Its size beside the tolerance, under a short name."""
+        name, _, _ = self.words.partition(" is ")
+        return Measured(f"3σ in tolerances: {name.replace(' of the surface frame', '')}", self.excess, most=1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
@@ -69,7 +74,8 @@ class Verdict:
         if self.weak:
             motions = "; ".join(motion.words for motion in self.weak)
             raise NotObservable(
-                f"{motions}. Scan more of the surface, one with more relief, or photograph the board more often"
+                f"{motions}. Scan more of the surface, one with more relief, or photograph the board more often",
+                *(motion.measured() for motion in self.weak),
             )
 
 

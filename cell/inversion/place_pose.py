@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from cell.inversion.registration import Prior, Registration, register
 from cell.inversion.search import across
 from cell.inversion.sweeps import balance
 from cell.reconstruction.cloud import Cloud
-from drivers.errors import RefusedError
+from drivers.errors import Measured, RefusedError
 
 BOARD_DISAGREES = 40.0
 """Squared Mahalanobis distance between scan and board from which on they contradict each other (6 degrees of freedom:
@@ -131,22 +132,26 @@ def invert_pose(
     pose = found.base_from_surface
     local = (scan.points[found.used] - pose.translation) @ pose.rotation
     coverage = nominal.coverage(local, 0.0025)
-    _demand(found, coverage, demands)
-    _demand_whole(scan, pose, nominal, tolerance, demands)
+    numbers = fit_figures(coverage, found.share, found.rms, found.chi2_per_dof, demands)
+    with _shown(pose, *numbers):
+        _demand(found, coverage, demands)
+        _demand_whole(scan, pose, nominal, tolerance, demands)
     lines, rows = cloud.subsample(most_points)
     displaced = [resolve(lines, rows) for resolve in (calibration, sweeps) if resolve is not None]
     if sweeps is not None:
         found = balance(found, scan, displaced[-1][found.used], prior)
         pose = found.base_from_surface
     explained = np.concatenate(displaced, axis=2) if displaced else None
-    parts_differ = _demand_agreement(dissent(scan, pose, nominal, tolerance, explained), tolerance, demands)
+    with _shown(pose, *numbers):
+        parts_differ = _demand_agreement(dissent(scan, pose, nominal, tolerance, explained), tolerance, demands)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
     covariance = found.covariance + shared
     correction = difference(pose, prior.base_from_surface)
-    disagreement = _disagreement(shared, prior, correction)
+    with _shown(pose, *numbers):
+        disagreement = _disagreement(shared, prior, correction)
     turn = np.kron(np.eye(2), pose.rotation.T)
     verdict = judge(
         turn @ covariance @ turn.T,
@@ -156,7 +161,8 @@ def invert_pose(
         nominal.radius,
         tolerance,
     )
-    verdict.require()
+    with _shown(pose, *numbers):
+        verdict.require()
     return PlacePose(
         base_from_surface=pose,
         random=found.covariance,
@@ -171,6 +177,29 @@ def invert_pose(
         parts_differ=parts_differ,
         correction=correction,
         disagreement=disagreement,
+    )
+
+
+@contextmanager
+def _shown(pose: pin.SE3, *numbers: Measured) -> Iterator[None]:
+    """A refusal in this block also shows the candidate "pose" that was judged, and `numbers`."""
+    try:
+        yield
+    except RefusedError as refused:
+        refused.showing(*numbers, seen={"pose": pose})
+        raise
+
+
+def fit_figures(
+    coverage: float, share: float, rms: float, chi2_per_dof: float, demands: Demands | None = None
+) -> tuple[Measured, ...]:
+    """How well a scan fits the surface, for people: each figure (those of `PlacePose`) beside what is demanded."""
+    demands = demands or Demands()
+    return (
+        Measured("fit, χ²/dof", chi2_per_dof, about=1.0),
+        Measured("surface covered", 100 * coverage, "%", least=100 * demands.coverage),
+        Measured("points over the surface that fit it", 100 * share, "%", least=100 * demands.share),
+        Measured("points off the surface, RMS", 1e3 * rms, "mm", most=1e3 * demands.rms),
     )
 
 
@@ -206,7 +235,13 @@ def _demand_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
         raise RefusedError(
             f"{100 * departed:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
             f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
-            "or covered, is it another one, or is the calibration disturbed?"
+            "or covered, is it another one, or is the calibration disturbed?",
+            Measured(
+                f"area more than {1e3 * allowed:.2f} mm off the surface",
+                100 * departed,
+                "%",
+                most=100 * demands.departed,
+            ),
         )
 
 
@@ -219,7 +254,10 @@ def _demand_agreement(found: Dissent, tolerance: Tolerance, demands: Demands) ->
             f"the parts of the surface do not agree: the quarter around ({x:.0f}, {y:.0f}, {z:.0f}) mm by itself puts "
             f"the place {1e3 * found.shift:.2f} mm and {1e3 * found.turn:.1f} mrad elsewhere, allowed beyond its noise "
             f"are {shift:.2f} mm and {turn:.1f} mrad. Which part is right cannot be told: is the surface worn, bent or "
-            "broken, does something lie on it, or is the calibration disturbed?"
+            "broken, does something lie on it, or is the calibration disturbed?",
+            Measured("a quarter of the surface puts the place off by", 1e3 * found.shift, "mm"),
+            Measured("and turned by", 1e3 * found.turn, "mrad"),
+            Measured("both, beyond their noise", found.excess, "tolerances", most=demands.dissent),
         )
     return max(0.0, found.excess)
 
@@ -255,6 +293,9 @@ def _disagreement(shared: Array, prior: Prior, correction: Array) -> float:
             f"scan and board disagree: the surface lies {1e3 * float(np.linalg.norm(correction[:3])):.2f} mm and "
             f"{np.degrees(np.linalg.norm(correction[3:])):.2f} deg from where the board puts it (squared distance "
             f"{distance:.0f} in units of the prior, allowed {BOARD_DISAGREES:.0f}). Was the board or the surface "
-            "moved?"
+            "moved?",
+            Measured("surface off where the board puts it", 1e3 * float(np.linalg.norm(correction[:3])), "mm"),
+            Measured("and turned", float(np.degrees(np.linalg.norm(correction[3:]))), "deg"),
+            Measured("squared distance in units of the prior", distance, most=BOARD_DISAGREES),
         )
     return distance

@@ -18,7 +18,7 @@ from cell.inversion.closest import Array
 from cell.inversion.correspondences import Rows, Scan, correspondences, robust_scale, sigmas_along
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.search import across, candidates
-from drivers.errors import RefusedError
+from drivers.errors import Measured, RefusedError
 
 COARSE_POINTS = 1200
 """Points of the search from the start, and of the searches from other starts."""
@@ -289,5 +289,6 @@ def _require_points(rows: Rows, scan: Scan) -> None:
     if len(rows.index) < LEAST_POINTS:
         raise RefusedError(
             f"{len(rows.index)} of {len(scan.points)} scanned points lie within {1e3 * FINE_GATE:.1f} mm of the "
-            f"nominal surface, at least {LEAST_POINTS} are needed. Is it the right surface, and is the scan over it?"
+            f"nominal surface, at least {LEAST_POINTS} are needed. Is it the right surface, and is the scan over it?",
+            Measured("points near the nominal surface", len(rows.index), least=LEAST_POINTS),
         )

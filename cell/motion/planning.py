@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints, Unreachable
+from cell.motion.point_speed import PointSpeed, carried_points
 from cell.motion.trajectory import LineLimits, Trajectory, join, plan_joint, plan_line
 
 STEPS = (0.02, 0.004)
@@ -26,12 +27,21 @@ NODES = 1500
 
 
 class Planner:
-    """Plans motions of one arm among one set of bodies. One instance per thread."""
+    """Plans motions of one arm among one set of bodies. One instance per thread.
+
+    `tool_speed` in m/s binds every point of the flange and of what it carries, in free moves and in lines.
+    """
 
     def __init__(
-        self, kinematics: ArmKinematics, collisions: CollisionModel, limits: JointLimits | None = None
+        self,
+        kinematics: ArmKinematics,
+        collisions: CollisionModel,
+        limits: JointLimits | None = None,
+        tool_speed: float | None = None,
     ) -> None:
         self.kinematics = kinematics
+        carried = carried_points(collisions.bodies)
+        self._points = None if tool_speed is None else PointSpeed(kinematics, carried, tool_speed)
         self.collisions = collisions
         self.limits = limits or kinematics.limits
 
@@ -56,7 +66,7 @@ class Planner:
         self.collisions.require_free(end, "the end of the motion", allowed)
         for step in STEPS:
             path = self._path(start, end, allowed, step)
-            motion = join([plan_joint(a, b, self.limits) for a, b in itertools.pairwise(path)])
+            motion = join([plan_joint(a, b, self.limits, points=self._points) for a, b in itertools.pairwise(path)])
             if all(self.collisions.free(joints, allowed) for joints in motion.joints):
                 return motion
         self.require_clear(motion, "the motion", allowed)
@@ -66,7 +76,7 @@ class Planner:
         self, start: Joints, base_from_end: pin.SE3, limits: LineLimits | None = None, allowed: Sequence[Pair] = ()
     ) -> Trajectory:
         """A straight line of the flange to `base_from_end`, checked; see `trajectory.plan_line` for its errors."""
-        motion = plan_line(self.kinematics, start, base_from_end, limits)
+        motion = plan_line(self.kinematics, start, base_from_end, limits, points=self._points)
         self.require_clear(motion, "the straight line", allowed)
         return motion
 

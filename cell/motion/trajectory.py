@@ -16,10 +16,12 @@ import ruckig
 from numpy.typing import NDArray
 
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.point_speed import PointSpeed
 from drivers.errors import RefusedError
 
 PERIOD = 0.008
 """Time between samples in s; drivers interpolate."""
+ROUNDING = 1.0005
 SINGULAR = 0.02
 """Manipulability (rad/s of joints per m/s, inverted) below which a straight line is refused."""
 
@@ -90,11 +92,13 @@ def join(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(np.concatenate(times), np.concatenate(joints))
 
 
-def plan_joint(start: Joints, end: Joints, limits: JointLimits, period: float = PERIOD) -> Trajectory:
+def plan_joint(
+    start: Joints, end: Joints, limits: JointLimits, period: float = PERIOD, points: PointSpeed | None = None
+) -> Trajectory:
     """The fastest straight joint move from rest at `start` to rest at `end` within speed, acceleration and jerk.
 
-    Straight in joint space, so that a path checked for collisions is the path that is driven. Raises `RefusedError`
-    when an end lies outside the joint ranges.
+    Straight in joint space, so that a path checked for collisions is the path that is driven; no faster than `points`
+    may be. Raises `RefusedError` when an end lies outside the joint ranges.
     """
     start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
     for name, joints in (("start", start), ("end", end)):
@@ -110,6 +114,8 @@ def plan_joint(start: Joints, end: Joints, limits: JointLimits, period: float = 
     speed, acceleration, jerk = (
         float(np.min(np.array(getattr(limits, name)) / way)) for name in ("speed", "acceleration", "jerk")
     )
+    if points is not None:
+        speed = min(speed, points.fraction_speed(start, end))
     times, fraction = _profile(speed, acceleration, jerk, period)
     joints = start + fraction[:, None] * (end - start)
     joints[-1] = end
@@ -122,11 +128,13 @@ def plan_line(
     base_from_end: pin.SE3,
     line: LineLimits | None = None,
     period: float = PERIOD,
+    points: PointSpeed | None = None,
 ) -> Trajectory:
     """The flange in a straight line from where `start` (6,) holds it to `base_from_end`, turning evenly on the way.
 
-    The branch of `start` is kept all along. Where a joint would be too fast the whole line is slowed down. Raises
-    `Unreachable` when the line leaves the reach and `SingularLine` when it comes too near a singular posture.
+    The branch of `start` is kept all along. Where a joint or one of `points` would be too fast the whole line is slowed
+    down. Raises `Unreachable` when the line leaves the reach and `SingularLine` when it comes too near a singular
+    posture.
     """
     line = line or LineLimits()
     start = np.array(start, dtype=np.float64)
@@ -149,6 +157,9 @@ def plan_line(
         trajectory = Trajectory(times, joints)
         _refuse_singular(kinematics, trajectory)
         excess = float((np.abs(trajectory.speeds()) / limit).max())
+        if points is not None:
+            # The limit of a line that does not turn is met by every point exactly, up to the joints' own accuracy.
+            excess = max(excess, points.excess(times, joints) / ROUNDING)
         if excess <= 1.0:
             return trajectory
         speed, scale = speed / (1.05 * excess), scale / (1.05 * excess) ** 2

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import RefusedError
+from drivers.errors import Measured, RefusedError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -117,7 +117,10 @@ class Cloud:
             raise RefusedError(
                 f"the sweep gave {self.size} points in {self.shape[0]} profiles ({int(self.rejected.sum())} rejected), "
                 f"at least {least_points} are needed. Check that the laser lights the surface, and the scan camera's "
-                "exposure"
+                "exposure",
+                Measured("points of the cloud", self.size, least=least_points),
+                Measured("points rejected as outliers", int(self.rejected.sum())),
+                Measured("profiles", self.shape[0]),
             )
         return self
 

@@ -6,7 +6,7 @@ the deviations around it, so that near outliers and streaks stand out (theory sh
 
 from __future__ import annotations
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,16 +57,14 @@ def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> N
 
 def _pass(values: Array, kept: Array, noise: Array, level: float, settled: Mask) -> tuple[Mask, Mask]:
     """Outliers with respect to the `kept` values, and the points that their neighbours supported; those `settled` are
-    not looked at. Two threads take half of the lines each."""
+    not looked at. Two threads take half of the lines each; what ends either of them ends the pass."""
     outliers = np.zeros(values.shape, dtype=np.bool_)
     supported = settled.copy()
     middle = len(values) // 2
-    other = threading.Thread(
-        target=_judge, args=(values, kept, noise, level, middle, len(values), supported, outliers), daemon=True
-    )
-    other.start()
-    _judge(values, kept, noise, level, 0, middle, supported, outliers)
-    other.join()
+    with ThreadPoolExecutor(1, "outliers") as pool:
+        other = pool.submit(_judge, values, kept, noise, level, middle, len(values), supported, outliers)
+        _judge(values, kept, noise, level, 0, middle, supported, outliers)
+        other.result()
     return outliers, supported
 
 

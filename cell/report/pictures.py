@@ -1,115 +1,119 @@
-"""The picture of a run: a stripe frame, the cloud coloured by its deviation, and the place error as bars."""
+"""The picture of a run for the person at the cell: the board as found, the surface, the place error or the reason.
+
+Each panel shows what the run has of it. Where a run ended early the panels show what was looked at, and why that did
+not do. The panels themselves are drawn in `panels.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+import pinocchio as pin
 from matplotlib.figure import Figure
 
-from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
-from drivers.interfaces import Image, Vector
+from cell.frames import FrameStore
+from cell.geometry.poses import transform
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job
+from cell.reconstruction import Cloud
+from cell.report.evidence import Evidence, ended_in
+from cell.report.panels import (
+    BoardPanel,
+    StripePanel,
+    SurfacePanel,
+    draw_board,
+    draw_error,
+    draw_reason,
+    draw_stripe,
+    draw_surface,
+    empty,
+)
+from cell.steps.drive_to_target import Arrival
+from cell.steps.laser_sweep import SweepRecord
+from cell.steps.photograph import BoardFix
+from cell.steps.reconstruct import Reconstruction
+from cell.vision import BoardView
+from drivers.interfaces import Frame
+from statemachine.runner import RunResult
 
-MAX_POINTS = 40_000
+SCALE_SHARE = 1 / 3
+"""End of the colours' scale in tolerances: what lies farther off the surface counts against it."""
 
 
-def run_picture(
-    path: Path,
-    *,
-    stripe: tuple[Image, Vector, Vector] | None,
-    cloud: tuple[Vector, Vector] | None,
-    truth: dict[str, Any] | None,
-    title: str,
-    seams: Sequence[dict[str, Any]] = (),
+def draw_run(
+    path: Path, job: Job, nominal: NominalSurface, result: RunResult, report: Mapping[str, Any], frames: FrameStore
 ) -> None:
-    """Draw what a run has: parts that it did not get to are left out, with a word in their place.
-
-    `stripe` is a frame with the rows and the centres in px of its stripe; `cloud` is points (n, 3) in the surface's
-    frame in m with their signed deviations (n,) from the nominal surface in m; `truth` and `seams` are the report's
-    parts of these names.
-    """
-    figure = Figure(figsize=(16, 5.2), dpi=110, layout="constrained")
+    """Draw a run's picture from what its steps made, from what its end shows, and from its report."""
+    evidence = Evidence.of(result)
+    figure = Figure(figsize=(17, 6), dpi=110, layout="constrained")
+    title = f"{report['outcome'].upper()}: run {report['run']}, job {job.job.name}"
+    if report["simulated"]:
+        title += f" (simulated, seed {report['seed']}, level {report['level']})"
     figure.suptitle(title)
-    axes = figure.subplots(1, 3, width_ratios=[1.15, 1.25, 1.0])
-    _stripe(axes[0], stripe)
-    _cloud(figure, axes[1], cloud, seams)
-    _bars(axes[2], truth)
+    board, stripe = _board(result, evidence, frames), _stripe(result, frames)
+    surface = _surface(job, nominal, result, evidence)
+    scanned = surface is not None or stripe is not None
+    left, *middle, right = figure.subplots(1, 2 + scanned, width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0])
+    if board is None:
+        empty(left, "the board", "not photographed")
+    else:
+        draw_board(left, board)
+    if surface is not None:
+        seams = (report["scan"] or {}).get("seams", ())
+        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams)
+    elif stripe is not None:
+        draw_stripe(middle[0], stripe)
+    if report["outcome"] == "placed":
+        draw_error(right, report["truth"], report["place_bound_95"], 1e3 * job.place.tolerance)
+    else:
+        draw_reason(right, report, ended_in(result))
     figure.savefig(path)
 
 
-def _stripe(axes: Axes, stripe: tuple[Image, Vector, Vector] | None) -> None:
-    axes.set_title("stripe in the middle of the sweep")
-    if stripe is None:
-        _empty(axes, "no sweep")
-        return
-    image, rows, centres = stripe
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-    axes.plot(centres, rows, ",", color="tab:red")
-    axes.set_xlabel("column in px")
-    axes.set_ylabel("row in px")
+def _board(result: RunResult, evidence: Evidence, frames: FrameStore) -> BoardPanel | None:
+    """The photograph that mattered last: the refused one, one of a step that broke off, or the one measured with."""
+    frame, view = evidence.seen.get("frame"), evidence.seen.get("view")
+    if isinstance(frame, Frame):
+        return BoardPanel(frame.image, view if isinstance(view, BoardView) else None, refused=True)
+    if frames.last is not None and frames.last[0].startswith("board") and ended_in(result) is not None:
+        return BoardPanel(frames.last[1].image, None)
+    fix, arrival = result.results.get("board_photo"), result.results.get("drive_to_target")
+    if not isinstance(fix, BoardFix) and isinstance(arrival, Arrival):
+        fix = arrival.fix
+    if not isinstance(fix, BoardFix):
+        return None
+    return BoardPanel(fix.frames[-1].image, fix.views[-1] if fix.views else None, fix.residual_px)
 
 
-def _cloud(figure: Figure, axes: Axes, cloud: tuple[Vector, Vector] | None, seams: Sequence[dict[str, Any]]) -> None:
-    told = [seam_words(seam) for seam in seams]
-    axes.set_title("\n".join(["cloud, coloured by its deviation from the nominal surface", *told]), fontsize="medium")
-    if cloud is None or len(cloud[0]) == 0:
-        _empty(axes, "no cloud")
-        return
-    points, deviation = cloud
-    chosen = np.linspace(0, len(points) - 1, min(MAX_POINTS, len(points))).astype(int)
-    span = max(0.02, float(np.percentile(np.abs(deviation), 98)) * 1e3)
-    shown = axes.scatter(
-        points[chosen, 0] * 1e3, points[chosen, 1] * 1e3, c=deviation[chosen] * 1e3, s=1, cmap="coolwarm",
-        vmin=-span, vmax=span, linewidths=0,
-    )  # fmt: skip
-    axes.set_aspect("equal")
-    axes.set_xlabel("x along the sweep in mm")
-    axes.set_ylabel("y in mm")
-    figure.colorbar(shown, ax=axes, label="deviation in mm", shrink=0.8)
+def _surface(job: Job, nominal: NominalSurface, result: RunResult, evidence: Evidence) -> SurfacePanel | None:
+    """The cloud in the surface's frame, with deviations where a pose was found, believed or not."""
+    made, pose, fix = (result.results.get(name) for name in ("reconstruct", "invert_pose", "board_photo"))
+    cloud = made.cloud if isinstance(made, Reconstruction) else evidence.seen.get("cloud")
+    if not isinstance(cloud, Cloud):
+        return None
+    lines, rows = cloud.valid.nonzero()
+    points = cloud.points[lines, rows]
+    judged = evidence.seen.get("pose")
+    base_from_surface = pose.base_from_surface if isinstance(pose, PlacePose) else judged
+    if isinstance(base_from_surface, pin.SE3):
+        local = transform(base_from_surface.inverse(), points)
+        return SurfacePanel(local, nominal.deviations(local), believed=isinstance(pose, PlacePose))
+    if isinstance(fix, BoardFix):
+        drawn = fix.base_from_board * job.place_from_board.inverse() * job.surface.place_from_surface.se3()
+        points = transform(drawn.inverse(), points)
+    return SurfacePanel(points, None, believed=False)
 
 
-def seam_words(seam: dict[str, Any]) -> str:
-    """One of the report's seams in a line."""
-    first, second = (number + 1 for number in seam["sweeps"])
-    return (
-        f"sweep {second} on sweep {first}: mean {seam['mean_mm']:+.3f} mm (expected ± {seam['expected_mean_mm']:.3f}), "
-        f"rms {seam['rms_mm']:.3f} mm (expected {seam['expected_rms_mm']:.3f})"
-    )
-
-
-def _bars(axes: Axes, truth: dict[str, Any] | None) -> None:
-    axes.set_title("place error over 45 points")
-    if truth is None:
-        _empty(axes, "no truth: real devices, or nothing placed")
-        return
-    names = ["x", "y", "z", "d"]
-    places = np.arange(len(names))
-    own = [truth["error_mm"][name] for name in names]
-    rows = [
-        ("this run (simulated)", [(entry["mean"], entry["max"]) for entry in own], "tab:blue"),
-        ("paper, optimised (its hardware)", [TABLE_1_OPTIMISED[name] for name in names], "tab:gray"),
-        ("paper, Handscan (its hardware)", [TABLE_1_HANDSCAN[name] for name in names], "silver"),
-    ]
-    for k, (label, values, colour) in enumerate(rows):
-        mean = np.array([value[0] for value in values])
-        top = np.array([value[1] for value in values])
-        axes.bar(places + 0.27 * (k - 1), mean, 0.25, color=colour, label=label)
-        axes.errorbar(
-            places + 0.27 * (k - 1), mean, yerr=[np.zeros(4), top - mean], fmt="none", ecolor="black", capsize=3
-        )
-    axes.axhline(
-        truth["bound_mm"], color="tab:green", linestyle="--", label=f"expected mean D {truth['bound_mm']:.3f} mm"
-    )
-    axes.set_yscale("log")
-    axes.set_xticks(places, ["x", "y", "z", "D"])
-    axes.set_ylabel("mean, whisker to max, in mm (log)")
-    axes.set_ylim(bottom=0.004)
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2)
-
-
-def _empty(axes: Axes, text: str) -> None:
-    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
-    axes.set_axis_off()
+def _stripe(result: RunResult, frames: FrameStore) -> StripePanel | None:
+    """The middle of the sweep, or the last frame of one that broke off."""
+    sweep = result.results.get("laser_sweep")
+    if isinstance(sweep, SweepRecord):
+        profile = sweep.middle_profile
+        rows = profile.rows.astype(float)
+        return StripePanel(sweep.middle.image, np.column_stack([profile.centres[profile.rows], rows]))
+    if frames.last is not None and frames.last[0] == "stripe":
+        return StripePanel(frames.last[1].image, None)
+    return None

@@ -1,7 +1,12 @@
-"""`report.json` and the picture of a run: what happened, what was placed, and in a simulated cell how true it is."""
+"""`report.json` and the picture of a run: what happened, what was placed, and in a simulated cell how true it is.
+
+Every key is told in `docs/report.md`.
+"""
 
 from __future__ import annotations
 
+import logging
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -9,15 +14,22 @@ from typing import Any
 import numpy as np
 
 from cell.config import CellConfig
-from cell.geometry.poses import to_ur, transform
+from cell.frames import FrameStore
+from cell.geometry.poses import to_ur
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
+from cell.report.bound import stated_bound
+from cell.report.evidence import last_frames, measured, refusal
 from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
-from cell.runs import REPORT, write_json
+from cell.runs import REPORT, when, write_json
 from cell.steps.laser_sweep import SweepRecord
 from cell.steps.reconstruct import Reconstruction
-from drivers.interfaces import Image, Vector
+from cell.version import release
+from drivers.interfaces import Vector
 from statemachine.runner import RunResult
+from statemachine.step import Summarised
+
+log = logging.getLogger(__name__)
 
 
 def make_report(
@@ -30,51 +42,117 @@ def make_report(
     info: dict[str, Any],
     started: float,
     witness: Witness | None,
-    frames_missing: str | None,
+    frames: FrameStore,
 ) -> dict[str, Any]:
     """Everything about a run as JSON-ready data; also `report.json` and `picture.png` in its folder.
 
     Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
     """
-    pose = result.results.get("invert_pose")
+    ended = time.time()
+    pose, made = (result.results.get(name) for name in ("invert_pose", "reconstruct"))
     report: dict[str, Any] = {
         "run": folder.name,
+        "kind": "job",
+        "version": release(),
         "outcome": result.outcome.value,
         "reason": result.reason,
         "code": result.code,
-        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(started)),
-        "wall_s": round(time.time() - started, 2),
+        "started": when(started),
+        "ended": when(ended),
+        "wall_s": round(ended - started, 2),
         **info,
-        "steps": [
-            {"name": step.name, "state": step.state, "duration_s": round(step.duration_s, 3), "retries": step.retries}
-            for step in result.steps
-        ],
+        "steps": _steps(result),
+        "faults": _faults(result),
+        "refusal": refusal(result, folder, frames),
+        "last_frames": last_frames(result, frames),
         "place_pose": None,
+        "place_pose_units": {"translation_mm": "mm", "rotation_vector_rad": "rad"},
         "place_sigma": None,
+        "place_sigma_units": {"translation_mm": "mm", "rotation_mrad": "mrad"},
+        "place_bound_95": None,
+        "tolerance": {"translation_mm": 1e3 * job.place.tolerance, "rotation_mrad": 1e3 * job.place.tolerance_angle},
+        "measured": [],
         "assumed_noise": {"level": info["level"], "sigmas": _configured_noise(config)},
-        "scan": None,
+        "scan": made.summary() if isinstance(made, Reconstruction) else None,
         "truth": None,
     }
-    made = result.results.get("reconstruct")
-    if isinstance(made, Reconstruction):
-        report["scan"] = made.summary()
     if isinstance(pose, PlacePose):
         report["place_pose"] = _pose(pose, job)
         report["place_sigma"] = _sigma(pose)
-    if frames_missing is not None:
-        report["frames_missing"] = frames_missing
-    write_json(folder / REPORT, report)
+        report["place_bound_95"] = stated_bound(job, nominal, pose, repeatability)
+    report["measured"] = measured(result, job, None, report["place_bound_95"])
+    if frames.failure is not None:
+        report["frames_missing"] = frames.failure
+    _write(folder, strict(report))
     if witness is not None:
         try:
             _add_truth(report, config, job, nominal, repeatability, result, witness)
         except Exception as error:
             report["truth_missing"] = f"{type(error).__name__}: {error}"
+    report["measured"] = measured(result, job, report["truth"], report["place_bound_95"])
     try:
-        _draw(folder, job, nominal, result, report)
+        # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
+        from cell.report.pictures import draw_run
+
+        draw_run(folder / "picture.png", job, nominal, result, report, frames)
     except Exception as error:
         report["picture_missing"] = f"{type(error).__name__}: {error}"
-    write_json(folder / REPORT, report)
+    report = strict(report)
+    _write(folder, report)
     return report
+
+
+def _write(folder: Path, report: dict[str, Any]) -> None:
+    """The report as a file; a disk that takes none of it does not hide how the run ended."""
+    try:
+        write_json(folder / REPORT, report)
+    except OSError as error:
+        report["report_missing"] = f"{type(error).__name__}: {error}"
+        log.error("the report could not be written: %s", error)
+
+
+def strict(data: Any) -> Any:
+    """The same data as strict JSON has it: a number that is none becomes None."""
+    if isinstance(data, dict):
+        return {str(key): strict(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [strict(value) for value in data]
+    if isinstance(data, np.generic):
+        return strict(data.item())
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data
+
+
+def _steps(result: RunResult) -> list[dict[str, Any]]:
+    rows = []
+    for step in result.steps:
+        made = result.results.get(step.name)
+        rows.append(
+            {
+                "name": step.name,
+                "state": step.state,
+                "duration_s": round(step.duration_s, 3),
+                "wall_s": round(step.wall_s, 3),
+                "retries": step.retries,
+                "result": dict(made.summary()) if isinstance(made, Summarised) else None,
+            }
+        )
+    return rows
+
+
+def _faults(result: RunResult) -> list[dict[str, Any]]:
+    return [
+        {
+            "at": when(fault.at),
+            "step": fault.step,
+            "attempt": fault.attempt,
+            "code": fault.code,
+            "reason": fault.reason,
+            "remedy": fault.remedy,
+        }
+        for fault in result.faults
+    ]
 
 
 def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:
@@ -120,39 +198,18 @@ def _add_truth(
     """The comparison with the simulated world; raises when that does not answer any more."""
     now = ask_truth(config.cell.truth)
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
-    report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part")}
+    report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part", "collisions")}
     sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     if isinstance(pose, PlacePose) and witness.at_sweep is not None:
         report["pose_error"] = pose_error(pose, witness.at_sweep)
+        report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
     if report["outcome"] != "placed" or not isinstance(pose, PlacePose):
         return
-    report["truth"] = place_error(job, nominal, now)
+    truth = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
-    report["truth"]["bound_mm"] = expected_error(
+    truth["bound_mm"] = expected_error(
         job, nominal, pose, sweep.base_from_flange, len(sweep.swaths), repeatability, now
     )
     if isinstance(made, Reconstruction) and witness.at_sweep is not None:
-        report["truth"]["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
-
-
-def _draw(folder: Path, job: Job, nominal: NominalSurface, result: RunResult, report: dict[str, Any]) -> None:
-    # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
-    from cell.report.pictures import run_picture
-
-    stripe: tuple[Image, Vector, Vector] | None = None
-    cloud: tuple[Vector, Vector] | None = None
-    sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
-    if isinstance(sweep, SweepRecord):
-        profile = sweep.middle_profile
-        stripe = (sweep.middle.image, profile.rows.astype(float), profile.centres[profile.rows])
-    if isinstance(made, Reconstruction) and isinstance(pose, PlacePose):
-        lines, rows = made.cloud.valid.nonzero()
-        points = transform(pose.base_from_surface.inverse(), made.cloud.points[lines, rows])
-        deviations = nominal.deviations(points)
-        on_surface = np.isfinite(deviations)
-        cloud = (points[on_surface], deviations[on_surface])
-    title = f"run {report['run']}: job {job.job.name}, {report['outcome']}"
-    if report["simulated"]:
-        title += f" · simulated, seed {report['seed']}, level {report['level']}"
-    seams = (report["scan"] or {}).get("seams", ())
-    run_picture(folder / "picture.png", stripe=stripe, cloud=cloud, truth=report["truth"], title=title, seams=seams)
+        truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
+    report["truth"] = truth

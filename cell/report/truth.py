@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial import cKDTree
 
 from cell.geometry.poses import difference, from_matrix, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
+from cell.report.bound import draws, part_points, placed_points, point_covariances, through
 from drivers.errors import CellError
 from drivers.interfaces import Vector
 from statemachine.runner import Event
 
-SEGMENTS, POINTS_PER_SEGMENT = 5, 9
 SENSOR_POINTS = 1000
 TIMEOUT_S = 5.0
 
@@ -52,18 +51,6 @@ class Witness:
 def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:
     """A pose of the truth by its name."""
     return from_matrix(truth["poses"][name])
-
-
-def part_points(nominal: NominalSurface) -> Vector:
-    """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each."""
-    low, high = nominal.vertices[:, :2].min(axis=0), nominal.vertices[:, :2].max(axis=0)
-    count = SEGMENTS * POINTS_PER_SEGMENT
-    along = low[0] + (high[0] - low[0]) * (np.arange(count) + 0.5) / count
-    across = np.tile(
-        np.linspace(0.9 * low[1] + 0.1 * high[1], 0.1 * low[1] + 0.9 * high[1], POINTS_PER_SEGMENT), SEGMENTS
-    )
-    _, nearest = cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
-    return nominal.samples[nearest]
 
 
 def pose_error(pose: PlacePose, truth: dict[str, Any]) -> dict[str, Any]:
@@ -122,24 +109,7 @@ def expected_error(
     }
     radial, angle = sigma["arm_repeatability"], sigma["arm_repeatability_rotation"]
     assumed = np.diag([radial**2 / 3] * 3 + [angle**2] * 3)
-    base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
-    points = transform(base_from_part, part_points(nominal))
-    place_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
-    by_pose = _jacobians(points - pose.base_from_surface.translation)
-    by_sweep = _jacobians(points - base_from_sweep_flange.translation)
-    by_placing = _jacobians(points - place_flange.translation)
-    covariance = _through(by_pose, pose.covariance) + _through(by_sweep, (assumed - configured) / sweeps)
-    values, vectors = np.linalg.eigh(covariance + _through(by_placing, assumed))
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    draws = np.random.default_rng(0).standard_normal((2000, 1, 3, 1))
-    return float(1e3 * np.linalg.norm((roots @ draws)[..., 0], axis=-1).mean())
-
-
-def _through(jacobians: Vector, covariance: Vector) -> Vector:
-    """Covariances (n, 3, 3) of points whose Jacobians (n, 3, 6) by a pose of covariance (6, 6) are given."""
-    return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1), dtype=np.float64)
-
-
-def _jacobians(arms: Vector) -> Vector:
-    """∂point/∂(δt, δφ) (n, 3, 6) for points at `arms` (n, 3) from the pose's origin."""
-    return np.stack([np.hstack([np.eye(3), -pin.skew(arm)]) for arm in arms])
+    points, _ = placed_points(job, nominal, pose)
+    covariance = point_covariances(job, nominal, pose, pose.covariance, assumed)
+    covariance = covariance + through(points - base_from_sweep_flange.translation, (assumed - configured) / sweeps)
+    return float(1e3 * np.linalg.norm(draws(covariance), axis=-1).mean())

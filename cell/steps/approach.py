@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
 
 from drivers.clock import Clock
-from drivers.errors import DeadlineError
+from drivers.errors import DeviceFault
 from drivers.interfaces import Vehicle, VehicleState
 
 CONTROL_PERIOD_S = 0.04
@@ -76,20 +77,23 @@ def line_command(pose: Planar, goal: Planar, speed: float) -> tuple[float, float
     return v, float(turn)
 
 
-class Odometry:
-    """The vehicle's pose in the place frame, from its odometry and the newest pose that it was seen at."""
-
-    def __init__(self, vehicle: Vehicle, seen: Planar) -> None:
-        self._vehicle = vehicle
-        self.anchor(seen)
-
-    def anchor(self, seen: Planar) -> None:
-        """From now on count from the pose `seen`; the vehicle stands still."""
-        self._place_from_odometry = seen * _reading(self._vehicle.state()).inverse()
+class Located(Protocol):
+    """Knows where the vehicle is, by odometry."""
 
     def pose(self) -> Planar:
         """The pose now."""
-        return self._place_from_odometry * _reading(self._vehicle.state())
+
+
+class RelativeOdometry:
+    """The vehicle's pose relative to where it stood when this was made."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._start_from_odometry = _reading(vehicle.state()).inverse()
+
+    def pose(self) -> Planar:
+        """The pose now."""
+        return self._start_from_odometry * _reading(self._vehicle.state())
 
 
 def _reading(state: VehicleState) -> Planar:
@@ -97,7 +101,7 @@ def _reading(state: VehicleState) -> Planar:
 
 
 def drive_line(
-    vehicle: Vehicle, odometry: Odometry, goal: Planar, speed: float, clock: Clock, check: Callable[[], None]
+    vehicle: Vehicle, odometry: Located, goal: Planar, speed: float, clock: Clock, check: Callable[[], None]
 ) -> None:
     """Drive along the goal's line and stop at the goal, on odometry. `check` raises when the run is to end."""
     distance = abs((goal.inverse() * odometry.pose()).x)
@@ -111,20 +115,31 @@ def drive_line(
         direction = v
         if clock.now() > deadline:
             vehicle.stop()
-            raise DeadlineError("vehicle", f"did not arrive at x = {goal.x:.3f} m in time; is it blocked or slipping?")
+            raise _blocked(f"did not arrive at x = {goal.x:.3f} m in time")
         vehicle.drive(v, w)
         clock.sleep(CONTROL_PERIOD_S)
     vehicle.stop()
 
 
-def turn_to(vehicle: Vehicle, odometry: Odometry, yaw: float, clock: Clock, check: Callable[[], None]) -> None:
+def _blocked(what: str) -> DeviceFault:
+    """A vehicle that does not come along: driving against what blocks it once more is not for a program to decide."""
+    return DeviceFault(
+        "vehicle",
+        "vehicle.blocked",
+        f"it {what}",
+        recoverable=False,
+        hint="Look what blocks it or where its wheels slip, and jog it away from there. Then run the job again.",
+    )
+
+
+def turn_to(vehicle: Vehicle, odometry: Located, yaw: float, clock: Clock, check: Callable[[], None]) -> None:
     """Turn on the spot to `yaw` in the place frame, on odometry, to 0.1°."""
     deadline = clock.now() + 20.0
     while abs(error := wrap(yaw - odometry.pose().yaw)) > math.radians(0.1):
         check()
         if clock.now() > deadline:
             vehicle.stop()
-            raise DeadlineError("vehicle", f"did not turn by {math.degrees(error):.2f} deg in time; is it blocked?")
+            raise _blocked(f"did not turn by {math.degrees(error):.2f} deg in time")
         rate = math.copysign(max(math.radians(0.6), min(MAX_TURN_RATE, TURN_GAIN * abs(error))), error)
         vehicle.drive(0.0, rate)
         clock.sleep(CONTROL_PERIOD_S)

@@ -15,7 +15,7 @@ from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.planning import ScanPlan
 from cell.steps.moves import Mover
-from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors
+from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import CellError, DeviceFault
 
 RUN_UP_S = 0.7
@@ -30,7 +30,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     """Move the scan head over the placement area and pair every profile with the flange's pose.
 
     Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, the arm's
-    states have gaps or it moved unevenly between them; whatever happens, the arm is stopped before the error goes on.
+    states have gaps or it moved unevenly between them, or the camera's times are not known well enough; whatever
+    happens, the arm is stopped before the error goes on.
     """
     scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
     shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
@@ -90,8 +91,9 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         )
     steady = np.polynomial.Polynomial.fit(times[lines], done, 1)
     residual = float(np.std(done - steady(times[lines])))
+    shift, variance = shift_by_times([TimeBound.of(camera)], scan.speed, errors)
     shared = np.zeros((6, 6))
-    shared[:3, :3] = np.outer(along, along) * (scan.speed * LATENCY_S * errors.rate) ** 2
+    shared[:3, :3] = np.outer(along, along) * ((scan.speed * LATENCY_S * errors.rate) ** 2 + variance)
     own = scan.speed * JITTER_S * errors.rate * along
     return Swath(
         builder=collector.builder,
@@ -103,6 +105,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         covariance=errors.repeatability + shared,
         lost=collector.lost + uneven,
         residual=residual,
+        shift=shift,
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],
         middle_profile=middle[1],

@@ -42,7 +42,7 @@ def collect_scan(
     board = parse_board(config.calibration.fine.board)
     views = scan_calibration_views(config, board)
     camera, rail = devices.scan_camera, devices.rail
-    if not rail.state().homed:
+    if not rail.state().homed_here:
         progress(0.0, "homing the rail")
         rail.home().wait(60.0)
     mover.to_joints(HOME)
@@ -53,6 +53,7 @@ def collect_scan(
     for k, view in enumerate(views):
         check()
         progress(k / len(views), f"fine board, view {k + 1} of {len(views)}")
+        mover.hold()
         travel = rail.move_to(view.rail_position)
         move_to_view(devices, mover, view, k)
         travel.wait(30.0)
@@ -121,6 +122,7 @@ def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
     except DeviceFault as fault:
         if fault.device != devices.arm.name or not fault.recoverable:
             raise
+        devices.gate.require()
         devices.arm.recover()
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
 

@@ -9,14 +9,17 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from cell.job import Job
-from cell.steps.approach import Odometry, Planar, drive_line, turn_to
+from cell.steps.approach import Planar, drive_line, turn_to
 from cell.steps.photograph import BoardFix
+from cell.steps.way import BACK_UP, Way
+from cell.steps.whereabouts import Whereabouts, next_step
 from drivers.clock import Clock
-from drivers.errors import RefusedError
+from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vehicle
 
 MAX_TRIES = 5
-BACK_UP = 0.45  # m, the run that a second try needs to work off an error to the side
+SETTLE_S = 0.3
+"""The suspension's, after the vehicle has come to rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,58 +47,93 @@ def drive_to_target(
     job: Job,
     vehicle_from_base: pin.SE3,
     vehicle: Vehicle,
-    odometry: Odometry,
+    whereabouts: Whereabouts,
     photograph: Callable[[], BoardFix],
     clock: Clock,
     check: Callable[[], None],
     progress: Callable[[float, str], None],
+    note: Callable[[str], None],
+    hold: Callable[[], None] = lambda: None,
 ) -> Arrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
-    The arm stands in its looking pose already, the vehicle is enabled, and `odometry` knows its place roughly until the
-    board is seen. On odometry alone it goes no further than the staging pose.
-    `photograph` gives the board in the base; `check` raises when the run is
-    to end. Raises `RefusedError` when the tolerance is not met after five tries.
+    The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than the
+    staging pose, and only when `whereabouts` knows where it stands. `photograph` gives the board in the base; `check`
+    raises when the run is to end; `note` takes what is worth keeping; `hold` is called before
+    each way, with the vehicle at rest: a paused run waits in it.
+    Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
+    close to the station, and when the tolerance is not met after five tries.
     """
+    way = Way(job, vehicle_from_base, whereabouts)
 
     def place_from_vehicle(fix: BoardFix) -> Planar:
         return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
+
+    def look() -> BoardFix:
+        fix = photograph()
+        if (doubt := whereabouts.see(place_from_vehicle(fix))) is not None:
+            note(doubt)
+        return fix
+
+    def look_again() -> BoardFix:
+        way_so_far = whereabouts.way
+        try:
+            return look()
+        except RefusedError as unseen:
+            raise RefusedError(
+                f"after {way_so_far:.2f} m on odometry the board is not seen from where it should be: {unseen}. Look "
+                "where the vehicle stands and bring it where it sees the board with `cell jog vehicle`; had it stood "
+                "at its start, and do its wheels slip?"
+            ).showing(*unseen.numbers, seen=unseen.seen) from unseen
+
+    def go(goal: Planar) -> None:
+        hold()
+        way.require_line(goal)
+        drive_line(vehicle, whereabouts, goal, approach.speed, clock, check)
 
     approach = job.approach
     staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
     progress(0.05, "looking whether the board is in sight already")
     try:
-        seen = place_from_vehicle(photograph())
-        odometry.anchor(seen)
-    except RefusedError:
-        seen = odometry.pose()
-    if (staging.inverse() * seen).x < 0:
+        look()
+    except RefusedError as unseen:
+        try:
+            whereabouts.pose()
+        except RefusedError as unknown:
+            text = f"{unknown}; and it does not see the board: {unseen}. {next_step(job)}"
+            raise RefusedError(text).showing(*unseen.numbers, seen=unseen.seen) from unknown
+    if (staging.inverse() * whereabouts.pose()).x < 0:
         progress(0.1, "driving on odometry")
-        drive_line(vehicle, odometry, staging, approach.speed, clock, check)
+        go(staging)
     for count in range(1, 2 * MAX_TRIES):
         progress(min(0.9, 0.3 + 0.15 * count), "looking at the board")
-        clock.sleep(0.3)  # the suspension settles
-        fix = photograph()
+        clock.sleep(SETTLE_S)
+        fix = look_again()
         base_from_place = fix.base_from_board * job.place_from_board.inverse()
-        seen = place_from_vehicle(fix)
-        odometry.anchor(seen)
-        error = target.inverse() * seen
+        error = target.inverse() * place_from_vehicle(fix)
         near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance
         if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
             vehicle.brake()
             return Arrival(base_from_place, fix, error.x, error.y, error.yaw, count)
         if near:
-            turn_to(vehicle, odometry, target.yaw, clock, check)
+            hold()
+            way.require_turn(target.yaw)
+            turn_to(vehicle, whereabouts, target.yaw, clock, check)
         elif abs(error.y) > 0.8 * approach.tolerance and error.x > -0.5 * BACK_UP:
             progress(0.5, "backing up")
-            drive_line(vehicle, odometry, target * Planar(-BACK_UP, 0.0, 0.0), approach.speed, clock, check)
-            drive_line(vehicle, odometry, target, approach.speed, clock, check)
+            go(target * Planar(-BACK_UP, 0.0, 0.0))
+            go(target)
         else:
-            drive_line(vehicle, odometry, target, approach.speed, clock, check)
+            go(target)
     vehicle.brake()
     raise RefusedError(
         f"the vehicle stands {1e3 * error.x:.1f} mm along, {1e3 * error.y:.1f} mm across and "
         f"{math.degrees(error.yaw):.2f} deg from its target after {count} photographs, allowed "
         f"{1e3 * approach.tolerance:.0f} mm and {math.degrees(approach.tolerance_angle):.1f} deg; "
-        "check the floor and the wheels"
-    )
+        "check the floor and the wheels",
+        Measured("vehicle off its target, along", 1e3 * error.x, "mm", most=1e3 * approach.tolerance),
+        Measured("vehicle off its target, across", 1e3 * error.y, "mm", most=1e3 * approach.tolerance),
+        Measured(
+            "vehicle turned off its target", math.degrees(error.yaw), "deg", most=math.degrees(approach.tolerance_angle)
+        ),
+    ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]})

@@ -48,6 +48,7 @@ class SweepRecord:
             "lost_frames": sum(swath.lost for swath in self.swaths),
             "points": sum(swath.points for swath in self.swaths),
             "residual_um": [round(1e6 * swath.residual, 2) for swath in self.swaths],
+            "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
         }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -33,17 +33,28 @@ Postures are chosen nearest to the present one, so a fixed beginning keeps the a
 
 
 class Mover:
-    """Moves one arm among the bodies that are known so far. Used by one thread at a time."""
+    """Moves one arm among the bodies that are known so far. Used by one thread at a time.
 
-    def __init__(self, arm: Arm, clock: Clock, config: CellConfig, job: Job | None) -> None:
+    `hold` is called before each free motion, at a moment when nothing moves: a paused run waits in it.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        clock: Clock,
+        config: CellConfig,
+        job: Job | None,
+        hold: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.hold = hold
         self._arm = arm
         self._clock = clock
         self._settle_time = config.arm.settle_time
-        self._line_speed = config.arm.max_tool_speed
+        self._tool_speed = config.arm.max_tool_speed
         self.kinematics = ArmKinematics(limits=_joint_limits(config.arm))
         grasp = None if job is None else job.grasp
         part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
-        self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(_plates(config))]
+        self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
         self._planner = self._plan_among([])
 
     def meet_station(
@@ -67,7 +78,8 @@ class Mover:
         self._planner = self._plan_among(still)
 
     def _plan_among(self, still: Sequence[Body]) -> Planner:
-        return Planner(self.kinematics, CollisionModel(self.kinematics, [*self._moving, *still]))
+        bodies = CollisionModel(self.kinematics, [*self._moving, *still])
+        return Planner(self.kinematics, bodies, tool_speed=self._tool_speed)
 
     @property
     def joints(self) -> Joints:
@@ -81,17 +93,19 @@ class Mover:
 
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose and settle."""
+        self.hold()
         self.follow(self.plan_to(base_from_flange, what))
 
     def to_joints(self, joints: Joints) -> None:
         """Move freely to joint angles and settle."""
+        self.hold()
         self.follow(self._planner.free(self.joints, joints))
 
     def line(
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None
     ) -> bool:
         """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
-        limits = LineLimits(speed=min(speed, self._line_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
+        limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
         return self.follow(self._planner.line(self.joints, base_from_flange, limits, allowed), force_limit)
 
     def plan_line(
@@ -99,7 +113,7 @@ class Mover:
     ) -> tuple[Trajectory, Trajectory]:
         """A free motion to the start of a straight line, and the line itself at `speed` m/s; nothing moves yet."""
         way = self.plan_to(base_from_start, "the start of the line")
-        limits = LineLimits(speed=min(speed, self._line_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
+        limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
         return way, self._planner.line(way.end, base_from_end, limits)
 
     def begin(self, trajectory: Trajectory) -> tuple[ArmMotion, float]:
@@ -126,7 +140,8 @@ def _joint_limits(config: ArmConfig) -> JointLimits:
     )
 
 
-def _plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:
+def deck_plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:
+    """The calibration boards on the deck: name, base_from_centre and size, m."""
     plates = []
     for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
         board = parse_board(plate.board)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,20 +12,24 @@ import pinocchio as pin
 from cell.calibration import TargetCalibration
 from cell.geometry.poses import compose_covariance, from_ur, mean
 from cell.job import PhotoSection
-from cell.vision import BoardSpec, board_pose, find_board
-from drivers.errors import RefusedError
+from cell.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
+from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class BoardFix:
-    """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad."""
+    """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad.
+
+    `views` are the points found in each of the `frames`.
+    """
 
     base_from_board: pin.SE3
     covariance: Vector
     residual_px: float
     obliquity: float
     frames: tuple[Frame, ...]
+    views: tuple[BoardView, ...] = ()
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -45,27 +50,34 @@ def photograph(
     limits: PhotoSection,
     repeatability: Vector,
     count: int = 1,
+    keep: Callable[[Frame], None] = lambda frame: None,
 ) -> BoardFix:
     """Photograph the board `count` times with arm and vehicle at rest and average its pose.
 
-    `repeatability` is the (6, 6) covariance of base_from_flange. Raises `RefusedError` with the reason: board not
-    found, seen more obliquely than `limits.max_obliquity`, residual above `limits.max_residual`, or pose ambiguous.
+    `repeatability` is the (6, 6) covariance of base_from_flange; `keep` is given each frame before it is looked at.
+    Raises `RefusedError` with the reason: board not found, seen more obliquely than `limits.max_obliquity`, residual
+    above `limits.max_residual`, or pose ambiguous; it shows the "frame" and the "view", as far as there is one.
     """
     base_from_flange = from_ur(arm.state().flange)
-    frames = tuple(camera.grab() for _ in range(count))
-    poses = [board_pose(find_board(frame.image, spec), calibration.camera) for frame in frames]
+    frames: list[Frame] = []
+    for _ in range(count):
+        frames.append(camera.grab())
+        keep(frames[-1])
+    views: list[BoardView] = []
+    poses: list[BoardPose] = []
+    for frame in frames:
+        view = None
+        try:
+            view = find_board(frame.image, spec)
+            pose = board_pose(view, calibration.camera)
+            _require(pose, limits)
+        except RefusedError as refused:
+            refused.showing(seen={"frame": frame, "view": view})
+            raise
+        views.append(view)
+        poses.append(pose)
     obliquity = max(pose.obliquity for pose in poses)
-    if obliquity > limits.max_obliquity:
-        raise RefusedError(
-            f"the board is seen {math.degrees(obliquity):.1f} deg from square, allowed up to "
-            f"{math.degrees(limits.max_obliquity):.0f} deg; photograph it from further in front"
-        )
     residual = max(pose.rms_px for pose in poses)
-    if residual > limits.max_residual:
-        raise RefusedError(
-            f"the board's dots miss their places by {residual:.2f} px RMS, allowed up to {limits.max_residual:.2f} px; "
-            "is the target camera still in focus and calibrated, and the board flat?"
-        )
     camera_from_board = mean([pose.camera_from_board for pose in poses])
     base_from_camera = base_from_flange * calibration.flange_from_camera
     hand_eye = compose_covariance(
@@ -74,4 +86,20 @@ def photograph(
     covariance = compose_covariance(
         base_from_camera, hand_eye, camera_from_board, np.mean([pose.covariance for pose in poses], axis=0) / count
     )
-    return BoardFix(base_from_camera * camera_from_board, covariance, residual, obliquity, frames)
+    return BoardFix(base_from_camera * camera_from_board, covariance, residual, obliquity, tuple(frames), tuple(views))
+
+
+def _require(pose: BoardPose, limits: PhotoSection) -> None:
+    if pose.obliquity > limits.max_obliquity:
+        seen, allowed = math.degrees(pose.obliquity), math.degrees(limits.max_obliquity)
+        raise RefusedError(
+            f"the board is seen {seen:.1f} deg from square, allowed up to {allowed:.0f} deg; photograph it from "
+            "further in front",
+            Measured("board, from square", seen, "deg", most=allowed),
+        )
+    if pose.rms_px > limits.max_residual:
+        raise RefusedError(
+            f"the board's dots miss their places by {pose.rms_px:.3g} px RMS, allowed up to {limits.max_residual:.3g} "
+            "px; is the target camera still in focus and calibrated, and the board flat?",
+            Measured("board's dots off their places, RMS", pose.rms_px, "px", most=limits.max_residual),
+        )

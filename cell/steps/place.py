@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import Job
 from cell.steps.moves import HOME, Mover
-from drivers.errors import RefusedError
+from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw
 
 TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
@@ -19,6 +20,35 @@ TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
 
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
+
+
+class PartState(Enum):
+    """Where the part is, as far as the claw's commands and its feedback tell."""
+
+    HELD = "held"
+    UNKNOWN = "unknown"
+    RELEASED = "released"
+
+
+@dataclass(eq=False)
+class PartProgress:
+    """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
+
+    `where` is base_from_part at the release.
+    """
+
+    state: PartState = PartState.HELD
+    where: pin.SE3 | None = None
+
+    def told(self, reason: str) -> str:
+        """A run's reason, not to be read without what has become of the part."""
+        if self.state is PartState.HELD or self.where is None:
+            return reason
+        x, y, z = 1e3 * self.where.translation
+        at = f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the arm base"
+        if self.state is PartState.RELEASED:
+            return f"the part is already down {at} and is not to be placed again, only the retreat failed: {reason}"
+        return f"the claw was told to release the part {at}, look whether it did: {reason}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +65,7 @@ class PlaceResult:
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
+            "base_from_flange_units": {"translation": "m", "rotation_vector": "rad"},
         }
 
 
@@ -44,13 +75,16 @@ def place(
     mover: Mover,
     arm: Arm,
     claw: Claw,
+    part: PartProgress,
     check: Callable[[], None],
     progress: Callable[[float, str], None],
+    note: Callable[[PartProgress], None],
 ) -> PlaceResult:
     """Put the part onto the surface whose pose was measured.
 
     Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
-    `contact_force`; afterwards the arm folds.
+    `contact_force`; afterwards the arm folds. `part` follows what becomes of the part; `note` is called as soon as it
+    is released, before anything else is done.
     Raises `RefusedError`, with the part still held and lifted, when contact comes too early, that is
     more than `contact_travel` from where it was expected, or does not come at all.
     """
@@ -62,6 +96,11 @@ def place(
         return base_from_part * from_parts((0.0, 0.0, height)) * part_from_flange
 
     above, below = flange_at(plan.approach), flange_at(-plan.contact_travel)
+
+    def depth() -> float:
+        on_flange = (flange_at(0.0).inverse() * from_ur(arm.state().flange)).translation
+        return float(on_flange @ job.grasp.flange_from_part.se3().rotation[:, 2])
+
     progress(0.05, "approaching")
     mover.to(above, "the approach pose")
     check()
@@ -69,28 +108,36 @@ def place(
         raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
     progress(0.4, "descending")
     if mover.line(flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
+        height = depth()
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(
             f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
-            "lifted again, still held. Look what lies on the place"
+            "lifted again, still held. Look what lies on the place",
+            Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
         )
     arm.zero_force()
     progress(0.6, "feeling for contact")
     contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
     reached = from_ur(arm.state().flange)
-    depth = float((flange_at(0.0).inverse() * reached).translation @ job.grasp.flange_from_part.se3().rotation[:, 2])
-    if not contact or abs(depth) > plan.contact_travel:
+    off = depth()
+    if not contact or abs(off) > plan.contact_travel:
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(
             f"no contact within {1e3 * plan.contact_travel:.2f} mm of the place pose (the part stopped "
-            f"{1e3 * depth:+.2f} mm from it along the normal); it was lifted again, still held. "
-            "Is the part the right one, and whole?"
+            f"{1e3 * off:+.2f} mm from it along the normal); it was lifted again, still held. "
+            "Is the part the right one, and whole?",
+            Measured("contact depth", 1e3 * off, "mm", most=1e3 * plan.contact_travel)
+            if contact
+            else Measured("reached without contact", 1e3 * off, "mm"),
         )
     progress(0.8, "releasing")
+    part.state, part.where = PartState.UNKNOWN, reached * job.grasp.flange_from_part.se3()
     claw.release()
+    part.state = PartState.RELEASED
+    note(part)
     mover.leave_part()
     progress(0.9, "retreating")
     mover.line(above, plan.speed, TOUCHES)
     progress(0.95, "folding the arm")
     mover.to_joints(HOME)
-    return PlaceResult(reached, contact, depth)
+    return PlaceResult(reached, contact, off)

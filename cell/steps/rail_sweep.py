@@ -8,19 +8,20 @@ from cell.assembly import Devices
 from cell.geometry.poses import from_ur
 from cell.planning import ScanPlan
 from cell.steps.moves import Mover
-from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault
 
 MAX_FLANGE_MOTION = 1e-4
 MAX_RESIDUAL = 5.0
-"""Median deviation of the rail's readings from an even motion that a sweep may have, in σ of a rail position."""
+"""Median distance of the rail's readings from an even motion that a sweep may have, in σ of a rail position."""
 
 
 def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
     """Sweep the scan head over the placement area and pair every profile with the rail's position.
 
     Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the constant-velocity part, the
-    flange moved by more than 0.1 mm meanwhile, or the rail did not run evenly.
+    flange moved by more than 0.1 mm meanwhile, the replies of rail or camera came so late that the sweep may lie off
+    by more than `errors.shift`, or the rail did not run evenly.
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
     mover.to(plan.base_from_flange, "the scan pose")
@@ -50,20 +51,26 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
             recoverable=True,
             hint="See what pushed the arm; the sweep is of no use.",
         )
+    allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
+    if sweep.unevenness > allowed:
+        raise DeviceFault(
+            rail.name,
+            "rail.uneven_sweep",
+            f"the rail's readings lie {1e3 * sweep.unevenness:.3f} mm (median) off an even motion, more than their "
+            f"round trips explain; allowed {1e3 * allowed:.3f} mm",
+            recoverable=True,
+            hint="See whether the carriage jams and what else commands this module.",
+        )
+    times_known = [TimeBound(rail.name, "rail", sweep.time_bound), TimeBound.of(devices.scan_camera)]
+    shift, variance = shift_by_times(times_known, scan.speed, errors)
     samples = sweep.samples
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
     deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
     residual = float(np.median(deviations)) if deviations else 0.0
-    allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
-    if residual > allowed:
-        raise DeviceFault(
-            rail.name,
-            "rail.uneven_sweep",
-            f"the rail's readings lie {1e3 * residual:.3f} mm (median) off an even motion, allowed {1e3 * allowed:.3f}",
-            recoverable=True,
-            hint="Look at the rail's link, at what else this machine is busy with, and whether the carriage jams.",
-        )
-    spread = errors.rail * collector.builder.sweep_direction(base_from_flange)
+    along = collector.builder.sweep_direction(base_from_flange)
+    spread = errors.rail * along
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = np.outer(along, along) * variance
     return Swath(
         builder=collector.builder,
         lines=lines,
@@ -71,9 +78,10 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
         flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
         rail=np.array([sweep.position_at(time) for time in times[lines]]),
         line_spread=np.tile(spread, (len(lines), 1)),
-        covariance=errors.repeatability,
+        covariance=errors.repeatability + shared,
         lost=collector.lost,
         residual=residual,
+        shift=shift,
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],
         middle_profile=middle[1],

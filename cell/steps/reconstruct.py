@@ -23,6 +23,7 @@ from cell.reconstruction import (
 from cell.reconstruction.cloud import Array, Indices
 from cell.reconstruction.seams import Motions
 from cell.steps.laser_sweep import SweepRecord
+from drivers.errors import RefusedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +58,15 @@ def reconstruct(
 
     The vehicle, which carries the arm at `base_from_vehicle`, leans by `lean_sigma` rad, one standard deviation, per
     metre that the arm reaches out: an arm that moves during the sweeps moves its base, too. Raises `RefusedError` when
-    too few points are left.
+    too few points are left; what there is of a cloud is written all the same.
     """
-    cloud = fill_holes(build_cloud(sweep).require(), largest_hole)
+    built = build_cloud(sweep)
+    try:
+        cloud = fill_holes(built.require(), largest_hole)
+    except RefusedError as refused:
+        write_cloud(path, built)
+        refused.showing(seen={"cloud": built})
+        raise
     geometry, variants = calibration.geometry(), calibration.variants()
     covariances = [swath.covariance for swath in sweep.swaths]
 

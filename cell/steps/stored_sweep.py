@@ -26,7 +26,7 @@ from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame, Vector
 
 FILE = "sweep.npz"
-FORMAT = 1
+FORMAT = 2
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
@@ -47,7 +47,7 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
     }
     for k, swath in enumerate(sweep.swaths):
         data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
-        data[f"figures_{k}"] = np.array([swath.lost, swath.residual])
+        data[f"figures_{k}"] = np.array([swath.lost, swath.residual, swath.shift])
     with (folder / FILE).open("wb") as file:
         np.savez(file, **data)
 
@@ -111,7 +111,7 @@ class StoredSweep:
 
 def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeometry, scan: ScanSection) -> Swath:
     arrays: dict[str, Any] = {name: stored[f"{name}_{k}"] for name in _ARRAYS}
-    lost, residual = stored[f"figures_{k}"]
+    lost, residual, shift = stored[f"figures_{k}"]
     shape = (geometry.camera.height, geometry.camera.width)
     collector = Collector(geometry, scan, lambda frame: None, lambda fraction, text: None)
     for frame_id in arrays["frame_ids"]:
@@ -124,6 +124,7 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
         **arrays,
         lost=int(lost),
         residual=float(residual),
+        shift=float(shift),
         points=sum(collector.counts),
         middle=middle[0],
         middle_profile=middle[1],

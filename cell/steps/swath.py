@@ -5,7 +5,7 @@ A frame is let go as soon as its profile has been triangulated, so memory does n
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,7 @@ from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
 from cell.vision import StripeProfile, StripeStream
 from drivers.errors import DeviceFault
-from drivers.interfaces import Frame, FrameStream, Vector
+from drivers.interfaces import Camera, Frame, FrameStream, Vector
 
 MAX_LOST_FRACTION = 0.05
 
@@ -25,11 +25,49 @@ MAX_LOST_FRACTION = 0.05
 @dataclass(frozen=True)
 class SweepErrors:
     """What a sweep's pose may be off by: `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m²
-    and rad²; `rail` one standard deviation of a rail position in m; `rate` seconds of the clock per wall second."""
+    and rad²; `rail` one standard deviation of a rail position in m; `shift` the farthest, in m, that a sweep may lie
+    off as a whole because its times are not known better; `rate` seconds of the clock per wall second."""
 
     repeatability: Vector
     rail: float
+    shift: float
     rate: float = 1.0
+
+
+@dataclass(frozen=True)
+class TimeBound:
+    """The times that the device `name`, a rail or a camera by its `kind`, tells may be off by `bound` s at most."""
+
+    name: str
+    kind: str
+    bound: float
+
+    @classmethod
+    def of(cls, camera: Camera) -> TimeBound:
+        """Of a camera's frames."""
+        return cls(camera.name, "camera", camera.time_bound)
+
+
+def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors) -> tuple[float, float]:
+    """How far (m) a sweep at `speed` m/s may lie off along its way because of its times, and the variance (m²) of it.
+
+    Each time is anywhere within its bound, for all lines alike: uniform, so a third of the square. Raises `DeviceFault`
+    (rail.late_readings, camera.late_readings) of the worst device when it may be more than `errors.shift`.
+    """
+    shift = speed * sum(one.bound for one in known)
+    if shift > errors.shift:
+        worst = max(known, key=lambda one: one.bound)
+        told = " and ".join(f"those of the {one.kind} to ±{1e3 * one.bound / errors.rate:.1f} ms" for one in known)
+        raise DeviceFault(
+            worst.name,
+            f"{worst.kind}.late_readings",
+            f"replies come so late that times are not known well enough, {told} at best: at {1e3 * speed:.2f} mm/s the "
+            f"sweep may lie {1e3 * shift:.3f} mm off, allowed are {1e3 * errors.shift:.3f} mm",
+            recoverable=True,
+            hint=f"Shorten the way to the {worst.kind} (baud rate, adapter, network, load of this machine) or sweep "
+            "more slowly.",
+        )
+    return shift, speed**2 * sum(one.bound**2 for one in known) / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +78,7 @@ class Swath:
 
     `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts the frames that the gaps of the frame
     ids tell of, and those left out because nothing tells where the arm was; `residual` in m is how far the readings
-    scatter about an even motion.
+    scatter about an even motion, `shift` in m the farthest that the sweep may lie off because of its times.
     """
 
     builder: ProfileBuilder
@@ -55,6 +93,7 @@ class Swath:
     points: int
     middle: Frame
     middle_profile: StripeProfile
+    shift: float
 
     @property
     def base_from_flange(self) -> pin.SE3:

@@ -19,6 +19,7 @@ from cell.calibration.verification_looks import CheckObservations, verify
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.planning import centre_of
+from cell.report.html import table
 from cell.stored_calibration import CellCalibration
 from cell.vision import parse_board
 
@@ -47,6 +48,19 @@ class Verification:
             return scan_effect(calibration.scan, suspect.change, job.scan.stand_off, (-half, half))
 
         return cls(verdict, [effect(suspect) for suspect in verdict.suspects], calibration.date)
+
+    def __str__(self) -> str:
+        return self.reason
+
+    def __repr__(self) -> str:
+        return f"<Verification of the calibration of {self.date}: {'good' if self.good else 'not good any more'}>"
+
+    def _repr_html_(self) -> str:
+        odds = f"{self.verdict.statistic:.1f}, allowed {self.verdict.threshold:.1f}"
+        suspects = ", ".join(f"{s.part} ({s.probability:.0%})" for s in self.verdict.suspects) or "none"
+        rows = [("reason", self.reason), ("log odds of a change", odds)]
+        title = f"verification: {'good' if self.good else 'not good any more'}"
+        return table(title, rows if self.good else [*rows, ("suspected", suspects)])
 
     @property
     def good(self) -> bool:

@@ -33,6 +33,8 @@ SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
 BACK_M = 0.02
 """How far the flange leaves a view, each time another way, before it approaches it again."""
 SWEEP_SPEED, SWEEP_RATE = "12 mm/s", "10 Hz"
+MAX_SHIFT = 0.15e-3
+"""Farthest, in m, that the sweep may lie off because of its times: less than the changes that are looked for."""
 
 
 def collect_verification(
@@ -44,7 +46,7 @@ def collect_verification(
     assert calibration.scan.reference is not None
     base_from_board = calibration.scan.reference.base_from_board
     ends = rail_ends(calibration.scan, base_from_board, scan_view, fine, config.rail.travel)
-    if not devices.rail.state().homed:
+    if not devices.rail.state().homed_here:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
     mover.to_joints(HOME)
@@ -115,7 +117,7 @@ def _sweep(
     )
     profiles: list[StripeProfile] = []
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
-    errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, devices.clock.rate)
+    errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)
     collector = Collector(geometry, section, lambda _: None, progress, profiles.append)
     rehearse(geometry)
     swath = rail_sweep(plan, mover, devices, errors, collector)

@@ -1,0 +1,77 @@
+"""What a place pose's stated uncertainty means at the part: the error below which 95 % of its points are to end.
+
+For a cell whose truth nobody knows this is the figure to hold against the job's tolerance; on a simulated cell it
+stands beside the true error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial import cKDTree
+
+from cell.geometry.poses import transform
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job
+from drivers.interfaces import Vector
+
+SEGMENTS, POINTS_PER_SEGMENT = 5, 9
+DRAWS = 2000
+
+
+def part_points(nominal: NominalSurface) -> Vector:
+    """The 45 points (45, 3) in m on the mating face, part frame: 5 segments along x of 9 points each."""
+    low, high = nominal.vertices[:, :2].min(axis=0), nominal.vertices[:, :2].max(axis=0)
+    count = SEGMENTS * POINTS_PER_SEGMENT
+    along = low[0] + (high[0] - low[0]) * (np.arange(count) + 0.5) / count
+    across = np.tile(
+        np.linspace(0.9 * low[1] + 0.1 * high[1], 0.1 * low[1] + 0.9 * high[1], POINTS_PER_SEGMENT), SEGMENTS
+    )
+    _, nearest = cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
+    return nominal.samples[nearest]
+
+
+def stated_bound(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector) -> dict[str, Any]:
+    """Bounds in mm that hold for 95 % of the part's 45 points, by axis of the surface's frame and for D.
+
+    From the pose's own covariance and from `placing`, the (6, 6) covariance of the flange each time the arm comes to
+    rest. How the claw holds the part is not in it.
+    """
+    covariances = point_covariances(job, nominal, pose, pose.covariance, placing)
+    turn = pose.base_from_surface.rotation
+    errors = 1e3 * np.abs(draws(turn.T @ covariances @ turn))
+    distance = np.linalg.norm(errors, axis=-1)
+    by_axis = {name: float(np.percentile(errors[..., k], 95)) for k, name in enumerate("xyz")}
+    return {"frame": "surface", "unit": "mm", **by_axis, "d": float(np.percentile(distance, 95))}
+
+
+def point_covariances(job: Job, nominal: NominalSurface, pose: PlacePose, of_pose: Vector, placing: Vector) -> Vector:
+    """Covariances (45, 3, 3), m², base axes, of where the part's points end.
+
+    `of_pose` (6, 6) is that of the surface's pose, `placing` (6, 6) that of the flange as it lets go.
+    """
+    points, place_flange = placed_points(job, nominal, pose)
+    covariance = through(points - pose.base_from_surface.translation, of_pose)
+    return covariance + through(points - place_flange.translation, placing)
+
+
+def placed_points(job: Job, nominal: NominalSurface, pose: PlacePose) -> tuple[Vector, pin.SE3]:
+    """Where the part's 45 points (45, 3), m, and the flange are in the base when the part lies where it belongs."""
+    base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
+    return transform(base_from_part, part_points(nominal)), base_from_part * job.grasp.flange_from_part.se3().inverse()
+
+
+def through(arms: Vector, covariance: Vector) -> Vector:
+    """Covariances (n, 3, 3) of points at `arms` (n, 3) from the origin of a pose of covariance (6, 6)."""
+    jacobians = np.stack([np.hstack([np.eye(3), -pin.skew(arm)]) for arm in arms])
+    return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1), dtype=np.float64)
+
+
+def draws(covariances: Vector) -> Vector:
+    """Errors (2000, n, 3) drawn with covariances (n, 3, 3), always the same ones."""
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    normal = np.random.default_rng(0).standard_normal((DRAWS, 1, 3, 1))
+    return np.asarray((roots @ normal)[..., 0], dtype=np.float64)

@@ -1,0 +1,86 @@
+"""What a run was judged by: its measured figures beside their limits, and what it looked at when it was refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cell.frames import FrameStore
+from cell.inversion import PlacePose, fit_figures
+from cell.job import Job
+from cell.steps.photograph import BoardFix
+from cell.steps.place import PlaceResult
+from drivers.errors import Measured, RefusedError
+from statemachine.policy import Outcome
+from statemachine.runner import RunResult
+
+CLOUD = "cloud.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """`numbers` that a refusal rests on, first those that decided; `seen` what was looked at, by name (`frame` and
+    `view` of the board, `cloud`, `pose` of the surface that was judged and not believed)."""
+
+    numbers: tuple[Measured, ...]
+    seen: Mapping[str, object]
+
+    @classmethod
+    def of(cls, result: RunResult) -> Evidence:
+        """What the error behind the end of a run shows; nothing for other ends."""
+        error = result.error
+        if result.outcome is Outcome.REFUSED and isinstance(error, RefusedError):
+            return cls(tuple(sorted(error.numbers, key=lambda number: number.kept)), error.seen)
+        return cls((), {})
+
+
+def ended_in(result: RunResult) -> str | None:
+    """The step in which a run ended that did not place; None when it ended between steps."""
+    return next((step.name for step in reversed(result.steps) if step.state == "failed"), None)
+
+
+def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, Any] | None:
+    """The report's part of this name: why, in which step, on which numbers, and the files that show it."""
+    if result.outcome is not Outcome.REFUSED:
+        return None
+    return {
+        "step": ended_in(result),
+        "reason": result.reason,
+        "numbers": [number.as_dict() for number in Evidence.of(result).numbers],
+        "frames": last_frames(result, frames),
+        "cloud": CLOUD if (folder / CLOUD).exists() else None,
+    }
+
+
+def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
+    """Files of the frames that the step looked at in which a run ended, the newest last; none when it placed."""
+    if result.outcome is Outcome.PLACED:
+        return []
+    return [f"frames/{name}" for name in frames.recent]
+
+
+def measured(
+    result: RunResult, job: Job, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Every figure that the run was or can be judged by, beside its limit: what decided a refusal comes first."""
+    fix, pose, placed = (result.results.get(name) for name in ("board_photo", "invert_pose", "place"))
+    found = list(Evidence.of(result).numbers)
+    tolerance = 1e3 * job.place.tolerance
+    if truth is not None:
+        found.append(Measured("place error, largest of 45 points", truth["error_mm"]["d"]["max"], "mm", most=tolerance))
+    if bound is not None:
+        found.append(Measured("place error, stated 95 % bound", bound["d"], "mm", most=tolerance))
+    if isinstance(placed, PlaceResult):
+        travel = 1e3 * job.place.contact_travel
+        found.append(Measured("contact depth", 1e3 * placed.depth_error, "mm", most=travel))
+    if isinstance(pose, PlacePose):
+        found += fit_figures(pose.coverage, pose.share, pose.rms, pose.chi2_per_dof)
+    if isinstance(fix, BoardFix):
+        most = job.photo.max_residual
+        found.append(Measured("board's dots off their places, RMS", fix.residual_px, "px", most=most))
+    known: dict[str, Measured] = {}
+    for number in found:
+        known.setdefault(number.name, number)
+    return [number.as_dict() for number in known.values()]

@@ -1,0 +1,31 @@
+"""How a measured figure of the report is written for people, on the screen and in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def shown_value(row: Mapping[str, Any]) -> str:
+    """The value with its unit: three digits that say something."""
+    return f"{_digits(row['value'])} {row['unit']}".strip()
+
+
+def shown_limit(row: Mapping[str, Any]) -> str:
+    """What the value is held against, or nothing."""
+    if row["limit"] is None:
+        return ""
+    return f"{row['bound']} {_digits(row['limit'])} {row['unit']}".strip()
+
+
+def told(row: Mapping[str, Any]) -> str:
+    """Value and limit in one."""
+    return ", ".join(part for part in (shown_value(row), shown_limit(row)) if part)
+
+
+def _digits(value: float | None) -> str:
+    if value is None:
+        return "no number"
+    if value == int(value) and abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
