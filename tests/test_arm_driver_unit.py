@@ -5,19 +5,22 @@ from __future__ import annotations
 import itertools
 import socket
 import threading
+import time
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.faults import fault
+from drivers.arm.faults import fault, unlock
+from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import safety_code
+from drivers.arm.messages import Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.trajectory import Trajectory, pose_difference
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
+from drivers.interfaces import LinkStatistics
 
 LIMITS = ArmLimits()
 REST = np.array([0.0, -1.5, -1.5, -1.5, 1.5, 0.0])
@@ -201,6 +204,83 @@ def test_a_silent_dashboard_is_a_deadline_and_a_missing_one_is_not_connected(ser
         dashboard.ask("stop")
     with pytest.raises(NotConnectedError, match=r"127\.255\.0\.9:29999 is not reachable"):
         Dashboard("arm", "127.255.0.9").ask("stop")
+
+
+def feed(clock):
+    return StateFeed("arm", clock, lambda: False, lambda: None, LinkStatistics())
+
+
+def snapshot(stamp, **shown):
+    still = (0.0,) * 6
+    return Snapshot(
+        stamp,
+        still,
+        still,
+        still,
+        still,
+        **{"safety_bits": 1, "mode": 7, "runtime": 2, "inputs": 0, "outputs": 0} | shown,
+    )
+
+
+@pytest.mark.parametrize("rate", [1.0, 20.0])
+def test_an_old_state_never_passes_as_fresh(rate):
+    states = feed(Clock(rate))
+    states.take(snapshot(time.monotonic() - 0.2, outputs=1))
+    with pytest.raises(DeadlineError, match="at most 100 ms old"):
+        states.fresh(0.1)
+
+
+def test_a_state_that_is_young_enough_is_taken_and_one_that_comes_meanwhile_is_waited_for():
+    states = feed(Clock())
+    states.take(snapshot(time.monotonic() - 0.2, outputs=1))
+    found, age = states.fresh(2.0)
+    assert found.outputs == 1
+    assert 0.2 <= age < 1.0
+    threading.Timer(0.05, lambda: states.take(snapshot(time.monotonic(), outputs=2))).start()
+    found, age = states.fresh(0.1)
+    assert found.outputs == 2
+    assert age < 0.1
+
+
+def test_a_state_from_before_the_call_does_not_do_when_none_older_than_the_call_is_wanted():
+    states = feed(Clock())
+    states.take(snapshot(time.monotonic()))
+    threading.Timer(0.05, lambda: states.take(snapshot(time.monotonic(), outputs=2))).start()
+    assert states.fresh(0.0)[0].outputs == 2
+
+
+def test_a_program_that_is_paused_does_not_run():
+    assert [snapshot(0.0, runtime=runtime).program_running for runtime in range(6)] == [False] * 2 + [True] + [
+        False
+    ] * 3
+
+
+def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
+    trajectory = Trajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0, *(1.0,) * 5)])
+    assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
+
+
+@pytest.mark.parametrize(("status", "unlocks"), [("REDUCED", True), ("PROTECTIVE_STOP", False)])
+def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, status, unlocks):
+    asked = []
+
+    def serve():
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Connected\n")
+            for question in client.makefile("rb"):
+                asked.append(question.decode().strip())
+                client.sendall(f"Safetystatus: {status}\n".encode())
+
+    threading.Thread(target=serve, daemon=True).start()
+    dashboard = Dashboard("arm", server.getsockname()[0])
+    if unlocks:
+        unlock("arm", dashboard, Clock(), False, lambda: None)
+    else:
+        with pytest.raises(DeviceFault, match="a person confirms"):
+            unlock("arm", dashboard, Clock(), False, lambda: None)
+    assert asked == ["safetystatus"]
+    dashboard.close()
 
 
 def test_a_clock_that_runs_faster_leaves_the_wire_its_time():

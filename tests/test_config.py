@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from cell.config import CellConfig, default_toml, load_config, validate
-from cell.job import job_path, load_job, require_fit, shipped_jobs
+from cell.fit import require_fit
+from cell.job import job_path, load_job, shipped_jobs
 from cell.units import parse_quantity
 from drivers.errors import ConfigError
 
@@ -79,7 +80,7 @@ def test_the_shipped_configuration_is_valid() -> None:
         ({"arm__max_joint_speed": "0 deg/s"}, ["arm.max_joint_speed", "1 to 120 deg/s"]),
         ({"claw__output": 0}, ["laser.output and claw.output are both 0"]),
         ({"calibration__fine__board": "marked_dots:11"}, ["calibration.fine.board"]),
-        ({"vehicle__driver": "tank"}, ["vehicle.driver", "'tank'"]),
+        ({"vehicle__driver": "tank"}, ["vehicle.driver", '"tank"', '"agilex"']),
     ],
 )
 def test_a_wrong_configuration_is_refused_by_key_and_value(changes: dict[str, Any], words: list[str]) -> None:
@@ -127,9 +128,9 @@ def test_a_job_that_asks_too_much_of_the_cell_is_refused(tmp_path: Path, edit: t
     source = job_path("pot")
     path = tmp_path / "mine.toml"
     path.write_text(source.read_text().replace(*edit).replace("pot.stl", str(source.parent / "pot.stl")))
-    job, _ = load_job(path)
+    job, mesh = load_job(path)
     with pytest.raises(ConfigError, match=re.escape(words)):
-        require_fit(job, load_config(None))
+        require_fit(job, load_config(None), mesh)
 
 
 def test_a_missing_mesh_is_named(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_requests_of_other_processes_are_taken_once_and_in_order(tmp_path):
         ("abort", "cell abort by ann"),
     ]
     assert journal.take_requests() == []
-    with pytest.raises(ValueError, match="abort, pause, resume"):
+    with pytest.raises(ValueError, match="abort, pause, go-on, confirm"):
         request(tmp_path, "explode", "")
     journal.close()
 

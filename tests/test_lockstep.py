@@ -19,6 +19,7 @@ from cell.job import load_job
 from drivers.errors import InterlockError
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+from tests.report_runs import pot
 
 CONFIG = load_config(None)
 Run = dict[str, Any]
@@ -142,8 +143,8 @@ def whole_job(name: str, changes: dict[str, object], calibrated: JobRecord | Non
 
 
 @pytest.fixture(scope="module")
-def single() -> tuple[JobRecord, Run]:
-    return whole_job("pot", {})
+def single(placed_pot) -> tuple[JobRecord, Run]:
+    return placed_pot, summed_up([figures(placed_pot, CONFIG, *pot())], "nominal")
 
 
 def require_near_what_is_expected(result: Run) -> None:

@@ -10,6 +10,7 @@ from cell.motion import bodies
 from cell.motion.collision import CollisionError, CollisionModel
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints, Unreachable
 from cell.motion.planning import Planner
+from cell.motion.point_speed import PointSpeed, carried_points
 from cell.motion.trajectory import LineLimits, SingularLine, Trajectory, join, plan_joint, plan_line
 from drivers.errors import RefusedError
 
@@ -273,3 +274,56 @@ def test_bodies_need_names_and_sizes() -> None:
     solid = bodies.block("twin", bodies.BASE, (0, 0, 0), (1, 1, 1))
     with pytest.raises(ValueError, match="names of their own"):
         CollisionModel(ArmKinematics(), [solid, solid])
+
+
+def corners_on_the_flange() -> np.ndarray:
+    """Corners of claw, scan head, target camera and part, homogeneous (n, 4), from their sizes as the cell has them."""
+    found = [np.zeros(3)]
+    for body in bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART):
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        found += list(signs * np.array(body.size) / 2 @ body.placement.rotation.T + body.placement.translation)
+    return np.column_stack([found, np.ones(len(found))])
+
+
+def fastest_point(motion: Trajectory, count: int) -> float:
+    """Speed in m/s of the fastest corner, by differences over `count` steps of plain matrices: not as planned."""
+    times, table = np.linspace(0.0, motion.duration, count), DenavitHartenberg()
+    flanges = np.eye(4)
+    for column, d, a, alpha in zip(motion.joints.T, table.d, table.a, table.alpha, strict=True):
+        q = np.interp(times, motion.times, column)
+        (c, s), ca, sa, one = (np.cos(q), np.sin(q)), np.cos(alpha), np.sin(alpha), np.ones(count)
+        rows = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+        flanges = flanges @ np.array([[one * value for value in row] for row in rows]).transpose(2, 0, 1)
+    placed = (corners_on_the_flange() @ flanges.transpose(0, 2, 1))[:, :, :3]
+    return float(np.linalg.norm(np.diff(placed, axis=0), axis=2).max() / (times[1] - times[0]))
+
+
+def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(arm: ArmKinematics) -> None:
+    generator = np.random.default_rng(9)
+    solids = bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
+    limits = JointLimits(speed=(1.6,) * 6, acceleration=(3.0,) * 6, jerk=(20.0,) * 6)
+    bound = PointSpeed(arm, carried_points(solids), 0.5)
+    unbound, speeds = [], []
+    for _ in range(40):
+        start = WORKING + generator.uniform(-1.0, 1.0, 6)
+        end = WORKING + generator.uniform(-1.0, 1.0, 6)
+        unbound.append(fastest_point(plan_joint(start, end, limits), 1000))
+        motion = plan_joint(start, end, limits, points=bound)
+        speeds.append(fastest_point(motion, 1000))
+        assert np.allclose(motion.end, end)
+    assert max(unbound) > 1.0, "the moves would be too fast otherwise"
+    assert max(speeds) <= 0.5
+    assert np.median(speeds) > 0.47, "and are not slower than need be"
+
+
+def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics) -> None:
+    model = CollisionModel(arm, bodies.arm_bodies() + bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART))
+    planner = Planner(arm, model, tool_speed=0.25)
+    free = planner.free(WORKING, WORKING + np.array([1.2, 0.1, -0.1, 0, 0, 0.5]))
+    assert 0.2 < fastest_point(free, 800) <= 0.25
+    start = arm.fk(WORKING)
+    turned = pin.SE3(pin.utils.rotate("z", 0.8) @ start.rotation, start.translation + np.array([0.0, 0.1, 0.05]))
+    assert fastest_point(planner.line(WORKING, turned, LineLimits(speed=0.25)), 800) <= 0.25 * 1.002
+    shifted = pin.SE3(start.rotation, start.translation + np.array([0.0, 0.25, 0.0]))
+    line = planner.line(WORKING, shifted, LineLimits(speed=0.25))
+    assert fastest_point(line, 800) == pytest.approx(0.25, rel=2e-3), "a line that does not turn has its full speed"

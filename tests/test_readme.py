@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
+from typing import Any
 
+import pytest
+import typer
+
+from cell.cli.app import app
 from statemachine.diagram import mermaid
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
@@ -17,5 +23,28 @@ def block(language: str) -> str:
     return found.group(1)
 
 
+def command_lines() -> list[str]:
+    """Every `cell …` of the shell blocks, without comments and optional brackets."""
+    text = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+    parts = re.split(r"[;\n]|&&", re.sub(r"#.*", "", text))
+    return [re.sub(r"[\[\]]", "", part).strip() for part in parts if part.strip().startswith("cell ")]
+
+
 def test_the_diagram_is_current() -> None:
     assert block("mermaid").strip() == mermaid().strip()
+
+
+@pytest.mark.parametrize("line", command_lines())
+def test_every_command_that_is_shown_exists_with_its_options(line: str) -> None:
+    command: Any = typer.main.get_command(app)
+    for word in shlex.split(line)[1:]:
+        for name in word.split("|"):
+            if name.startswith("--") or re.fullmatch(r"-[a-z]", name):
+                options = [option for each in command.params for option in each.opts]
+                assert name in options, f"{line}: {name}"
+        if not word.startswith("-") and hasattr(command, "commands"):
+            names = word.split("|")
+            if any(name in command.commands for name in names):
+                assert all(name in command.commands for name in names), line
+                command = command.commands[names[0]]
+    assert command.name != "cell", line

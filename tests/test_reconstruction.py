@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,15 @@ from numpy.typing import NDArray
 
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
-from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry, calibration_motions, deviation_colours, write_ply
+from cell.reconstruction import (
+    Cloud,
+    ProfileBuilder,
+    ScanGeometry,
+    calibration_motions,
+    deviation_colours,
+    outliers,
+    write_ply,
+)
 from cell.reconstruction.outliers import find_outliers
 from cell.vision.stripe import StripeProfile
 from drivers.errors import RefusedError
@@ -153,6 +162,24 @@ def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
 
 
 # --- outliers ---
+
+
+@pytest.mark.parametrize("half", [0, 1])
+def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(
+    monkeypatch: pytest.MonkeyPatch, half: int
+) -> None:
+    whole = outliers._judge
+    middle = 20
+
+    def judge(*arguments: Any) -> None:
+        if (arguments[4] >= middle) == bool(half):
+            raise MemoryError("no room")
+        whole(*arguments)
+
+    monkeypatch.setattr(outliers, "_judge", judge)
+    depth = np.zeros((2 * middle, 30))
+    with pytest.raises(MemoryError, match="no room"):
+        find_outliers(depth, np.full_like(depth, 1e-5))
 
 
 def relief(name: str, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import pytest
 
 from drivers.clock import Clock
+from statemachine.control import RunControl
 from statemachine.journal import Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.runner import Runner
@@ -47,7 +49,13 @@ class Bench:
     def classify(self, error):
         if isinstance(error, ValueError):
             return Failure(Outcome.REFUSED, str(error), "refused")
-        return Failure(Outcome.FAULTED, str(error), "fault", recoverable=isinstance(error, ConnectionError))
+        return Failure(
+            Outcome.FAULTED,
+            str(error),
+            "fault",
+            recoverable=isinstance(error, ConnectionError),
+            needs_person=isinstance(error, ConnectionRefusedError),
+        )
 
     def safe_stop(self, reason):
         self.log.append(f"stop: {reason}")
@@ -77,6 +85,14 @@ def failing(*errors):
         return f"made in attempt {context.attempt}"
 
     return work
+
+
+def test_a_step_has_its_time_on_the_wall_beside_the_cells(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.runner.clock.sleep(2.0))
+    bench.runner.clock = Clock(rate=20.0)
+    (sweep,) = (record for record in bench.run().steps if record.name == "laser_sweep")
+    assert sweep.duration_s >= 2.0
+    assert sweep.wall_s == pytest.approx(sweep.duration_s / 20.0, rel=0.05)
 
 
 def test_all_steps_run_in_order_and_the_run_ends_placed(tmp_path):
@@ -159,12 +175,13 @@ def test_an_exception_that_is_not_named_is_not_retried(tmp_path):
 def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path):
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
-    bench.runner.recover = lambda error: bench.log.append(f"recover: {error}")
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover: {error}")
     result = bench.run()
     assert result.outcome is Outcome.PLACED
     start = bench.log.index("laser_sweep")
-    assert bench.log[start : start + 4] == [
-        "laser_sweep", "stop: fault in laser_sweep", "recover: protective stop", "laser_sweep",
+    again = "stop: recovered, before laser_sweep is tried again"
+    assert bench.log[start : start + 5] == [
+        "laser_sweep", "stop: fault in laser_sweep", "recover: protective stop", again, "laser_sweep",
     ]  # fmt: skip
     changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
     assert changes[3:6] == [
@@ -173,7 +190,7 @@ def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path
 
 
 def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
-    def recover(error):
+    def recover(error, token, confirmed):
         raise OSError("the link is gone")
 
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
@@ -188,7 +205,7 @@ def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
 def test_a_step_whose_policy_is_to_stop_is_not_recovered(tmp_path):
     bench = Bench(tmp_path, place=failing(ConnectionError("protective stop")))
     bench.policy("place", 10.0, 1, on_failure=OnFailure.STOP)
-    bench.runner.recover = lambda error: bench.log.append("recover")
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
     assert bench.run().outcome is Outcome.FAULTED
     assert "recover" not in bench.log
 
@@ -253,7 +270,7 @@ def test_a_computing_step_has_its_deadline_on_the_wall(tmp_path):
 
 def test_an_abort_from_another_thread_stops_the_moving_step(tmp_path):
     def work(context):
-        bench.runner.abort("the operator has seen enough")
+        bench.runner.control.abort("the operator has seen enough")
         assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
         raise OSError("the motion was stopped")
 
@@ -278,9 +295,9 @@ def test_a_paused_run_waits_before_its_next_step_and_goes_on(tmp_path):
     def observe(event):
         if event.kind == "state" and event.data["to"] == "paused":
             bench.log.append("paused")
-            request(tmp_path, "resume", "")
+            request(tmp_path, "go-on", "")
 
-    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.pause())
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.pause())
     bench.runner.observer = observe
     assert bench.run().outcome is Outcome.PLACED
     assert bench.log[:4] == ["drive_to_target", "board_photo", "paused", "laser_sweep"]
@@ -289,9 +306,9 @@ def test_a_paused_run_waits_before_its_next_step_and_goes_on(tmp_path):
 def test_a_paused_run_can_be_aborted(tmp_path):
     def observe(event):
         if event.kind == "state" and event.data["to"] == "paused":
-            bench.runner.abort("enough")
+            bench.runner.control.abort("enough")
 
-    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.pause())
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.pause())
     bench.runner.observer = observe
     assert bench.run().outcome is Outcome.ABORTED
 
@@ -377,3 +394,185 @@ def test_a_runner_without_work_for_a_step_is_refused(tmp_path):
             Sequence(), {name: print for name in NAMES if name != State.PLACE.value}, Policy(),
             bench.runner.journal, Clock(), bench.classify, bench.safe_stop,
         )  # fmt: skip
+
+
+# --- one authority for every ending ---
+
+
+def test_an_abort_while_the_cell_recovers_ends_the_recovery_before_it_begins_anything(tmp_path):
+    begun = []
+
+    def recover(error, token, confirmed):
+        bench.runner.control.abort("enough")
+        assert token.event.wait(5)
+        token.check()
+        begun.append("unlocked and started")
+
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("link lost")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = recover
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.ABORTED, "enough")
+    assert begun == []
+
+
+def test_an_abort_while_a_step_computes_ends_the_run_and_no_step_follows(tmp_path):
+    def work(context):
+        bench.runner.control.abort("Cell.stop() was called")
+        return "a result that comes too late"
+
+    bench = Bench(tmp_path, reconstruct=work)
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.ABORTED, "Cell.stop() was called")
+    assert "invert_pose" not in bench.log
+
+
+def test_what_a_step_leaves_behind_is_ended_with_it(tmp_path):
+    tokens = {}
+    bench = Bench(tmp_path, board_photo=lambda context: tokens.update({context.attempt: context.token}))
+    bench.run()
+    assert tokens[1].reason == "board_photo has ended"
+
+
+def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(tmp_path):
+    def observe(event):
+        if event.kind == "confirm_needed":
+            bench.log.append("asked")
+            request(tmp_path, "confirm", "Ann")
+
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.observer = observe
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover, confirmed: {confirmed}")
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    start = bench.log.index("laser_sweep")
+    again = "stop: recovered, before laser_sweep is tried again"
+    assert bench.log[start : start + 6] == [
+        "laser_sweep", "stop: fault in laser_sweep", "asked", "recover, confirmed: True", again, "laser_sweep",
+    ]  # fmt: skip
+    (fault,) = result.faults
+    assert (fault.step, fault.attempt, fault.code) == ("laser_sweep", 1, "fault")
+    assert fault.remedy == "confirmed by Ann, recovered"
+
+
+def test_nobody_confirms_and_the_run_ends_without_a_recovery(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.policy = replace(bench.runner.policy, confirm_deadline_s=0.1)
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "nobody confirmed within 0.1 s" in result.reason
+    assert "recover" not in bench.log
+
+
+def test_a_word_that_was_given_before_it_was_asked_for_does_not_count():
+    control = RunControl()
+    assert not control.confirm("too early")
+    control.ask("protective stop")
+    assert control.answer() is None
+    assert control.confirm("Ann")
+    assert control.answer() == "Ann"
+
+
+def test_a_pause_holds_the_step_at_its_next_safe_point_and_its_deadline_waits_too(tmp_path):
+    def observe(event):
+        if event.kind == "paused":
+            threading.Timer(0.4, bench.runner.control.go_on).start()
+
+    def work(context):
+        bench.runner.control.pause()
+        context.safe_point()
+        bench.log.append("went on")
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.policy("laser_sweep", 0.2)
+    bench.runner.observer = observe
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED, result.reason
+    assert "went on" in bench.log
+    assert {"paused", "going_on"} <= {event.kind for event in bench.record.events}
+
+
+def test_a_step_that_is_held_can_be_aborted(tmp_path):
+    def observe(event):
+        if event.kind == "paused":
+            bench.runner.control.abort("enough")
+
+    def work(context):
+        bench.runner.control.pause()
+        context.safe_point()
+        bench.log.append("went on")
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.runner.observer = observe
+    assert bench.run().outcome is Outcome.ABORTED
+    assert "went on" not in bench.log
+
+
+def test_every_fault_and_repetition_is_in_the_result(tmp_path):
+    bench = Bench(
+        tmp_path,
+        drive_to_target=lambda context: context.fault("vehicle.motor_fault", "motor 2 is too hot"),
+        board_photo=failing(TimeoutError("no frame")),
+        invert_pose=failing(ValueError("not observable")),
+    )
+    bench.policy("board_photo", 10.0, 1, ("TimeoutError",))
+    result = bench.run()
+    assert [(f.step, f.code, f.remedy) for f in result.faults] == [
+        ("drive_to_target", "vehicle.motor_fault", "noted"),
+        ("board_photo", "fault", "tried again"),
+        ("invert_pose", "refused", "ended the run"),
+    ]
+
+
+def test_nothing_is_tried_again_on_a_cell_of_which_it_is_not_known_that_it_stands(tmp_path):
+    def safe_stop(reason):
+        bench.safe_stop(reason)
+        if reason.startswith("before"):
+            raise OSError("vehicle stopped and braked: not confirmed")
+
+    bench = Bench(tmp_path, board_photo=failing(TimeoutError("no frame")))
+    bench.policy("board_photo", 10.0, 2, ("TimeoutError",))
+    bench.runner.safe_stop = safe_stop
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert result.code == "safe_stop"
+    assert "no frame" in result.reason
+    assert "not confirmed" in result.reason
+    assert bench.log.count("board_photo") == 1
+
+
+def test_after_a_recovery_the_cell_has_to_be_known_to_stand_before_the_step_is_tried_again(tmp_path):
+    def safe_stop(reason):
+        bench.safe_stop(reason)
+        if reason.startswith("recovered"):
+            raise OSError("arm stopped: not confirmed")
+
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("link lost")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = lambda error, token, confirmed: None
+    bench.runner.safe_stop = safe_stop
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "arm stopped: not confirmed" in result.reason
+    assert bench.log.count("laser_sweep") == 1
+
+
+def test_a_word_about_an_earlier_fault_does_not_count_for_the_next():
+    control = RunControl()
+    first = control.ask("protective stop in the sweep")
+    assert control.confirm("Ann", first)
+    control.asked_no_more()
+    second = control.ask("protective stop while placing")
+    assert not control.confirm("a listener that is late", first)
+    assert control.answer() is None
+    assert control.confirm("Ann", second)
+
+
+def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):
+    bench = Bench(tmp_path)
+    bench.run()
+    bench.runner.control.abort("interrupted from the keyboard", signal.SIGINT)
+    assert bench.runner.control.signal == signal.SIGINT

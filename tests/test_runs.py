@@ -3,40 +3,91 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
+import signal
+import sqlite3
+import time
 from pathlib import Path
 
 import pytest
 
-from cell.config import load_config
-from cell.runs import CellLock, find_run, list_runs, new_run, read_report, write_json
+from cell.config import CellConfig, load_config
+from cell.runs import (
+    CellLock,
+    awaited_word,
+    find_going,
+    find_run,
+    is_going,
+    list_runs,
+    new_run,
+    read_report,
+    write_json,
+)
 from drivers.errors import ConfigError, InterlockError
 from statemachine.journal import Journal
 
 
-@pytest.fixture(autouse=True)
-def own_lock_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+@pytest.fixture
+def config() -> CellConfig:
+    """A configuration whose addresses nobody else uses while the test runs."""
+    shipped = load_config(None)
+    own = f"127.1.{os.getpid() // 250 % 250}.{os.getpid() % 250}"
+    return shipped.model_copy(
+        update={
+            "arm": shipped.arm.model_copy(update={"address": own}),
+            "rail": shipped.rail.model_copy(update={"url": f"socket://{own}:1"}),
+            "vehicle": shipped.vehicle.model_copy(update={"channel": f"socket://{own}:2"}),
+            "scan_camera": shipped.scan_camera.model_copy(update={"address": f"{own}:3"}),
+            "target_camera": shipped.target_camera.model_copy(update={"address": f"{own}:4"}),
+        }
+    )
 
 
-def test_a_cell_is_held_once_and_free_again_afterwards() -> None:
-    lock = CellLock(load_config(None))
-    with lock, pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
-        CellLock(load_config(None)).__enter__()
-    assert not lock.path.exists()
-    with CellLock(load_config(None)):
+def test_a_cell_is_held_once_and_free_again_afterwards(config: CellConfig) -> None:
+    with CellLock(config), pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
+        CellLock(config).__enter__()
+    with CellLock(config):
         pass
 
 
-def test_the_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
-    script = (
-        "import os, signal\nfrom cell.config import load_config\nfrom cell.runs import CellLock\n"
-        "CellLock(load_config(None)).__enter__()\nos.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-    assert subprocess.run([sys.executable, "-c", script], env=env, timeout=60).returncode == -9
-    with CellLock(load_config(None)):
+def test_two_configurations_that_share_one_device_are_not_open_at_once(config: CellConfig) -> None:
+    other = config.model_copy(update={"arm": config.arm.model_copy(update={"address": "127.2.0.1"})})
+    with CellLock(config):
+        with pytest.raises(InterlockError, match="the rail at"):
+            CellLock(other).__enter__()
+        # What it had taken before it met the rail is free again.
+        with pytest.raises(InterlockError, match="the rail at"):
+            CellLock(other).__enter__()
+
+
+def test_another_user_finds_the_cell_held(config: CellConfig) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root can become another user")
+    reader, writer = os.pipe()
+    with CellLock(config):
+        child = os.fork()
+        if child == 0:
+            os.setgid(65534)
+            os.setuid(65534)
+            try:
+                CellLock(config).__enter__()
+                os.write(writer, b"free")
+            except InterlockError:
+                os.write(writer, b"held")
+            os._exit(0)
+        os.waitpid(child, 0)
+    assert os.read(reader, 4) == b"held"
+
+
+def test_the_lock_of_a_killed_process_is_free(config: CellConfig) -> None:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        CellLock(config).__enter__()
+        os.write(writer, b"held")
+        os.kill(os.getpid(), signal.SIGKILL)
+    assert os.read(reader, 4) == b"held"
+    os.waitpid(child, 0)
+    with CellLock(config):
         pass
 
 
@@ -64,3 +115,51 @@ def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> N
     assert report["steps"][0]["name"] == "drive_to_target"
     write_json(folder / "report.json", {"outcome": "placed"})
     assert read_report(folder) == {"outcome": "placed"}
+
+
+def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    with pytest.raises(ConfigError, match="nothing is going on"):
+        find_going(root, None)
+    dead = new_run(root)
+    Journal(dead, dead.name, {"kind": "job", "pid": 2**22 + 1}).close()
+    ended = new_run(root)
+    journal = Journal(ended, ended.name, {"kind": "calibration", "pid": os.getpid()})
+    with pytest.raises(ConfigError, match="process died"):
+        find_going(root, dead.name)
+    assert find_going(root, None) == ended
+    journal.run_ended("done", "calibration done")
+    with pytest.raises(ConfigError, match="nothing is going on"):
+        find_going(root, None)
+    assert find_run(root, None, "job") == dead
+    assert find_run(root, None, "calibration") == ended
+
+
+def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
+    folder = new_run(tmp_path / "runs")
+    journal = Journal(folder, folder.name)
+    assert awaited_word(folder) is None
+    journal.event("confirm_needed", "laser_sweep", {"reason": "the arm is in protective stop", "code": "x"})
+    assert awaited_word(folder) == "the arm is in protective stop"
+    journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "the arm is in protective stop"})
+    assert awaited_word(folder) is None
+
+
+def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    two = [new_run(root), new_run(root)]
+    for folder in two:
+        Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    with pytest.raises(ConfigError, match="more than one is going on"):
+        find_going(root, None)
+    assert find_going(root, two[0].name) == two[0]
+
+
+def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:
+    folder = new_run(tmp_path / "runs")
+    Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    assert is_going(folder)
+    base = sqlite3.connect(folder / "journal.sqlite")
+    base.execute("UPDATE runs SET started = ?", (time.time() - 30 * 86400.0,))
+    base.commit()
+    assert not is_going(folder)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import DeviceFault, InterlockError
+from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import Arm, ArmMotion, ArmSafety, ArmState, Claw, Identity, Laser, LinkStatistics, Vector
 from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
 
@@ -59,7 +59,7 @@ class BenchArm:
 
     def set_payload(self, mass: float, centre: Vector) -> None: ...
 
-    def recover(self) -> None: ...
+    def recover(self, *, confirmed: bool = False) -> None: ...
 
 
 @pytest.fixture
@@ -89,6 +89,20 @@ def test_the_laser_goes_off_when_its_owner_fails(arm: BenchArm) -> None:
     with pytest.raises(KeyboardInterrupt), laser.lit():
         raise KeyboardInterrupt
     assert not laser.is_on
+
+
+def test_a_laser_that_does_not_go_off_does_not_hide_why_its_owner_failed(arm: BenchArm) -> None:
+    laser = ArmSwitchedLaser("laser", arm, 2)
+    fault = DeviceFault("rail", "rail.stalled", "the motor does not move", recoverable=False, hint="See why.")
+
+    def silent(index: int, value: bool) -> None:
+        raise DeadlineError("arm", "no answer")
+
+    with pytest.raises(DeviceFault) as caught, laser.lit():
+        arm.set_digital_output = silent  # type: ignore[method-assign]
+        raise fault
+    assert caught.value is fault
+    assert "no answer" in caught.value.__notes__[0]
 
 
 def test_the_laser_has_one_owner_at_a_time(arm: BenchArm) -> None:

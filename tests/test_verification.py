@@ -102,7 +102,10 @@ def test_the_verdict_reckons_the_place_error(calibrated):
         seen = look_again(cell, calibration)
     finally:
         cell.truth = before
-    summary = Verification.of(calibration, load_job("pot")[0], seen).summary()
+    verification = Verification.of(calibration, load_job("pot")[0], seen)
+    assert "not good any more" in repr(verification)
+    assert "<td>scan camera&#x27;s mount on the flange" in verification._repr_html_()
+    summary = verification.summary()
     assert not summary["good"]
     assert summary["suspects"][0]["part"] == "scan camera's mount on the flange"
     # A mount moved by 0.6 mm moves every point by 0.6 mm; the prior and the arm's repeatability take a part of it.

@@ -1,7 +1,8 @@
 """A simulated arm in a process of its own for the tests of the arm driver, above a stiff table if asked.
 
-Commands come on standard input, one a line, and are answered by one JSON line each: the name of a fault, `reset`
-(as after switching on), `input INDEX 0|1`, or `show` for what the arm itself knows.
+Commands come on standard input, one a line, and are answered by one JSON line each: the name of a fault, `clear` (its
+cause is gone), `reset` (as after switching on), `input INDEX 0|1`, `output INDEX 0|1`, or `show` for what the arm
+itself knows.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ STIFFNESS = 2e4
 class ArmBench:
     """Starts the process; `address` is where the arm answers. To be used as a context."""
 
-    def __init__(self, *, speed: float = 1.0, table: float | None = None) -> None:
-        arguments = [str(speed), "none" if table is None else str(table)]
+    def __init__(self, *, speed: float = 1.0, table: float | None = None, model: str = "UR10e") -> None:
+        arguments = [str(speed), "none" if table is None else str(table), model]
         self.process = subprocess.Popen(
             [sys.executable, __file__, *arguments],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -66,9 +67,10 @@ def _table(height: float):
     return contact
 
 
-def _main(speed: float, table: float | None) -> None:
+def _main(speed: float, table: float | None, name: str) -> None:
     clock = WorldClock(speed)
-    model = ArmModel(ArmParams(unlock_delay=0.3, force_noise=(0.2, 0.02)), np.random.default_rng(0), clock)
+    params = ArmParams.of(name, unlock_delay=0.3, force_noise=(0.2, 0.02))
+    model = ArmModel(params, np.random.default_rng(0), clock)
     if table is not None:
         model.contact = _table(table)
     peer = RtdePeer(model, clock)
@@ -84,10 +86,15 @@ def _main(speed: float, table: float | None) -> None:
                 model.write_digital_outputs(-1, 0)
             case ["input", index, value]:
                 model.set_digital_input(int(index), value == "1")
+            case ["output", index, value]:
+                model.write_digital_outputs(1 << int(index), int(value) << int(index))
+            case ["clear"]:
+                model.clear()
             case ["show"]:
                 answer = {
                     "outputs": model.digital_outputs, "moving": model.moving, "q": model.drive.q.tolist(),
-                    "fault": model.fault_text, "payload": model.payload[0], "tcp": model.drive.flange_from_tcp.tolist(),
+                    "time": model.time, "fault": model.fault_text, "payload": model.payload[0],
+                    "tcp": model.drive.flange_from_tcp.tolist(),
                 }  # fmt: skip
             case [fault]:
                 model.fault(fault)
@@ -96,4 +103,4 @@ def _main(speed: float, table: float | None) -> None:
 
 
 if __name__ == "__main__":
-    _main(float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]))
+    _main(float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]), sys.argv[3])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -52,7 +53,7 @@ def arm(bench, connected):
     try:
         stand_at_home(connected)
     except CellError:
-        connected.recover()
+        connected.recover(confirmed=True)
         stand_at_home(connected)
     return connected
 
@@ -317,7 +318,7 @@ def test_a_protective_stop_ends_the_motion_and_recovery_forgets_it(arm, bench, k
     assert arm.state().safety is ArmSafety.PROTECTIVE_STOP
     with pytest.raises(DeviceFault, match="protective stop"):
         arm.move_joints(target, 0.5, 2.0)
-    arm.recover()
+    arm.recover(confirmed=True)
     assert arm.state().safety is ArmSafety.NORMAL
     stands = arm.state().joints
     target = joints_away(arm, -0.05)
@@ -350,10 +351,11 @@ def test_an_emergency_stop_is_a_fault_that_only_the_operator_can_clear():
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSEGV])
 def test_the_death_of_the_child_is_a_fault_that_stops_the_arm_and_can_be_recovered(arm, bench, way):
     arm.set_digital_output(LASER, True)
+    keep_outputs(bench)
     moving = arm.move_joints(joints_away(arm, 2.0), 0.5, 2.0)
     assert soon(lambda: arm.state().moving)
     begun = time.monotonic()
-    os.kill(arm._link.pid, way)
+    os.kill(arm._session.link.pid, way)
     with pytest.raises(DeviceFault) as caught:
         moving.wait(10.0)
     assert time.monotonic() - begun < 0.5
@@ -370,7 +372,7 @@ def test_the_death_of_the_child_is_a_fault_that_stops_the_arm_and_can_be_recover
 
 
 def test_a_child_that_hangs_is_a_fault_as_well(arm):
-    os.kill(arm._link.pid, signal.SIGSTOP)
+    os.kill(arm._session.link.pid, signal.SIGSTOP)
     begun = time.monotonic()
     with pytest.raises(DeviceFault, match="no sign of life"):
         while time.monotonic() - begun < 5.0:
@@ -386,7 +388,7 @@ def test_the_death_of_the_arm_is_a_fault_within_two_seconds_and_close_does_not_h
     with ArmBench() as bench:
         arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
         moving = arm.move_joints(joints_away(arm, 2.0), 0.5, 2.0)
-        child = arm._link.pid
+        child = arm._session.link.pid
         bench.kill()
         begun = time.monotonic()
         with pytest.raises(DeviceFault) as caught:
@@ -405,7 +407,7 @@ def test_a_silent_arm_is_a_fault_and_close_does_not_hang():
     with ArmBench() as bench:
         arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
         moving = arm.move_joints(joints_away(arm, 2.0), 0.5, 2.0)
-        child = arm._link.pid
+        child = arm._session.link.pid
         bench.process.send_signal(signal.SIGSTOP)
         begun = time.monotonic()
         with pytest.raises((DeviceFault, DeadlineError)):
@@ -428,6 +430,14 @@ def test_no_arm_and_a_silent_arm_at_the_start_are_not_connected():
         assert time.monotonic() - begun < 4.0
 
 
+def keep_outputs(bench):
+    """Have the controller keep the laser's output when no program runs, so that only the driver can switch it off."""
+    with socket.create_connection((bench.address, 30002), timeout=5.0) as connection:
+        connection.sendall(b"sec keep():\n  set_runstate_standard_digital_output_to_value(0, 0)\nend\n")
+        connection.recv(4096)
+        Clock().sleep(0.05)
+
+
 OWNER = """
 import json, sys, threading
 from drivers.arm.ur import UrArm
@@ -438,7 +448,7 @@ arm.set_digital_output(1, True)
 joints = arm.state().joints
 joints[0] += 2.0
 arm.move_joints(joints, 0.5, 2.0)
-print(json.dumps({"child": arm._link.pid}), flush=True)
+print(json.dumps({"child": arm._session.link.pid}), flush=True)
 threading.Event().wait(60)
 """
 
@@ -458,6 +468,7 @@ def owner_dies(bench, way):
     assert owner.stdout is not None
     child = json.loads(owner.stdout.readline())["child"]
     assert bench.ask("show")["outputs"] & 0b11 == 0b11
+    keep_outputs(bench)
     assert soon(lambda: bench.ask("show")["moving"])
     owner.send_signal(way)
     assert soon(lambda: bench.ask("show")["outputs"] & 0b11 == 0b10), "the laser is off, the claw stays closed"
@@ -467,7 +478,7 @@ def owner_dies(bench, way):
 
 
 def test_ctrl_c_does_not_reach_the_child(arm):
-    os.kill(arm._link.pid, signal.SIGINT)
+    os.kill(arm._session.link.pid, signal.SIGINT)
     arm.move_joints(joints_away(arm, -0.02), 1.0, 2.0).wait(5.0)
 
 
@@ -475,7 +486,8 @@ def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated():
     with ArmBench() as bench:
         arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
         arm.set_digital_output(LASER, True)
-        child = arm._link.pid
+        keep_outputs(bench)
+        child = arm._session.link.pid
         arm.close()
         arm.close()
         assert not bench.ask("show")["outputs"] & 1 << LASER

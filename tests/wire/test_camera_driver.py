@@ -214,6 +214,17 @@ def test_a_silent_camera_is_a_deadline(bench: Bench) -> None:
 
 
 @pytest.mark.wire
+def test_what_ended_a_stream_stays_the_error_when_the_camera_does_not_stop(bench: Bench) -> None:
+    fault = DeviceFault("arm", "arm.emergency_stop", "emergency stop", recoverable=False, hint="Release it.")
+    with pytest.raises(DeviceFault) as caught, bench.camera.stream():
+        bench.peer.fault("camera.silent")
+        raise fault
+    bench.peer.clear()
+    assert caught.value is fault
+    assert "no answer to 'stop'" in caught.value.__notes__[0]
+
+
+@pytest.mark.wire
 def test_a_camera_that_dies_is_lost_at_once(bench: Bench) -> None:
     with bench.camera.stream() as stream:
         stream.next(2.0)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.wire
 def dry_run(folder: Path, *faults: str) -> dict[str, Any]:
     """The report of a dry run in which the faults happen."""
     options = [word for fault in faults for word in ("--inject", fault)]
-    done = cell("dry-run", "--seed", "3", "--json", *options, folder=folder)
+    done = cell("dry-run", "--seed", "3", "--json", "--confirm", "simulated", *options, folder=folder)
     assert "Traceback" not in done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["injected"] == list(faults)
@@ -51,7 +51,9 @@ def test_the_cell_recovers_from_a_protective_stop_in_the_sweep_and_a_lost_bus_on
     [
         ("vehicle.emergency_stop@drive_to_target:30%", "vehicle"),
         ("arm.protective_stop@place:40%", "arm"),
+        ("vehicle.motor_fault@place:40%", "vehicle"),
         ("target_camera.silent@board_photo:0%", "target_camera"),
+        ("rail.late_reply@laser_sweep:0%", "rail: replies come so late that times are not known"),
     ],
 )
 def test_a_fault_that_a_program_may_not_clear_ends_the_run_safe_and_names_the_device(
@@ -69,9 +71,24 @@ def test_a_fault_that_a_program_may_not_clear_ends_the_run_safe_and_names_the_de
     assert end["part"]["held"], "whatever fails before the release, the part stays in the claw"
 
 
+def test_a_vehicle_that_was_turned_by_hand_is_not_driven_blind(place: Path) -> None:
+    with served(place, "--seed", "3") as endpoints:
+        assert cell("jog", "vehicle", "+30deg", "-c", "sim.toml", folder=place).returncode == 0
+        stood = vehicle_place(endpoints)
+        done = cell("run", "-c", "sim.toml", "--json", folder=place)
+        assert done.returncode == 1, done.stderr
+        report = json.loads(done.stdout)
+        assert report["outcome"] == "refused"
+        assert "where the vehicle stands is not known" in report["reason"]
+        assert "--at-start" in report["reason"]
+        assert vehicle_place(endpoints) == pytest.approx(stood, abs=1e-4)
+        assert report["end_state"]["collisions"] == []
+        assert report["part"] == "held"
+
+
 def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path) -> None:
     with served(place, "--seed", "3") as endpoints:
-        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+        with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             folder = wait_for_step(place, "place")
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
@@ -98,7 +115,7 @@ def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path
 
 def test_a_vehicle_that_was_pushed_meanwhile_makes_the_resumed_run_sweep_again(place: Path) -> None:
     with served(place, "--seed", "3"):
-        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+        with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "place")
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Rail
 from drivers.rail.motion import move_duration, run_up_distance
-from drivers.rail.sweep import fit_line
+from drivers.rail.timing import fit_line
 from drivers.rail.tmcl import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
@@ -87,6 +87,12 @@ def bench() -> Iterator[Bench]:
 def homed(bench: Bench) -> Bench:
     bench.rail.home().wait(20.0)
     return bench
+
+
+def telegram(command: int, kind: int, value: int) -> bytes:
+    """A request to the module at address 1, motor 0."""
+    body = bytes([1, command, kind, 0]) + value.to_bytes(4, "big", signed=True)
+    return body + bytes([sum(body) & 0xFF])
 
 
 # --- helpers with closed forms ---
@@ -196,12 +202,44 @@ def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench
     times = np.linspace(begin, end, 50)[1:-1]
     errors = [sweep.position_at(time) - homed.carriage(time) for time in times]
     assert np.max(np.abs(errors)) < 30e-6
+    assert speed * sweep.time_bound < 300e-6
     assert len(sweep.samples) > 20
     assert sweep.samples.shape[1] == 2
     with pytest.raises(ValueError, match="outside the sweep"):
         sweep.position_at(end + 0.1)
     # Outside of start and stop there is room for the ramps, and the rail has come to rest behind them.
     assert abs(homed.carriage() - stop) > run_up_distance(speed, ACCELERATION)
+
+
+@pytest.mark.wire
+def test_late_replies_shift_a_sweep_within_the_bound_that_it_states(homed: Bench) -> None:
+    start, stop, speed = 0.02, 0.06, 0.005
+    homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
+    homed.peer.fault("rail.late_reply")
+    sweep = homed.rail.sweep(start, stop, speed)
+    sweep.wait(30.0)
+    begin, end = sweep.window
+    times = np.linspace(begin, end, 50)[5:-5]
+    late = np.array([homed.carriage(time) - sweep.position_at(time) for time in times]) / speed
+    # 0.2 s on the wall, half of which the middle of the round trip is off; and nothing but the round trips shows it.
+    assert late.mean() == pytest.approx(0.1 * SPEED, rel=0.1)
+    assert sweep.time_bound == pytest.approx(0.1 * SPEED, rel=0.1)
+    # The bench's two clocks are compared to a millisecond only.
+    assert late.max() <= sweep.time_bound + 0.005
+    assert sweep.unevenness == 0.0
+
+
+@pytest.mark.wire
+def test_a_sweep_that_somebody_slowed_down_is_a_fault_with_both_velocities(homed: Bench) -> None:
+    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.04)).wait(10.0)
+    sweep = homed.rail.sweep(0.02, 0.06, 0.04)
+    settings = homed.model.settings
+    slower = replace(settings, max_velocity=round(0.9 * settings.max_velocity))
+    homed.model.configure(homed.world.now(), slower)
+    sweep.wait(10.0)
+    with pytest.raises(DeviceFault, match=r"ran at 3[567]\.\d+ mm/s instead of 40\.000 mm/s") as caught:
+        _ = sweep.window
+    assert caught.value.code == "rail.velocity"
 
 
 @pytest.mark.wire
@@ -269,6 +307,137 @@ def test_a_limit_switch_on_the_way_is_a_fault_that_names_it(bench: Bench) -> Non
     with pytest.raises(InterlockError, match="home"):
         rail.move_to(0.05)
     rail.close()
+    # Somebody turns it off the switch by hand: that does not make the count right.
+    bench.model.rotate(bench.world.now(), -51_200)
+    bench.clock.sleep(2.0)
+    again = connect(bench.peer.url, bench.clock)
+    assert not again.state().right_switch
+    assert not again.state().homed
+    again.close()
+
+
+# --- a zero that is lost, and one that is found again ---
+
+
+@pytest.mark.wire
+def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: Bench) -> None:
+    homed.rail.move_to(0.005).wait(10.0)
+    homed.rail.close()
+    again = connect(homed.peer.url, homed.clock)
+    state = again.state()
+    assert (state.homed, state.position) == (True, 0.005)
+    again.move_to(0.010).wait(10.0)
+    assert homed.carriage() == pytest.approx(0.010, abs=1e-6)
+    again.close()
+
+
+@pytest.mark.wire
+def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench) -> None:
+    homed.rail.close()
+    other = TmclRail(
+        "rail", homed.peer.url, lead=0.004, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1), max_speed=MAX_SPEED,
+        acceleration=ACCELERATION, clock=homed.clock,
+    )  # fmt: skip
+    assert not other.state().homed
+    with pytest.raises(InterlockError, match="not homed"):
+        other.move_to(0.01)
+    other.close()
+    # The other program has set the module up for itself since.
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().homed
+    again.close()
+
+
+@pytest.mark.wire
+def test_a_module_set_to_other_microsteps_is_not_homed_any_more(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 140, 7))
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().homed
+    again.close()
+
+
+@pytest.mark.wire
+def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 13, 1))  # without its left limit switch
+    homed.model.rotate(homed.world.now(), -5 * 51_200)
+    homed.clock.sleep(3.0)
+    homed.model.rotate(homed.world.now(), 5 * 51_200)
+    homed.clock.sleep(1.0)
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().left_switch
+    assert not again.state().homed
+    again.close()
+
+
+@pytest.mark.wire
+def test_a_reset_between_two_motions_is_told_before_anything_moves(homed: Bench) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault, match="lost its zero") as caught:
+        homed.rail.move_to(0.01)
+    assert caught.value.code == "rail.reset"
+    with pytest.raises(InterlockError, match="home"):
+        homed.rail.move_to(0.01)
+    assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
+
+
+@pytest.mark.wire
+def test_a_position_read_after_a_reset_is_a_fault_and_then_that_of_a_rail_not_homed(homed: Bench) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        homed.rail.state()
+    assert caught.value.code == "rail.reset"
+    assert not homed.rail.state().homed
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("goal", [0.05, 0.0])
+def test_a_reset_on_the_way_is_never_an_arrival(homed: Bench, goal: float) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    motion = homed.rail.move_to(goal, speed=0.01)
+    homed.clock.sleep(1.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault, match="Home the rail again") as caught:
+        motion.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    assert caught.value.recoverable
+
+
+@pytest.mark.wire
+def test_a_reset_in_a_sweep_leaves_no_window(homed: Bench) -> None:
+    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.02)).wait(10.0)
+    sweep = homed.rail.sweep(0.02, 0.06, 0.02)
+    homed.clock.sleep(1.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        sweep.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    with pytest.raises(DeviceFault):
+        _ = sweep.window
+
+
+@pytest.mark.wire
+def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench) -> None:
+    motion = bench.rail.home()
+    bench.clock.sleep(0.2)
+    bench.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        motion.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    assert not bench.rail.state().homed
+
+
+@pytest.mark.wire
+def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench) -> None:
+    homed.peer.fault("rail.reset")
+    homed.rail.home().wait(20.0)
+    homed.rail.move_to(0.02).wait(10.0)
+    assert homed.carriage() == pytest.approx(0.02, abs=1e-6)
+    assert homed.model.settings.search_mode == 5
+    assert homed.model.settings.max_acceleration == round(ACCELERATION * 200 * 256 / 0.002)
 
 
 @pytest.mark.wire
@@ -382,3 +551,28 @@ def test_a_refusal_of_the_module_is_a_fault_in_words(module: Callable[..., str])
     with pytest.raises(DeviceFault, match="invalid value") as caught:
         connect(module(lambda request: reply(request, status=4)), Clock())
     assert caught.value.code == "tmcl.refused"
+
+
+@pytest.mark.wire
+def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(module: Callable[..., str]) -> None:
+    variables: dict[int, int] = {}
+    full = False
+
+    def answer(request: bytes) -> bytes:
+        command, kind, value = request[1], request[2], int.from_bytes(request[4:8], "big", signed=True)
+        if command == 9:
+            if full:
+                return reply(request, status=5)
+            variables[kind] = value
+        # It stands at 0 and at its right limit switch, whatever it is told.
+        known = {(10, kind): variables.get(kind, 0), (6, 10): 1, (6, 0): 1_280_000}
+        return reply(request, known.get((command, kind), 0))
+
+    rail = connect(module(answer), Clock())
+    rail.home().wait(10.0)
+    assert rail.state().homed
+    full = True
+    with pytest.raises(DeviceFault, match="right limit switch"):
+        rail.move_to(0.05).wait(10.0)
+    assert not rail.state().homed
+    rail.close()

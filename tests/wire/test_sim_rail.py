@@ -302,6 +302,41 @@ def test_a_dropped_reply_is_the_next_one_only(peer: TmclPeer, port: serial.Seria
 
 
 @pytest.mark.wire
+def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM1260, model: RailModel) -> None:
+    axis = module.motors[0]
+    module.set_global_parameter(7, 2, 70)
+    module.store_global_parameter(7, 2)
+    module.set_global_parameter(8, 2, 80)
+    module.set_global_parameter(200, 2, 90)
+    with pytest.raises(TMCLReplyStatusError):
+        module.store_global_parameter(200, 2)
+    axis.set_axis_parameter(axis.AP.MaxVelocity, 51200)
+    module.rotate(0, 10 * STEPS)
+    WorldClock().sleep(0.1)
+    peer.fault("rail.reset")
+    stands = model.carriage(peer.module._clock.now())
+    assert (axis.actual_position, axis.actual_velocity, axis.target_position) == (0, 0, 0)
+    assert [module.get_global_parameter(number, 2) for number in (0, 7, 8, 200)] == [4711, 70, 0, 0]
+    assert axis.get_axis_parameter(axis.AP.MaxVelocity) == 512_000
+    assert model.carriage(peer.module._clock.now()) == stands
+
+
+@pytest.mark.wire
+def test_late_replies_are_late_until_the_faults_are_cleared(peer: TmclPeer, port: serial.SerialBase) -> None:
+    def round_trip() -> float:
+        clock = WorldClock()
+        port.write(request(1, 6, 1))
+        assert len(port.read(9)) == 9
+        return clock.now()
+
+    peer.fault("rail.late_reply")
+    assert 0.2 < round_trip() < 0.5
+    assert 0.2 < round_trip() < 0.5
+    peer.clear()
+    assert round_trip() < 0.15
+
+
+@pytest.mark.wire
 def test_stopping_the_peer_leaves_no_thread(model: RailModel, clock: WorldClock) -> None:
     before = set(threading.enumerate())
     peer = TmclPeer(model, clock, pty=True)

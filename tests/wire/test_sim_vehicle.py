@@ -228,7 +228,9 @@ def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: Vehic
             read[entry.name] = entry.decode(bytes(frame.data), decode_choices=False)
     assert names <= set(read)
     state = read["SystemState"]
-    assert (state["State"], state["Mode"], state["ErrorBits"]) == (2, 1, 1)
+    # ugv_sdk: SYSTEM_ERROR_MOTOR_DRIVER, DRIVER_STATE_DRIVER_ENABLED and …_DRIVER_FAULT.
+    assert (state["State"], state["Mode"], state["ErrorBits"]) == (2, 1, 0x0100)
+    assert read["MotorDriver2"]["DriverStatus"] == 0x40
     assert state["BatteryVoltage"] == read["BatteryState"]["Voltage"] == read["MotorDriver1"]["Voltage"]
     assert state["BatteryVoltage"] == pytest.approx(26.4)
 

@@ -13,12 +13,22 @@ import numpy as np
 import pytest
 import serial
 
+from cell.job import load_job
+from cell.steps.whereabouts import Whereabouts
 from drivers.clock import Clock
-from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
+from drivers.errors import (
+    ConfigError,
+    DeadlineError,
+    DeviceFault,
+    InterlockError,
+    LimitError,
+    NotConnectedError,
+    RefusedError,
+)
 from drivers.interfaces import Vehicle
 from drivers.vehicle.agilex import AgilexVehicle
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.agilex import AgilexPeer
 
 pytestmark = pytest.mark.wire
@@ -186,15 +196,87 @@ def test_an_emergency_stop_is_a_fault_that_names_it(enabled: Bench) -> None:
     assert enabled.true_speed() > 0.0
 
 
-def test_a_motor_fault_is_reported_with_its_bits_and_cleared_by_enabling(enabled: Bench) -> None:
+def test_a_motor_fault_is_told_in_words_and_cleared_by_enabling(enabled: Bench) -> None:
     enabled.peer.fault("vehicle.motor_fault")
-    enabled.until(lambda: enabled.vehicle.state().error_bits == 1)
-    with pytest.raises(DeviceFault, match="0x0001") as caught:
-        enabled.vehicle.drive(0.1, 0.0)
-    assert caught.value.code == "vehicle.error"
-    assert caught.value.recoverable
+    enabled.until(lambda: len(enabled.vehicle.state().trouble) == 2)
+    assert enabled.vehicle.state().trouble == ("a motor driver fails", "motor 1: driver fails")
+    for refused in (enabled.vehicle.check, lambda: enabled.vehicle.drive(0.1, 0.0)):
+        with pytest.raises(DeviceFault, match="0x0100: a motor driver fails; motor 1: driver fails") as caught:
+            refused()
+        assert caught.value.code == "vehicle.error"
+        assert caught.value.recoverable
     enabled.vehicle.enable()
+    enabled.vehicle.check()
     assert enabled.vehicle.state().error_bits == 0
+
+
+def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Bench) -> None:
+    enabled.vehicle.brake()
+    enabled.until(lambda: enabled.model.feedback(enabled.world.now()).braked)
+    enabled.peer.fault("vehicle.motor_fault")
+    enabled.until(lambda: bool(enabled.vehicle.state().error_bits))
+    released = []
+    enabled.model.set_brake = lambda t, locked: released.append(not locked)  # type: ignore[method-assign]
+    enabled.vehicle.recover()
+    enabled.clock.sleep(0.2)
+    enabled.vehicle.check()
+    assert not any(released)
+    with pytest.raises(InterlockError, match="brake is locked"):
+        enabled.vehicle.drive(0.1, 0.0)
+
+
+def test_what_somebody_else_commands_on_the_bus_ends_the_command(enabled: Bench) -> None:
+    enabled.drive_for(0.3, 0.2)
+    enabled.vehicle.brake()
+    with can.Bus(interface="slcan", channel=enabled.peer.channel, sleep_after_open=0) as other:
+        other.send(can.Message(arbitration_id=0x131, data=[0], is_extended_id=False))
+        with pytest.raises(DeviceFault, match="released its brake") as caught:
+            enabled.until(lambda: enabled.vehicle.check() is not None)
+        assert caught.value.code == "vehicle.disturbed"
+        assert not caught.value.recoverable
+        enabled.vehicle.enable()
+        other.send(can.Message(arbitration_id=0x111, data=[0, 100, 0, 0, 0, 0, 0, 0], is_extended_id=False))
+        with pytest.raises(DeviceFault, match="commands it to move"):
+            enabled.until(lambda: enabled.vehicle.drive(0.1, 0.0) is not None)
+        with pytest.raises(InterlockError, match="not under CAN command"):
+            enabled.vehicle.drive(0.1, 0.0)
+
+
+def test_a_person_who_takes_the_remote_control_ends_the_command(enabled: Bench) -> None:
+    enabled.model.set_mode(enabled.world.now(), Mode.STANDBY)
+    with pytest.raises(DeviceFault, match="left CAN command") as caught:
+        enabled.until(lambda: enabled.vehicle.check() is not None)
+    assert caught.value.code == "vehicle.command_lost"
+    enabled.vehicle.check()  # told once: whoever is in charge now is no fault of the vehicle
+    with pytest.raises(InterlockError, match="enable"):
+        enabled.vehicle.drive(0.1, 0.0)
+    assert enabled.vehicle.state().interruptions == 1
+
+
+def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_no_motion(bench: Bench) -> None:
+    assert bench.vehicle.state().braked is None
+    with can.Bus(interface="slcan", channel=bench.peer.channel, sleep_after_open=0, timeout=0.02) as observer:
+        bench.vehicle.close()
+        seen = set()
+        while (message := observer.recv(0.3)) is not None and len(seen) < 12:
+            seen.add(message.arbitration_id)
+    assert 0x111 not in seen
+
+
+def test_where_it_stands_is_not_known_any_more_after_its_link_was_lost(enabled: Bench) -> None:
+    job = load_job("pot")[0]
+    whereabouts = Whereabouts(enabled.vehicle)
+    whereabouts.say_at_start()
+    whereabouts.enter(job)
+    enabled.drive_for(1.0, 0.3)
+    enabled.vehicle.stop()
+    start = job.approach.start.se3().translation[0]
+    assert whereabouts.pose().x == pytest.approx(start + enabled.truth()[0], abs=0.01)
+    enabled.peer.fault("can.bus_off")
+    enabled.until(lambda: enabled.vehicle.statistics.errors.get("link_lost") == 1)
+    enabled.vehicle.enable()
+    with pytest.raises(RefusedError, match="bus failed and was opened again"):
+        whereabouts.pose()
 
 
 def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sqlite3
 import time
@@ -69,7 +70,7 @@ def test_the_run_folder_holds_everything(place: Path, placed: dict[str, Any]) ->
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
     with served(place, "--seed", "3") as endpoints:
-        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+        with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "laser_sweep")
             os.kill(run.pid, signal.SIGINT)
             out, err = run.communicate(timeout=30)
@@ -83,7 +84,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
 
 def test_cell_abort_ends_a_run_from_another_shell(place: Path) -> None:
     with served(place, "--seed", "3") as endpoints:
-        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+        with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "drive_to_target")
             held = cell("jog", "rail", "+1mm", "-c", "sim.toml", folder=place)
             asked = cell("abort", "-c", "sim.toml", folder=place)
@@ -98,7 +99,7 @@ def test_cell_abort_ends_a_run_from_another_shell(place: Path) -> None:
 
 def test_an_emergency_stop_faults_the_run_and_names_the_arm(place: Path) -> None:
     with served(place, "--seed", "3") as endpoints:
-        with started("run", "-c", "sim.toml", "--json", folder=place) as run:
+        with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "laser_sweep")
             ask(endpoints, op="fault", name="arm.emergency_stop")
             out, err = run.communicate(timeout=60)
@@ -177,7 +178,7 @@ def test_diag_shows_every_device_and_fails_when_one_does(tmp_path: Path) -> None
     with served(tmp_path, "--seed", "3"):
         good = cell("diag", "-c", "sim.toml", "--json", folder=tmp_path)
         toml = tmp_path / "sim.toml"
-        toml.write_text(toml.read_text().replace('url = "socket://127.0.0.1:', 'url = "socket://127.0.0.1:1'))
+        toml.write_text(re.sub(r'url = "socket://[^"]*"', 'url = "socket://127.0.0.1:1"', toml.read_text()))
         bad = cell("diag", "-c", "sim.toml", "--json", folder=tmp_path)
     rows = json.loads(good.stdout)
     assert good.returncode == 0

@@ -1,0 +1,31 @@
+"""What several test files need and what takes long to make: once for all of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from cell.bench.whole_job import JobRecord, run_whole_job
+from tests.report_runs import CONFIG, Ended, Ends, Make, pot
+
+
+@pytest.fixture(scope="session")
+def placed_pot() -> JobRecord:
+    """The job `pot` on the cell in lock step, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
+    job, nominal = pot()
+    record = run_whole_job(CONFIG, job, nominal, 2, "nominal")
+    assert (record.outcome, record.reason) == ("placed", "")
+    return record
+
+
+@pytest.fixture(scope="session")
+def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ends:
+    """Gives the run that ends as `tests.report_runs` says; each is made once."""
+    root = tmp_path_factory.mktemp("cell") / "runs"
+    made: dict[Make, Ended] = {}
+
+    def get(make: Make) -> Ended:
+        if make not in made:
+            made[make] = make(placed_pot, root)
+        return made[make]
+
+    return get

@@ -1,0 +1,275 @@
+"""Runs for the tests of what is said at the end: the product's own steps on the cell in lock step, ended in many ways.
+
+What a step returns or raises is the product's; only the runner's record of it is put together here.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cell.bench.lockstep import LockstepCell
+from cell.bench.whole_job import JobRecord
+from cell.config import CellConfig, load_config
+from cell.frames import FrameStore
+from cell.inversion import NominalSurface
+from cell.job import Job, load_job
+from cell.job_run import classify
+from cell.report.report import make_report
+from cell.report.truth import Witness
+from cell.resumption import job_source
+from cell.runs import new_run
+from cell.steps.whereabouts import Whereabouts
+from cell.work import JobWork
+from drivers.errors import CellError
+from sim_backends.peers.truth import TruthPeer
+from statemachine.policy import Failure, Outcome, Policy
+from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
+from statemachine.sequence import STEPS, State
+
+CONFIG = load_config(None)
+NAMES = [step.value for step in STEPS]
+LOST = FaultRecord(
+    1_790_000_000.0, "laser_sweep", 1, "camera.frames_lost", "scan_camera: 61 frames were lost", "tried again"
+)
+
+
+def pot(**scan: object) -> tuple[Job, NominalSurface]:
+    """The job `pot`, swept twice as fast as shipped, and its surface."""
+    job, mesh = load_job("pot")
+    job = job.model_copy(update={"scan": job.scan.model_copy(update={"speed": 0.030, **scan})})
+    return job, NominalSurface.load(mesh)
+
+
+def changed(job: Job, section: str, **values: object) -> Job:
+    """A job with other values in one section."""
+    return job.model_copy(update={section: getattr(job, section).model_copy(update=values)})
+
+
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """A run's report and its folder."""
+
+    report: dict[str, Any]
+    folder: Path
+
+
+def work_of(
+    cell: LockstepCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
+) -> JobWork:
+    """The steps of a job on a cell whose vehicle stands at its start."""
+    assert record.calibration is not None
+    whereabouts = Whereabouts(cell.devices.vehicle)
+    whereabouts.say_at_start()
+    return JobWork(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
+
+
+def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root: Path) -> Ended:
+    """A run on a cell just started that did the steps before `step` as in `record` and then this one, by itself."""
+    assert record.calibration is not None
+    folder = new_run(root)
+    cell = LockstepCell(CONFIG, record.seed, record.level)
+    before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
+    with FrameStore(folder / "frames") as frames:
+        work = work_of(cell, job, nominal, record, frames, folder)
+        context = StepContext(Policy().of(State(step)), 1, math.inf, before, cell.clock, lambda event: None)
+        try:
+            made = work.steps()[step](context)
+        except CellError as error:
+            failed, failure = error, classify(error)
+        else:
+            raise AssertionError(f"{step} was to fail, it made {made}")
+    result = RunResult(failure.outcome, failure.reason, failure.code, records(step), before, failed)
+    return reported(folder, CONFIG, job, nominal, work, result, frames, None)
+
+
+def records(failed: str | None, faults: tuple[FaultRecord, ...] = ()) -> tuple[StepRecord, ...]:
+    """The runner's records of a run that failed in the step of this name, or in none."""
+    last = len(NAMES) if failed is None else NAMES.index(failed)
+    states = ["done"] * last + ["failed"] * (failed is not None)
+    again = Counter(fault.step for fault in faults if fault.remedy == "tried again")
+    done = [StepRecord(name, state, 12.34, again[name], 12.51) for name, state in zip(NAMES, states, strict=False)]
+    return (*done, *(StepRecord(name) for name in NAMES[len(done) :]))
+
+
+def placed(record: JobRecord, root: Path) -> Ended:
+    """The run of `record`, in which frames were lost once."""
+    return of_placed(record, root, (LOST,))
+
+
+def real(record: JobRecord, root: Path) -> Ended:
+    """The same as a real cell reports it, without a truth."""
+    return of_placed(record, root, simulated=False)
+
+
+def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (), *, simulated: bool = True) -> Ended:
+    """The report of a run that placed."""
+    job, nominal = pot()
+    assert record.calibration is not None and record.at_end is not None
+    folder = new_run(root)
+    result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
+    cell = LockstepCell(CONFIG, record.seed, record.level)
+    with FrameStore(folder / "frames") as frames:
+        work = work_of(cell, job, nominal, record, frames, folder)
+    if not simulated:
+        return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
+    at_end = record.at_end
+    peer = TruthPeer(lambda: at_end, lambda name: None, lambda: None)
+    peer.start()
+    try:
+        config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": peer.address})})
+        witness = Witness(peer.address)
+        witness.at_sweep = record.at_sweep
+        return reported(folder, config, job, nominal, work, result, frames, witness)
+    finally:
+        peer.stop()
+
+
+def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tuple[FaultRecord, ...] = ()) -> Ended:
+    """A run of `record` that broke off in `step`, with nothing to show for it."""
+    job, nominal = pot()
+    assert record.calibration is not None
+    folder = new_run(root)
+    cell = LockstepCell(CONFIG, record.seed, record.level)
+    with FrameStore(folder / "frames") as frames:
+        work = work_of(cell, job, nominal, record, frames, folder)
+        frames.keep("stripe", record.results["laser_sweep"].middle)
+    before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
+    result = RunResult(
+        failure.outcome,
+        failure.reason,
+        failure.code,
+        records(step, faults),
+        before,
+        CellError(failure.reason),
+        faults=faults,
+    )
+    return reported(folder, CONFIG, job, nominal, work, result, frames, None)
+
+
+def reported(
+    folder: Path,
+    config: CellConfig,
+    job: Job,
+    nominal: NominalSurface,
+    work: JobWork,
+    result: RunResult,
+    frames: FrameStore,
+    witness: Witness | None,
+    *,
+    simulated: bool = True,
+) -> Ended:
+    """The report of a result, with the facts that `cell.job_run.JobRun` adds."""
+    info: dict[str, Any] = {
+        "kind": "job",
+        "pid": os.getpid(),
+        "part": work.part.state.value,
+        "cell": config.cell.name,
+        "job": job.job.name,
+        "simulated": simulated,
+        "seed": 2 if simulated else None,
+        "level": "nominal" if simulated else None,
+        **job_source("pot"),
+        "speed": config.cell.time_scale,
+        "configuration_hash": config.calibration_hash(),
+        "calibration_hash": work._calibration.hash(),
+        "calibration_date": work._calibration.date,
+    }
+    started = time.time() - 31.0
+    report = make_report(
+        folder, config, job, nominal, work.repeatability, result, info, started, witness, frames
+    )  # fmt: skip
+    return Ended(report, folder)
+
+
+def with_few_lines(record: JobRecord, lines: int) -> JobRecord:
+    """The record with a sweep of which only so many lines are left."""
+    sweep = record.results["laser_sweep"]
+    short = tuple(
+        replace(
+            swath, lines=swath.lines[:lines], frame_ids=swath.frame_ids[:lines], flanges=swath.flanges[:lines],
+            rail=swath.rail[:lines], line_spread=swath.line_spread[:lines],
+        )
+        for swath in sweep.swaths
+    )  # fmt: skip
+    return replace(record, results={**record.results, "laser_sweep": replace(sweep, swaths=short)})
+
+
+Make = Callable[[JobRecord, Path], Ended]
+"""Makes a run that ends in one particular way."""
+Ends = Callable[[Make], Ended]
+"""Gives such a run, which is made once for all tests."""
+
+
+def no_board(record: JobRecord, root: Path) -> Ended:
+    """The vehicle is where no board like the job's is seen."""
+    job, nominal = pot()
+    return tried(record, changed(job, "board", spec="asymmetric_dots:4x11:20mm"), nominal, "drive_to_target", root)
+
+
+def blurred_board(record: JobRecord, root: Path) -> Ended:
+    """The board is found, its dots miss their places by more than the job allows."""
+    job, nominal = pot()
+    return tried(record, changed(job, "photo", max_residual=0.001), nominal, "drive_to_target", root)
+
+
+def few_points(record: JobRecord, root: Path) -> Ended:
+    """The sweep brings hardly a point."""
+    job, nominal = pot()
+    return tried(with_few_lines(record, 2), job, nominal, "reconstruct", root)
+
+
+def other_surface(record: JobRecord, root: Path) -> Ended:
+    """What was scanned is not the surface that the job names."""
+    job, _ = pot()
+    _, mesh = load_job("seat")
+    return tried(record, job, NominalSurface.load(mesh), "invert_pose", root)
+
+
+def too_strict(record: JobRecord, root: Path) -> Ended:
+    """The place is not known as well as the job asks for."""
+    job, nominal = pot()
+    return tried(record, changed(job, "place", tolerance=0.00005), nominal, "invert_pose", root)
+
+
+def no_contact(record: JobRecord, root: Path) -> Ended:
+    """There is nothing under the part where the surface was: the vehicle stands elsewhere."""
+    job, nominal = pot()
+    return tried(record, job, nominal, "place", root)
+
+
+def faulted(record: JobRecord, root: Path) -> Ended:
+    """A device fails in the sweep, after a fault that the run had gone on from."""
+    reason = (
+        "arm: the arm is in emergency stop (arm.emergency_stop). Release the button when the way is clear, and power "
+        "the arm on from its pendant."
+    )
+    fault = FaultRecord(1_790_000_004.0, "laser_sweep", 2, "arm.emergency_stop", reason, "ended the run")
+    return ended(record, root, Failure(Outcome.FAULTED, reason, "arm.emergency_stop"), "laser_sweep", (LOST, fault))
+
+
+def aborted(record: JobRecord, root: Path) -> Ended:
+    """Somebody asks for the end during the sweep."""
+    return ended(record, root, Failure(Outcome.ABORTED, "interrupted from the keyboard", "signal"), "laser_sweep")
+
+
+def crippled(record: JobRecord, root: Path) -> Ended:
+    """A run that placed, whose frames, truth and picture all came to grief."""
+    job, nominal = pot()
+    assert record.calibration is not None
+    folder = new_run(root)
+    (folder / "picture.png").mkdir()
+    cell = LockstepCell(CONFIG, record.seed, record.level)
+    with FrameStore(folder / "frames") as frames:
+        work = work_of(cell, job, nominal, record, frames, folder)
+        (folder / "frames").rmdir()
+        frames.keep("stripe", record.results["laser_sweep"].middle)
+    result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
+    config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": "127.0.0.1:1"})})
+    return reported(folder, config, job, nominal, work, result, frames, Witness("127.0.0.1:1"))

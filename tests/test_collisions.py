@@ -1,0 +1,155 @@
+"""Solid things stop each other in the simulated world, and the truth says what met what."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.job import load_job
+from cell.motion.bodies import BASE, FLANGE, Body, arm_bodies, tool_bodies
+from cell.motion.kinematics import ArmKinematics
+from sim_backends.clock import SteppedClock
+from sim_backends.models.arm import Safety
+from sim_backends.models.arm_motion import JointMove, LinearMove
+from sim_backends.models.vehicle import MOTOR_FAULT, Mode, State
+from sim_backends.world import nominal
+from sim_backends.world.collisions import FOOTPRINT, ArmPoints, Collisions
+from sim_backends.world.truth import truth
+from sim_backends.world.world import World
+
+OVER_DECK = np.deg2rad([0.0, -100.0, 100.0, -90.0, -90.0, 0.0])
+
+
+@pytest.fixture
+def world() -> World:
+    return World(seed=1, level="ideal", clock=SteppedClock())
+
+
+def advance(world: World, seconds: float, speed: float = 0.0, yaw_rate: float = 0.0) -> None:
+    """Let time pass; the vehicle is commanded all along when it has a speed."""
+    end = world.clock.now() + seconds
+    while (t := world.clock.now()) < end:
+        if speed or yaw_rate:
+            world.vehicle.command(t, speed, yaw_rate)
+        world.clock.sleep(0.02)
+        world.arm.tick(world.clock.now())
+        world.vehicle.tick(world.clock.now())
+
+
+def outline(world: World) -> np.ndarray:
+    x, y, yaw = world.vehicle.planar(world.clock.now())
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    return FOOTPRINT @ turn.T + [x, y]
+
+
+def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exception(world: World) -> None:
+    world.vehicle.set_mode(0.0, Mode.CAN)
+    advance(world, 10.0, speed=0.4)
+    assert outline(world)[:, 0].max() == pytest.approx(-nominal.TABLE_HALF, abs=0.003)
+    feedback = world.vehicle.feedback(world.clock.now())
+    assert feedback.state is State.EXCEPTION
+    assert feedback.errors & MOTOR_FAULT
+    assert all(feedback.drivers)
+    met = truth(world)["collisions"]
+    assert [(row["body"], row["obstacle"]) for row in met] == [("vehicle", "table")]
+    # From -3.05 m to -0.75 m: 0.4 m/s after 0.67 s of ramp.
+    assert met[0]["time"] == pytest.approx(2.3 / 0.4 + 0.5 * 0.4 / 0.6, abs=0.05)
+
+
+def test_cleared_of_its_error_it_can_go_back_and_not_ahead(world: World) -> None:
+    world.vehicle.set_mode(0.0, Mode.CAN)
+    advance(world, 8.0, speed=0.4)
+    stood = world.vehicle.planar(world.clock.now())[0]
+    world.vehicle.clear_errors(world.clock.now())
+    advance(world, 1.0, speed=0.2)
+    assert world.vehicle.planar(world.clock.now())[0] == pytest.approx(stood, abs=0.002)
+    assert world.vehicle.feedback(world.clock.now()).state is State.EXCEPTION
+    world.vehicle.clear_errors(world.clock.now())
+    advance(world, 2.0, speed=-0.2)
+    assert world.vehicle.planar(world.clock.now())[0] < stood - 0.2
+    assert world.vehicle.feedback(world.clock.now()).state is State.OK
+
+
+def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it() -> None:
+    world = World(seed=1, level="ideal", clock=SteppedClock())
+    collisions = Collisions(world.scene, world.part)
+    edge = -nominal.TABLE_HALF - 0.5
+    assert not collisions.blocks(0.0, (edge - 0.001, 0.0, 0.0))
+    assert collisions.blocks(0.0, (edge + 0.001, 0.0, 0.0))
+    # Turned by 45° its corner reaches ahead: half a length and half a width, each by the cosine.
+    corner = (0.5 + 0.4) * math.sqrt(0.5)
+    assert not collisions.blocks(0.0, (-nominal.TABLE_HALF - corner - 0.001, 0.0, math.pi / 4))
+    assert collisions.blocks(0.0, (-nominal.TABLE_HALF - corner + 0.001, 0.0, math.pi / 4))
+
+
+def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does(world: World) -> None:
+    world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
+    advance(world, 8.0)
+    assert world.arm.safety is Safety.NORMAL
+    down = world.arm.base_from_flange(world.clock.now()).copy()
+    down[2, 3] = -0.1
+    world.arm.start(LinearMove(down, 0.1, 0.5))
+    advance(world, 8.0)
+    assert world.arm.safety is Safety.PROTECTIVE_STOP
+    assert "hit the vehicle" in world.arm.fault_text
+    assert {row["obstacle"] for row in truth(world)["collisions"]} == {"vehicle"}
+    # Stopped where it hit: a look every 50 ms at 0.1 m/s, and braking.
+    assert world.arm.base_from_flange(world.clock.now())[2, 3] > down[2, 3] + 0.05
+
+
+def test_an_arm_that_was_unlocked_can_leave_what_it_hit(world: World) -> None:
+    world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
+    advance(world, 8.0)
+    up = world.arm.base_from_flange(world.clock.now()).copy()
+    down = up.copy()
+    down[2, 3] = -0.1
+    world.arm.start(LinearMove(down, 0.1, 0.5))
+    advance(world, 8.0)
+    count = len(world.collisions.found)
+    advance(world, world.arm.params.unlock_delay)
+    world.arm.halt()
+    assert world.arm.unlock()
+    world.arm.start(LinearMove(up, 0.1, 0.5))
+    advance(world, 10.0)
+    assert world.arm.safety is Safety.NORMAL
+    assert np.allclose(world.arm.base_from_flange(world.clock.now())[:3, 3], up[:3, 3], atol=1e-3)
+    assert len(world.collisions.found) == count
+
+
+def test_no_point_of_the_worlds_arm_reaches_beyond_the_bodies_that_the_cell_plans_with(world: World) -> None:
+    """Two descriptions of one arm, each from the maker's table; else a planned way could be a collision."""
+    grasp = load_job("pot")[0].grasp
+    bodies = [*arm_bodies(), *tool_bodies(grasp.size, grasp.flange_from_part.se3())]
+    model = ArmKinematics().model
+    data = model.createData()
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        joints = rng.uniform(-2.0, 2.0, 6)
+        pin.forwardKinematics(model, data, joints)
+        base_from_joint6 = data.oMi[6].homogeneous
+        base_from_flange = world.arm.kinematics.forward(joints)
+        points = world._solid.at(world.arm.kinematics.frames(joints), world.flange_from_camera("scan", 0.0), True)
+        for point, body, radius in zip(points, ArmPoints.body, ArmPoints.radius, strict=True):
+            room = max(inside(point, _pose(b, data, base_from_flange), b.size, b.radius) - radius for b in bodies)
+            assert room > -0.002, ArmPoints.names[body]
+        assert np.allclose(base_from_joint6[:3, 2], base_from_flange[:3, 2], atol=1e-9)
+
+
+def _pose(body: Body, data: pin.Data, base_from_flange: np.ndarray) -> np.ndarray:
+    if body.parent == BASE:
+        return body.placement.homogeneous
+    parent = base_from_flange if body.parent == FLANGE else data.oMi[body.parent].homogeneous
+    return parent @ body.placement.homogeneous
+
+
+def inside(point: np.ndarray, pose: np.ndarray, size: tuple[float, float, float], radius: float | None) -> float:
+    """How deep a point is inside a box, or inside a capsule of `radius` about a segment of length size[2]; m."""
+    local = (nominal.inverse(pose) @ [*point, 1.0])[:3]
+    if radius is None:
+        beyond = np.abs(local) - 0.5 * np.array(size)
+        return float(-beyond.max()) if beyond.max() <= 0 else float(-np.linalg.norm(np.maximum(beyond, 0.0)))
+    along = np.clip(local[2], -0.5 * size[2], 0.5 * size[2])
+    return radius - float(np.linalg.norm(local - [0.0, 0.0, along]))

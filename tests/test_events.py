@@ -1,0 +1,103 @@
+"""A run's events: typed, in order, and nobody who listens can hold the run up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from cell.events import MOST_WAITING, Detached, RunEnded, StepProgress, StepStarted, Subscription
+from cell.run import Run
+from statemachine.step import Event
+from statemachine.watch import EndSignals, SignalInterrupt
+
+
+def progress(step: str, fraction: float) -> Event:
+    return Event("progress", step, {"fraction": fraction, "text": ""})
+
+
+def test_the_newest_progress_wins_and_nothing_else_is_lost() -> None:
+    events = Subscription()
+    events.put(Event("step_started", "laser_sweep", {"attempt": 1}))
+    for count in range(5000):
+        events.put(progress("laser_sweep", count / 5000))
+    events.put(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
+    events.close()
+    got = list(events)
+    assert [type(event) for event in got] == [StepStarted, StepProgress, RunEnded]
+    assert isinstance(got[1], StepProgress)
+    assert got[1].fraction == 4999 / 5000
+
+
+def test_a_subscriber_that_never_reads_holds_a_bounded_number_of_events() -> None:
+    events = Subscription()
+    for count in range(3 * MOST_WAITING):
+        events.put(Event("note", "place", {"count": count}))
+    events.close()
+    assert len(list(events)) == MOST_WAITING
+
+
+def test_a_listener_that_comes_late_hears_what_was_and_a_run_that_has_ended_ends_it() -> None:
+    def work(run: Run[int]) -> int:
+        run.tell(Event("step_started", "place", {"attempt": 1}))
+        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": ""}))
+        return 7
+
+    run = Run("job", work)
+    assert run.result(5.0) == 7
+    assert [type(event) for event in run.events()] == [StepStarted, RunEnded]
+
+
+def test_an_observer_that_sleeps_does_not_slow_the_run() -> None:
+    heard: list[Event] = []
+    go_on = threading.Event()
+
+    def observer(event: Event) -> None:
+        go_on.wait(10)
+        heard.append(event)
+
+    told = Detached(observer)
+    begun = time.monotonic()
+    for count in range(200):
+        told(progress("place", count / 200))
+    assert time.monotonic() - begun < 1.0
+    go_on.set()
+    told.close(10.0)
+    assert heard[-1].data["fraction"] == 199 / 200
+
+
+def test_an_observer_that_fails_is_named_and_told_nothing_more() -> None:
+    def observer(event: Event) -> None:
+        raise OSError("the terminal is gone")
+
+    told = Detached(observer)
+    told(progress("place", 0.5))
+    told.close(5.0)
+    assert told.failure == "OSError: the terminal is gone"
+
+
+def test_every_event_has_its_time() -> None:
+    before = time.time()
+    events = Subscription()
+    events.put(progress("place", 0.5))
+    events.close()
+    (event,) = events
+    assert before <= event.at <= time.time()
+
+
+def test_nested_contexts_leave_the_programs_own_handlers_as_they_were() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)]
+    outer, inner = EndSignals(), EndSignals()
+    with outer:
+        pass
+    inner.__enter__()
+    assert signal.getsignal(signal.SIGTERM) == inner._raise
+    with pytest.raises(SignalInterrupt, match="asked to end"):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)  # what is cleaned up after the first is not cut short by a second
+    inner.__exit__(None, None, None)
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)] == before

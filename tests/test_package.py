@@ -1,0 +1,47 @@
+"""What a script can take from `cell` itself, and what the command line says of itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+import cell
+from drivers import errors
+
+
+def test_every_error_of_the_tree_is_in_the_package() -> None:
+    tree = [
+        name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, errors.CellError)
+    ]
+    assert len(tree) > 10
+    for name in tree:
+        assert getattr(cell, name) is getattr(errors, name)
+        assert name in cell.__all__
+
+
+def test_an_error_is_imported_without_the_devices() -> None:
+    code = "import sys; from cell import RefusedError; assert 'cell.supervisor' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_unknown_name_is_no_attribute() -> None:
+    with pytest.raises(AttributeError, match="nothing"):
+        cell.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("option", "shown"), [("--version", version("assembly-cell")), ("--show-completion", "complete")]
+)
+def test_the_command_line_tells_its_release_and_completes(
+    option: str, shown: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from cell.cli import main
+
+    monkeypatch.setattr(sys, "argv", ["cell", option, *(["bash"] if "completion" in option else [])])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    assert shown in capsys.readouterr().out

@@ -1,0 +1,208 @@
+"""Placing, on the simulated arm in lock step: what the force, the claw and a fault make of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.bench.lockstep import LockstepCell
+from cell.bench.lockstep_arm import LockstepArm
+from cell.bench.whole_job import NoFrames
+from cell.config import load_config
+from cell.geometry.poses import from_matrix, from_parts, from_ur
+from cell.inversion import NominalSurface
+from cell.job import load_job
+from cell.resumption import UnfinishedRun
+from cell.steps.moves import HOME, Mover
+from cell.steps.place import PartProgress, PartState, PlaceResult, place
+from cell.steps.whereabouts import Whereabouts
+from cell.vision import parse_board
+from cell.work import JobWork
+from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
+from drivers.switches import ArmSwitchedClaw
+from sim_backends.world.nominal import inverse
+from statemachine.journal import Journal
+from statemachine.policy import OnFailure, Policy
+from statemachine.runner import StepContext
+from statemachine.sequence import State
+
+CONFIG = load_config(None)
+JOB, MESH = load_job("pot")
+NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+
+
+class Site:
+    """A simulated cell at its target with the part in the claw, the arm folded, and the true place of the surface."""
+
+    def __init__(self) -> None:
+        self.cell = LockstepCell(CONFIG, seed=1, level="ideal")
+        world = self.cell.world
+        target = JOB.approach.target.se3()
+        world.vehicle._x, world.vehicle._y = target.translation[:2]
+        self.cell.clock.sleep(0.1)
+        self.arm = cast(LockstepArm, self.cell.devices.arm)
+        self.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
+        world_from_base = world.world_from_base(self.cell.clock.now())
+        self.base_from_surface = from_matrix(inverse(world_from_base) @ world.scene.world_from_surface)
+        self.mover = Mover(self.arm, self.cell.clock, CONFIG, JOB)
+        self.mover.meet_station(
+            self.base_from_surface * JOB.surface.place_from_surface.se3().inverse(),
+            JOB,
+            parse_board(JOB.board.spec),
+            NOMINAL.extent,
+        )
+        self.part = PartProgress()
+        self.noted: list[PartState] = []
+        self.forces: list[float] = []
+        self.heights: list[float] = []
+        touch = world.arm.contact
+        assert touch is not None
+
+        def watched(base_from_flange: Any) -> Any:
+            wrench = touch(base_from_flange)
+            self.forces.append(float(np.linalg.norm(wrench[:3])))
+            self.heights.append(float(base_from_flange[2, 3]))
+            return wrench
+
+        world.arm.contact = watched
+
+    def place(self, too_low: float = 0.0, **exchanged: Any) -> PlaceResult:
+        """Place where the surface is taken to be `too_low` m below where it truly is."""
+        given = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state), **exchanged}
+        return place(
+            JOB,
+            self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
+            self.mover,
+            self.arm,
+            given["claw"],
+            self.part,
+            lambda: None,
+            lambda share, text: None,
+            given["note"],
+        )
+
+    @property
+    def held(self) -> bool:
+        return self.cell.world.part.held
+
+    def height_above(self) -> float:
+        """Of the flange over where it places, along the surface's normal, m."""
+        at = self.base_from_surface * JOB.place.surface_from_part.se3() * JOB.grasp.flange_from_part.se3().inverse()
+        return float((at.inverse() * from_ur(self.arm.state().flange)).translation @ normal())
+
+
+def normal() -> np.ndarray:
+    return np.asarray(JOB.grasp.flange_from_part.se3().rotation[:, 2])
+
+
+def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() -> None:
+    site = Site()
+    above: list[float] = []
+
+    def note(part: PartProgress) -> None:
+        site.noted.append(part.state)
+        above.append(site.height_above())
+
+    result = site.place(note=note)
+    assert result.contact
+    assert abs(result.depth_error) < JOB.place.contact_travel
+    assert not site.held
+    assert site.noted == [PartState.RELEASED]
+    assert above[0] == pytest.approx(0.0, abs=JOB.place.contact_travel)
+    assert max(site.forces) < 3 * JOB.place.contact_force
+    assert site.cell.world.collisions.found == ()
+    where = site.part.where
+    assert where is not None
+    true = pin.SE3(site.base_from_surface * JOB.place.surface_from_part.se3())
+    assert np.linalg.norm(where.translation - true.translation) < 1e-3
+
+
+def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not_crushed() -> None:
+    site = Site()
+    with pytest.raises(RefusedError, match=r"touched something more than 1\.00 mm above"):
+        site.place(too_low=0.004)
+    assert site.held
+    assert site.part.state is PartState.HELD
+    assert site.height_above() > 0.5 * JOB.place.approach
+    # 40 mm/s until 24 N is felt: far below the 150 N of a protective stop.
+    assert 10.0 < max(site.forces) < 100.0
+    assert site.part.told("touched") == "touched"
+
+
+def test_a_part_that_meets_nothing_is_not_released() -> None:
+    site = Site()
+    with pytest.raises(RefusedError, match=r"no contact within 1\.00 mm"):
+        site.place(too_low=-0.004)
+    assert site.held
+    assert site.noted == []
+    assert site.height_above() > 0.5 * JOB.place.approach
+
+
+def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
+    site = Site()
+    site.cell.devices.claw.release()
+    site.heights.clear()
+    with pytest.raises(RefusedError, match="does not hold the part any more before the descent"):
+        site.place()
+    assert site.height_above() > 0.9 * JOB.place.approach
+    assert min(site.heights) > site.arm.state().flange[2] - 0.002
+
+
+def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
+    site = Site()
+    site.cell.devices.claw.release()
+    work = JobWork(
+        CONFIG,
+        JOB,
+        NOMINAL,
+        cast(Any, None),
+        site.cell.devices,
+        NoFrames(),
+        Path(),
+        Whereabouts(site.cell.devices.vehicle),
+    )
+    before = site.arm.state().joints
+    context = StepContext(Policy().of(State.DRIVE_TO_TARGET), 1, 1e9, {}, site.cell.clock, lambda event: None)
+    with pytest.raises(RefusedError, match="the claw holds no part"):
+        work.drive_to_target(context)
+    assert np.array_equal(site.arm.state().joints, before)
+
+
+def test_a_fault_after_the_release_says_that_the_part_is_down() -> None:
+    site = Site()
+    with pytest.raises(DeviceError) as caught:
+        site.place(note=lambda part: site.cell.world.arm.fault("protective_stop"))
+    assert not site.held
+    assert site.part.state is PartState.RELEASED
+    told = site.part.told(str(caught.value))
+    assert told.startswith("the part is already down at (")
+    assert "only the retreat failed" in told
+    assert "not to be placed again" in told
+
+
+def test_a_release_that_is_not_confirmed_leaves_the_part_unknown() -> None:
+    site = Site()
+    miswired = ArmSwitchedClaw("claw", site.arm, 5, CONFIG.claw.feedback, clock=site.cell.clock)
+    with pytest.raises(DeviceFault) as caught:
+        site.place(claw=miswired)
+    assert site.part.state is PartState.UNKNOWN
+    assert "look whether it did" in site.part.told(str(caught.value))
+    assert site.noted == []
+
+
+def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
+    step = Policy().of(State.PLACE)
+    assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
+
+
+def test_a_run_that_has_put_its_part_down_is_not_resumed(tmp_path: Path) -> None:
+    """Whether it was killed or faulted afterwards: the journal had it before the retreat began."""
+    journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
+    journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
+    journal.close()
+    with pytest.raises(ConfigError, match="had put its part down already"):
+        UnfinishedRun.find(tmp_path)

@@ -1,0 +1,140 @@
+"""A sweep that something disturbed is a fault that names it, on the devices in lock step: nothing of it is used."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.bench.lockstep import LockstepCell
+from cell.bench.lockstep_arm import LockstepArm
+from cell.bench.lockstep_camera import LockstepCamera
+from cell.bench.lockstep_rail import LockstepRail
+from cell.config import load_config
+from cell.geometry.light_plane import LightPlane
+from cell.geometry.poses import from_ur
+from cell.job import load_job
+from cell.planning import ScanPlan
+from cell.reconstruction import ScanGeometry
+from cell.steps.moves import HOME, Mover
+from cell.steps.rail_sweep import rail_sweep
+from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.stored_calibration import nominal_camera
+from drivers.errors import DeviceFault
+from drivers.interfaces import Frame
+
+CONFIG = load_config(None)
+SCAN = load_job("pot")[0].scan.model_copy(update={"length": 0.02, "speed": 0.02, "frame_rate": 20.0})
+GEOMETRY = ScanGeometry(
+    nominal_camera(CONFIG.scan_camera),
+    LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035),
+    np.array([1.0, 0.0, 0.0]),
+    CONFIG.scan_camera.flange_from_camera.se3(),
+)
+ERRORS = SweepErrors(np.zeros((6, 6)), 5e-6, 0.15e-3)
+Meddle = Callable[[LockstepCell], None]
+
+
+def nothing(cell: LockstepCell) -> None:
+    """Nobody meddles."""
+
+
+def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> Swath:
+    """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
+    cell = LockstepCell(CONFIG, seed=4, level="ideal")
+    devices, rail = cell.devices, cell.devices.rail
+    assert isinstance(rail, LockstepRail)
+    rail.home().wait(60.0)
+    rail.late = late
+    camera = devices.scan_camera
+    assert isinstance(camera, LockstepCamera)
+    camera.late = camera_late
+    mover = Mover(devices.arm, cell.clock, CONFIG, None)
+    mover.to_joints(HOME)
+    pose: pin.SE3 = from_ur(devices.arm.state().flange)
+    taken: list[int] = []
+
+    def keep(frame: Frame) -> None:
+        taken.append(frame.frame_id)
+        if len(taken) == 10:
+            meddle(cell)
+
+    collector = Collector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
+    return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, ERRORS, collector)
+
+
+def refused(code: str, meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> str:
+    with pytest.raises(DeviceFault) as caught:
+        sweep(meddle, late, camera_late)
+    assert caught.value.code == code
+    return str(caught.value)
+
+
+def push_the_arm(cell: LockstepCell) -> None:
+    arm = cell.devices.arm
+    assert isinstance(arm, LockstepArm)
+    arm.model.drive.q[0] += 0.0005
+
+
+def drive_the_rail_slower(cell: LockstepCell) -> None:
+    model, now = cell.world.rail, cell.clock.now()
+    slower = dataclasses.replace(model.settings, max_velocity=round(0.9 * model.settings.max_velocity))
+    model.configure(now, slower)
+
+
+def lose(count: int) -> Meddle:
+    def meddle(cell: LockstepCell) -> None:
+        camera = cell.devices.scan_camera
+        assert isinstance(camera, LockstepCamera)
+        camera.model.fault("camera.frame_loss", count)
+
+    return meddle
+
+
+def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres() -> None:
+    swath = sweep()
+    assert len(swath.lines) == pytest.approx(20, abs=2)
+    assert swath.lost == 0
+    # Half a round trip of 0.5 ms of the camera's, at 20 mm/s, and next to nothing of the rail's many readings.
+    assert 0.0 < swath.shift < 10e-6
+    assert np.sqrt(np.linalg.eigvalsh(swath.covariance)[-1]) == pytest.approx(swath.shift / np.sqrt(3), rel=0.3)
+
+
+def test_a_rail_that_somebody_drives_slower_meanwhile_is_uneven() -> None:
+    assert "off an even motion" in refused("rail.uneven_sweep", drive_the_rail_slower)
+
+
+def test_an_arm_that_is_pushed_meanwhile_is_a_fault() -> None:
+    assert "the flange moved by" in refused("arm.moved_in_sweep", push_the_arm)
+
+
+def test_more_lost_frames_than_a_twentieth_are_a_fault() -> None:
+    refused("camera.frames_lost", lose(2))
+    assert sweep(lose(1)).lost == 1
+
+
+@pytest.mark.parametrize("late", [0.02, 0.2])
+def test_replies_that_are_all_late_are_refused_with_what_they_leave_open(late: float) -> None:
+    said = refused("rail.late_readings", late=late)
+    told = re.search(r"those of the rail to ±([\d.]+) ms", said)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(0.5e3 * late, abs=0.25)
+    assert "allowed are 0.150 mm" in said
+    assert "sweep more slowly" in said
+
+
+def test_lateness_that_is_allowed_is_in_the_budget() -> None:
+    late = 0.01
+    swath = sweep(late=late)
+    # The trap: the readings show nothing of it, and the positions are off by half of it at 20 mm/s.
+    assert swath.residual < 10e-6
+    assert swath.shift == pytest.approx(0.5 * late * SCAN.speed, abs=15e-6)
+    assert np.sqrt(np.trace(swath.covariance[:3, :3])) == pytest.approx(swath.shift / np.sqrt(3), rel=0.1)
+
+
+def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well() -> None:
+    assert re.search(r"those of the camera to ±100\.\d ms", refused("camera.late_readings", camera_late=0.2))

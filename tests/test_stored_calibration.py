@@ -1,0 +1,115 @@
+"""A stored calibration is taken for its own devices, its own configuration and its own time only."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.calibration import ScanCalibration, TargetCalibration
+from cell.calibration.results import KEPT, Quality
+from cell.config import load_config
+from cell.geometry.light_plane import LightPlane
+from cell.stored_calibration import CellCalibration, find_calibration, nominal_camera, save_calibration
+from drivers.errors import CalibrationStale
+
+DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}
+CONFIGURATION = "0123456789abcdef"
+DAY = 86400.0
+MAX_AGE = 30 * DAY
+
+
+def made(
+    age: float = 1 * DAY, devices: dict[str, str] = DEVICES, configuration: str = CONFIGURATION
+) -> CellCalibration:
+    """A calibration that was made `age` s ago."""
+    quality = Quality(20, 1.0, 0.03, 1e-5, 0.03, 1e-5)
+    config = load_config(None)
+    plane = LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035)
+    scan = ScanCalibration(
+        nominal_camera(config.scan_camera), plane, np.array([1.0, 0.0, 0.0]), pin.SE3.Identity(), np.eye(KEPT), quality
+    )
+    target = TargetCalibration(nominal_camera(config.target_camera), pin.SE3.Identity(), np.eye(6), quality)
+    return CellCalibration(scan, target, dict(devices), configuration, time.time() - age)
+
+
+def found(folder: Path) -> CellCalibration:
+    return find_calibration(folder, DEVICES, CONFIGURATION, MAX_AGE)
+
+
+def test_the_own_one_is_found_as_it_was_stored(tmp_path: Path) -> None:
+    stored = made()
+    save_calibration(stored, tmp_path / "own.json")
+    assert found(tmp_path).as_dict() == stored.as_dict()
+
+
+def test_of_several_the_newest_is_taken(tmp_path: Path) -> None:
+    for age in (3, 1, 2):
+        save_calibration(made(age * DAY), tmp_path / f"{age}.json")
+    assert (time.time() - found(tmp_path).made) / DAY == pytest.approx(1, abs=0.01)
+
+
+def test_none_at_all_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationStale, match=r"no calibration of these devices.*run `cell calibrate`"):
+        found(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("device", sorted(DEVICES))
+def test_that_of_another_device_is_not_taken(tmp_path: Path, device: str) -> None:
+    save_calibration(made(devices={**DEVICES, device: "other"}), tmp_path / "other.json")
+    with pytest.raises(CalibrationStale, match=rf"no calibration of these devices.*{device} {DEVICES[device]}.*of 1"):
+        found(tmp_path)
+
+
+def test_that_of_fewer_or_more_devices_is_not_taken(tmp_path: Path) -> None:
+    save_calibration(made(devices={"arm": "A1"}), tmp_path / "fewer.json")
+    save_calibration(made(devices={**DEVICES, "mirror": "M1"}), tmp_path / "more.json")
+    with pytest.raises(CalibrationStale, match="of 2 stored"):
+        found(tmp_path)
+
+
+def test_that_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
+    save_calibration(made(configuration="fedcba9876543210"), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match=r"another configuration \(fedcba9876543210, now 0123456789abcdef\)"):
+        found(tmp_path)
+
+
+@pytest.mark.parametrize("age", [MAX_AGE + 60.0, 400 * DAY])
+def test_one_that_is_too_old_is_not_taken(tmp_path: Path, age: float) -> None:
+    save_calibration(made(age), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match=r"days old, allowed are 30\.0"):
+        found(tmp_path)
+    save_calibration(made(MAX_AGE - 60.0), tmp_path / "own.json")
+    found(tmp_path)
+
+
+def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path) -> None:
+    own = made(5 * DAY)
+    save_calibration(own, tmp_path / "own.json")
+    save_calibration(made(1 * DAY, configuration="fedcba9876543210"), tmp_path / "a.json")
+    save_calibration(made(1 * DAY, devices={**DEVICES, "rail": "R2"}), tmp_path / "z.json")
+    assert found(tmp_path).made == pytest.approx(own.made)
+
+
+def test_a_torn_file_is_named_and_not_taken(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    text = (tmp_path / "own.json").read_text(encoding="utf-8")
+    (tmp_path / "own.json").write_text(text[: len(text) // 2], encoding="utf-8")
+    with pytest.raises(CalibrationStale, match=r"1 unreadable \(own\.json\)"):
+        found(tmp_path)
+
+
+def test_its_hash_tells_two_calibrations_apart() -> None:
+    one = made()
+    other = replace(one, target=replace(one.target, hand_eye_covariance=2.0 * np.eye(6)))
+    assert one.hash() == replace(one).hash() != other.hash()
+
+
+def test_one_from_the_future_is_not_taken(tmp_path: Path) -> None:
+    save_calibration(made(-2 * DAY), tmp_path / "future.json")
+    with pytest.raises(CalibrationStale, match=r"48\.0 hours in the future"):
+        found(tmp_path)

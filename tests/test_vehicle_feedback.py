@@ -1,0 +1,150 @@
+"""What the vehicle's feedback means: error bits in words, and when odometry no longer tells where the vehicle is."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import DeadlineError, DeviceFault
+from drivers.interfaces import LinkStatistics
+from drivers.vehicle.faults import driver_trouble, system_trouble
+from drivers.vehicle.feedback import CAN_MODE, Feedback
+
+
+class Hand(Clock):
+    """A clock that is moved by hand."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.clock = Hand()
+        self.feedback = Feedback("vehicle", self.clock, track=0.58, max_speed=0.5, statistics=LinkStatistics())
+        self.tell(0, 0)
+
+    def tell(self, left: int, right: int, bits: int = 0, mode: int = CAN_MODE, state: int = 0) -> None:
+        """One round of cyclic messages, 20 ms after the last."""
+        self.clock.time += 0.02
+        self.feedback.take("Odometry", {"Left": left, "Right": right})
+        self.feedback.take("MotionState", {"Speed": 0.0, "YawRate": 0.0})
+        self.feedback.take("SystemState", {"State": state, "Mode": mode, "BatteryVoltage": 26.0, "ErrorBits": bits})
+
+    def interruption(self) -> tuple[int, str]:
+        state = self.feedback.state(1.0, None)
+        return state.interruptions, state.interruption
+
+
+@pytest.mark.parametrize(
+    ("bits", "words"),
+    [
+        (0x0001, ("the battery's voltage is too low",)),
+        (0x0008, ("motor 1 does not communicate",)),
+        (0x0140, ("motor 4 does not communicate", "a motor driver fails")),
+        (0x0006, ()),  # battery low and no remote control: it drives all the same
+        (0x0800, ("bit 0x0800",)),
+    ],
+)
+def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ...]) -> None:
+    assert system_trouble(bits, commanded=True) == words
+    bench = Bench()
+    bench.tell(0, 0, bits=bits)
+    if not words:
+        bench.feedback.check(in_command=True, driving=False)
+        return
+    with pytest.raises(DeviceFault, match=words[0]) as caught:
+        bench.feedback.check(in_command=True, driving=False)
+    assert caught.value.code == "vehicle.error"
+
+
+def test_an_error_that_came_while_driving_is_for_a_person_to_look_at() -> None:
+    """It may be a collision; one that came while it stood is cleared by a program."""
+    bench = Bench()
+    for driven in (True, False):
+        if driven:
+            bench.feedback.commanded_to_move()
+        else:
+            bench.clock.time += 5.0
+        bench.tell(0, 0, bits=0x0100, state=2)
+        with pytest.raises(DeviceFault, match="a motor driver fails") as caught:
+            bench.feedback.check(in_command=True, driving=False)
+        assert caught.value.recoverable is not driven
+        assert ("driven against" in caught.value.hint) is driven
+
+
+def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None:
+    assert driver_trouble(3, 0x44) == ("motor 3: overloaded",)
+    bench = Bench()
+    bench.feedback.take("MotorDriver2", {"DriverStatus": 0x40})
+    bench.feedback.check(in_command=True, driving=False)
+    bench.feedback.take("MotorDriver2", {"DriverStatus": 0x50})
+    with pytest.raises(DeviceFault, match="motor 2: sensor fails"):
+        bench.feedback.check(in_command=False, driving=False)
+
+
+def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands() -> None:
+    bench = Bench()
+    bench.clock.time += 0.6
+    with pytest.raises(DeviceFault, match=r"no feedback for 0\.60 s") as caught:
+        bench.feedback.check(in_command=True, driving=True)
+    assert caught.value.code == "vehicle.silent"
+    with pytest.raises(DeadlineError, match=r"0\.60 s old"):
+        bench.feedback.state(0.2, None)
+    bench.feedback.check(in_command=True, driving=False)  # this program may have read late
+    for _ in range(25):
+        bench.feedback.idle(0.1)
+    with pytest.raises(DeviceFault, match="no feedback"):
+        bench.feedback.check(in_command=True, driving=False)
+
+
+def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place() -> None:
+    bench = Bench()
+    for count in range(50):
+        bench.feedback.commanded_to_move()
+        bench.tell(10 * count, 10 * count)
+    assert bench.interruption() == (0, "")
+    bench.tell(0, 0)  # switched off and on: 490 mm are gone
+    assert bench.interruption() == (1, "its odometers jumped, so it was restarted")
+    bench.clock.time += 2.2  # this program computed, what came meanwhile waits
+    bench.tell(0, 0)
+    assert bench.interruption()[0] == 1
+    for _ in range(22):
+        bench.feedback.idle(0.1)
+    bench.tell(0, 0)
+    assert bench.interruption() == (2, "nothing was heard of it for 2.2 s")
+
+
+def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed() -> None:
+    bench = Bench()
+    for _ in range(10):
+        bench.tell(0, 0)
+    bench.tell(4, 3)
+    assert bench.interruption()[0] == 0
+    bench.tell(9, 8)
+    assert bench.interruption() == (1, "it moved by 9 mm without a command")
+    with pytest.raises(DeviceFault, match="moved by 9 mm") as caught:
+        bench.feedback.check(in_command=True, driving=False)
+    assert caught.value.code == "vehicle.disturbed"
+    bench.feedback.check(in_command=False, driving=False)
+
+
+def test_what_moves_by_our_own_command_is_no_push() -> None:
+    bench = Bench()
+    bench.feedback.commanded_to_move()
+    for count in range(150):
+        bench.tell(8 * count, 8 * count)
+    bench.clock.time += 0.9
+    for _ in range(200):
+        bench.tell(8 * 149, 8 * 149)
+    assert bench.interruption() == (0, "")
+
+
+def test_that_commands_stayed_away_is_no_fault_of_a_vehicle_that_nobody_commands() -> None:
+    assert system_trouble(0x0200, commanded=False) == ()
+    assert system_trouble(0x0200, commanded=True) == ("commands stayed away",)
+    assert system_trouble(0x0100, commanded=False) == ("a motor driver fails",)

@@ -1,0 +1,207 @@
+"""The vehicle drives only from where it is known to stand, not too far unseen, and not through the station."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from cell.bench.lockstep import LockstepCell
+from cell.config import load_config
+from cell.geometry.poses import from_matrix
+from cell.job import Job, load_job
+from cell.steps.approach import Planar, RelativeOdometry, turn_to
+from cell.steps.drive_to_target import Arrival, drive_to_target
+from cell.steps.photograph import BoardFix
+from cell.steps.way import Way, distance
+from cell.steps.whereabouts import Whereabouts
+from drivers.errors import RefusedError
+from sim_backends.world.nominal import inverse
+
+CONFIG = load_config(None)
+JOB = load_job("pot")[0]
+VEHICLE_FROM_BASE = CONFIG.arm.vehicle_from_base.se3()
+SIGHT_M, SIGHT = 2.3, math.radians(40)
+
+
+class Site:
+    """A simulated cell whose vehicle drives; the board's sight is told by the world's truth."""
+
+    def __init__(self, seed: int = 2) -> None:
+        self.cell = LockstepCell(CONFIG, seed, "nominal")
+        self.vehicle = self.cell.devices.vehicle
+        self.whereabouts = Whereabouts(self.vehicle)
+        self.notes: list[str] = []
+
+    def truth(self) -> Planar:
+        """Where the vehicle truly stands in the world, which is the place frame but for its height."""
+        return Planar(*self.cell.world.vehicle.planar(self.cell.clock.now()))
+
+    def photograph(self) -> BoardFix:
+        t = self.cell.clock.now()
+        base_from_board = inverse(self.cell.world.world_from_base(t)) @ self.cell.world.scene.world_from_board
+        x, y, _ = base_from_board[:3, 3]
+        if math.hypot(x, y) > SIGHT_M or abs(math.atan2(y, x)) > SIGHT:
+            raise RefusedError("no board found")
+        return BoardFix(from_matrix(base_from_board), 1e-8 * np.eye(6), 0.1, 0.0, ())
+
+    def run(self, job: Job = JOB) -> Arrival:
+        self.vehicle.enable()
+        self.whereabouts.enter(job)
+        return drive_to_target(
+            job, VEHICLE_FROM_BASE, self.vehicle, self.whereabouts, self.photograph, self.cell.clock, _never,
+            lambda share, text: None, self.notes.append,
+        )  # fmt: skip
+
+    def turn(self, angle: float) -> None:
+        """As `cell jog vehicle` does."""
+        self.vehicle.enable()
+        turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, _never)
+        self.vehicle.brake()
+
+
+def _never() -> None:
+    pass
+
+
+def moved(before: Planar, after: Planar) -> float:
+    return math.hypot(after.x - before.x, after.y - before.y)
+
+
+def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -> None:
+    site = Site()
+    stood = site.truth()
+    with pytest.raises(RefusedError, match=r"has just connected.*no board found") as refused:
+        site.run()
+    assert "cell jog vehicle" in str(refused.value)
+    assert "--at-start" in str(refused.value)
+    assert moved(stood, site.truth()) == 0.0
+
+
+def test_after_a_jog_in_another_process_three_runs_are_refused_and_nothing_drives() -> None:
+    site = Site()
+    site.turn(math.radians(30))
+    for _ in range(3):
+        stood = site.truth()
+        site.whereabouts = Whereabouts(site.vehicle)  # each run is a new process
+        with pytest.raises(RefusedError, match="not known"):
+            site.run()
+        assert moved(stood, site.truth()) == 0.0
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(seed: int) -> None:
+    site = Site(seed)
+    site.whereabouts.say_at_start()
+    arrival = site.run()
+    assert max(abs(arrival.error_along), abs(arrival.error_across)) < JOB.approach.tolerance
+    stood = site.truth()
+    assert moved(Planar.of(JOB.approach.target.se3()), stood) < 0.02
+    site.run()
+    assert moved(stood, site.truth()) < 0.002
+    assert site.cell.world.collisions.found == ()
+
+
+def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.turn(math.radians(20))
+    site.whereabouts.enter(JOB)
+    assert site.whereabouts.pose().yaw == pytest.approx(site.truth().yaw, abs=0.03)
+    site.run()
+    assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
+
+
+def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:
+    """Turned by 30° and said to be at its start: it goes that way once, sees nothing, and is not driven again."""
+    site = Site()
+    site.turn(math.radians(30))
+    stood = site.truth()
+    site.whereabouts.say_at_start()
+    for _ in range(3):
+        with pytest.raises(RefusedError, match="no board found"):
+            site.run()
+    staging = Planar.of(JOB.approach.staging.se3())
+    start = Planar.of(JOB.approach.start.se3())
+    assert moved(stood, site.truth()) < moved(start, staging) + 0.05
+    assert site.cell.world.collisions.found == ()
+
+
+def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.whereabouts.enter(JOB)
+    start = site.whereabouts.pose()
+    assert site.whereabouts.see(Planar(start.x + 0.03, start.y, start.yaw)) is None
+    told = site.whereabouts.see(Planar(start.x + 0.4, start.y, start.yaw))
+    assert told is not None
+    assert "370 mm" in told
+    assert site.whereabouts.pose().x == pytest.approx(start.x + 0.4)
+
+
+def test_another_jobs_board_tells_nothing_about_this_place() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.whereabouts.enter(JOB)
+    board = JOB.board.model_copy(update={"spec": "marked_dots:9x7:25mm"})
+    site.whereabouts.enter(JOB.model_copy(update={"board": board}))
+    with pytest.raises(RefusedError, match="board of another job"):
+        site.whereabouts.pose()
+
+
+def seen_at(site: Site, pose: Planar) -> Way:
+    site.whereabouts.enter(JOB)
+    site.whereabouts.see(pose)
+    return Way(JOB, VEHICLE_FROM_BASE, site.whereabouts)
+
+
+def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not() -> None:
+    site = Site()
+    target, staging = Planar.of(JOB.approach.target.se3()), Planar.of(JOB.approach.staging.se3())
+    way = seen_at(site, staging)
+    way.require_line(target)
+    with pytest.raises(RefusedError, match="of the table"):
+        way.require_line(Planar(-0.6, -0.6, 0.0))
+    # Turning on the spot, a corner of the vehicle sweeps 0.64 m around it.
+    near = seen_at(site, Planar(-1.0, -0.2, 0.0))
+    near.require_turn(math.radians(2))
+    with pytest.raises(RefusedError, match="of the table"):
+        near.require_turn(math.radians(45))
+
+
+def test_a_target_in_the_table_is_not_driven_to() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    target = JOB.approach.target.model_copy(update={"translation": (-0.8, 0.0, -0.6)})
+    with pytest.raises(RefusedError, match="of the table"):
+        site.run(JOB.model_copy(update={"approach": JOB.approach.model_copy(update={"target": target})}))
+    assert moved(Planar.of(JOB.approach.staging.se3()), site.truth()) < 0.05
+    assert site.cell.world.collisions.found == ()
+
+
+def test_the_longer_it_was_not_seen_the_more_room_it_needs() -> None:
+    site = Site()
+    close = Planar(-0.95, -0.2, 0.0)  # its front 100 mm before the table
+    way = seen_at(site, Planar(-1.2, -0.2, 0.0))
+    way.require_line(close)
+    site.whereabouts.way = 1.0
+    with pytest.raises(RefusedError, match="allowed 1"):
+        way.require_line(close)
+
+
+def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose() -> None:
+    site = Site()
+    way = seen_at(site, Planar(-3.05, -0.6, 0.0))
+    way.require_line(Planar(-1.85, -0.6, 0.0))
+    far = seen_at(site, Planar(-4.5, -0.6, 0.0))
+    with pytest.raises(RefusedError, match=r"2\.65 m on odometry alone .* allowed 1\.45 m"):
+        far.require_line(Planar(-1.85, -0.6, 0.0))
+
+
+def test_the_distance_between_outlines_is_that_of_their_nearest_points() -> None:
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    for aside, expected in (((1.3, 0.4), 0.3), ((1.3, 1.4), 0.5), ((0.5, 0.5), 0.0)):
+        assert distance(square, square + np.array(aside)) == pytest.approx(expected)
+    diamond = np.array([[2.0, 0.5], [2.5, 1.0], [3.0, 0.5], [2.5, 0.0]])
+    assert distance(square, diamond) == pytest.approx(1.0)

@@ -1,0 +1,173 @@
+"""Which configuration a command works with: the named one, else the present folder's; nothing moves at another."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cell import Cell, ConfigError
+from cell.cli import main
+from cell.config import (
+    config_to_open,
+    default_toml,
+    find_config,
+    load_config,
+    require_confirm,
+    require_real_addresses,
+)
+from cell.job import job_path
+from cell.simulation import with_endpoints
+
+MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
+ENDPOINTS = {
+    "speed": 3.0,
+    "truth": {"address": "127.0.0.1:4001"},
+    "arm": {"address": "127.0.0.2"},
+    "rail": {"url": "socket://127.0.0.1:4002"},
+    "vehicle": {"interface": "slcan", "channel": "socket://127.0.0.1:4003"},
+    "scan_camera": {"address": "127.0.0.1:4004"},
+    "target_camera": {"address": "127.0.0.1:4005"},
+}
+
+
+@pytest.fixture
+def cell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """`cell(words…)` in an empty folder: exit code and all that was printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["cell", *words])
+        code: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code or 0
+        shown = capsys.readouterr()
+        assert isinstance(code, int)
+        return code, shown.out + shown.err
+
+    return run
+
+
+@pytest.mark.parametrize("words", MOVING, ids=" ".join)
+def test_without_a_configuration_nothing_moves(cell: Callable[..., tuple[int, str]], words: list[str]) -> None:
+    code, shown = cell(*words)
+    assert code == 2
+    assert "there is no cell.toml" in shown
+    assert "192.0.2" not in shown
+
+
+@pytest.mark.parametrize("words", MOVING, ids=" ".join)
+def test_the_configuration_of_the_present_folder_is_used(
+    cell: Callable[..., tuple[int, str]], words: list[str]
+) -> None:
+    Path("cell.toml").write_text(default_toml().replace("192.0.2.10", "192.0.2.77"))
+    code, shown = cell(*words)
+    assert code == 2
+    assert 'arm.address = "192.0.2.77"' in shown
+
+
+@pytest.mark.parametrize("words", MOVING, ids=" ".join)
+def test_nothing_moves_at_an_address_that_is_only_the_example(
+    cell: Callable[..., tuple[int, str]], words: list[str]
+) -> None:
+    assert cell("init", "mine")[0] == 0
+    code, shown = cell(*words, "-c", "mine/cell.toml")
+    assert code == 2
+    assert "still the example's" in shown
+
+
+def test_the_supervisor_script_is_held_to_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="there is no cell"):
+        Cell.open()
+    Path("cell.toml").write_text(default_toml())
+    with pytest.raises(ConfigError, match="still the example's"):
+        Cell.open()
+
+
+def test_what_is_named_wins_and_a_simulated_cell_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config(None, simulated=True) is None
+    with pytest.raises(ConfigError):
+        find_config(None)
+    Path("cell.toml").write_text(default_toml())
+    assert find_config(None) == find_config(None, simulated=True) == Path("cell.toml")
+    assert find_config(Path("other.toml")) == Path("other.toml")
+
+
+def test_a_broken_local_file_is_no_reason_to_take_another(cell: Callable[..., tuple[int, str]]) -> None:
+    Path("cell.toml").symlink_to("gone.toml")
+    for words in (["check"], ["runs"], ["dry-run"], *MOVING):
+        code, shown = cell(*words)
+        assert code == 2
+        assert "cell.toml does not exist" in shown
+
+
+def test_check_reads_the_local_files_and_says_which(cell: Callable[..., tuple[int, str]]) -> None:
+    assert json.loads(cell("check", "--json")[1])["configuration"] == "the one that ships"
+    assert cell("init")[0] == 0
+    told = json.loads(cell("check", "--json")[1])
+    assert (told["ok"], told["configuration"], told["job_file"]) == (True, "cell.toml", "pot.toml")
+    assert told["job"] == "pot"
+    assert told["mesh"] == "pot.stl"
+    assert any("192.0.2.10" in note for note in told["notes"])
+    Path("cell.toml").write_text(default_toml().replace('lead = "2 mm"', 'lead = "2"'))
+    assert cell("check")[0] == 2
+
+
+def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = job_path("pot")
+    assert shipped.is_absolute()
+    Path("pot").mkdir()
+    assert job_path("pot") == shipped
+    Path("pot.toml").write_text(shipped.read_text())
+    assert job_path("pot") == Path("pot.toml")
+    assert job_path(shipped) == shipped
+
+
+def test_runs_are_looked_for_where_the_local_file_says(cell: Callable[..., tuple[int, str]]) -> None:
+    Path("cell.toml").write_text(default_toml().replace('runs = "runs"', 'runs = "mine"'))
+    code, shown = cell("report")
+    assert code == 2
+    assert str(Path.cwd() / "mine") in shown
+
+
+def test_only_a_simulated_cell_may_confirm_by_itself() -> None:
+    real = load_config(None)
+    assert real.cell.confirm == "person"
+    require_confirm(real)
+    _, wished = config_to_open(None, simulated=True, confirm="simulated")
+    with pytest.raises(ConfigError, match="only for a simulated cell"):
+        require_confirm(wished)
+    for config, confirm in ((real, "person"), (wished, "simulated")):
+        simulated = with_endpoints(config, ENDPOINTS)
+        assert simulated.cell.confirm == confirm
+        require_confirm(simulated)
+        require_real_addresses(simulated)
+
+
+def test_a_real_cell_that_is_to_confirm_by_itself_is_not_opened(tmp_path: Path) -> None:
+    text = default_toml().replace('confirm = "person"', 'confirm = "simulated"').replace("192.0.2", "127.0.0")
+    (tmp_path / "cell.toml").write_text(text)
+    with pytest.raises(ConfigError, match="a person looks and confirms"):
+        Cell.open(tmp_path / "cell.toml")
+    (tmp_path / "cell.toml").write_text(text.replace('confirm = "simulated"', 'confirm = "person"'))
+    with pytest.raises(ConfigError, match="a person looks and confirms"):
+        Cell.open(tmp_path / "cell.toml", confirm="simulated")
+
+
+def test_the_configuration_that_ships_names_no_device() -> None:
+    with pytest.raises(ConfigError) as told:
+        require_real_addresses(load_config(None))
+    for key in ("arm.address", "scan_camera.address", "target_camera.address"):
+        assert key in str(told.value)

@@ -1,0 +1,547 @@
+"""Whatever is wrong in a configuration, a job or a command line is told in the cell's own words, before anything moves.
+
+Every case goes through the real command line: exit code 2, no traceback, no word of the libraries underneath.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.cli import main
+from cell.config import default_toml
+from cell.job import job_path
+
+JARGON = (
+    "Traceback", "pydantic", "Input should be", "type=", "input_value", "valid string", "valid dictionary",
+    "Field required", "Value error", "dimensionality", "Cannot convert", "not defined in the unit", "pint",
+    "TOMLDecodeError", "Expected", "Invalid statement", "Errno", "codec", "NoneType", "ValidationError", "trimesh",
+    "unexpected keyword", "object has no attribute",
+)  # fmt: skip
+
+
+def changed(text: str, key: str, value: str | None) -> str:
+    """A TOML text with the value of "table.key" replaced, added, or with None removed."""
+    table, _, name = key.rpartition(".")
+    lines, here, done = [], "", False
+    for line in text.splitlines():
+        if line.startswith("["):
+            here = line[1 : line.index("]")]
+        if here == table and line.split(" = ")[0] == name:
+            done = True
+            if value is not None:
+                lines.append(f"{name} = {value}")
+            continue
+        lines.append(line)
+        if not done and here == table and line.startswith("[") and f"\n{name} = " not in text.partition(line)[2]:
+            lines.append(f"{name} = {value}")
+            done = True
+    return "\n".join(lines) + "\n"
+
+
+def pose(*numbers: float) -> str:
+    """A pose in TOML, mm and deg."""
+    moved, turned = [f'"{v:g} mm"' for v in numbers[:3]], [f'"{v:g} deg"' for v in (*numbers[3:], 0, 0, 0)[:3]]
+    return f"{{ translation = [{', '.join(moved)}], rotation = [{', '.join(turned)}] }}"
+
+
+def write_stl(path: Path, size: tuple[float, float] = (0.07, 0.036), height: float = 0.008, at: float = 0.0) -> None:
+    """A small binary STL: a slightly bent sheet around (at, 0), m."""
+    x, y = (np.linspace(-side / 2, side / 2, 8) for side in size)
+    grid = np.array([[(a + at, b, height * (1 - (a / size[0]) ** 2)) for b in y] for a in x])
+    corners = [
+        corner
+        for i in range(7)
+        for j in range(7)
+        for corner in (
+            (grid[i, j], grid[i + 1, j], grid[i + 1, j + 1]),
+            (grid[i, j], grid[i + 1, j + 1], grid[i, j + 1]),
+        )
+    ]
+    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *np.ravel(corner), 0) for corner in corners)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(corners)) + facets)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in, with a small mesh beside it all."""
+    monkeypatch.chdir(tmp_path)
+    write_stl(tmp_path / "pot.stl")
+    return tmp_path
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str]:
+    """A `cell` command in this process: its exit code and all that it printed."""
+    monkeypatch.setattr(sys, "argv", ["cell", *words])
+    code: object = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code
+    shown = capsys.readouterr()
+    return (code if isinstance(code, int) else 0 if code is None else 1), shown.out + shown.err
+
+
+Run = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def cell(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, place: Path) -> Run:
+    """`cell(words…)` in an empty folder."""
+    return lambda *words: run(capsys, monkeypatch, *words)
+
+
+def assert_refused(code: int, shown: str, words: tuple[str, ...]) -> None:
+    for word in words:
+        assert word in shown, shown
+    for word in JARGON:
+        assert word not in shown, shown
+    assert code == 2, shown
+
+
+WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
+    # addresses and ports
+    ("arm.address", '"300.1.2.3"', ("arm.address", "0 to 255")),
+    ("arm.address", '"192.168.0"', ("arm.address", "four numbers")),
+    ("arm.address", '""', ("arm.address", "is no address")),
+    ("arm.address", '"arm one"', ("arm.address", "is no address")),
+    ("arm.address", '"10.0.0.5:30004"', ("arm.address", "leave out port")),
+    ("arm.address", '"http://10.0.0.5"', ("arm.address", "leave out port, scheme")),
+    ("arm.address", '"0.0.0.0"', ("arm.address", "not the address of one device")),
+    ("arm.address", '"255.255.255.255"', ("arm.address", "not the address of one device")),
+    ("arm.address", "5", ("arm.address", "is no text; write it in quotes")),
+    ("scan_camera.address", '"10.0.0.20:0"', ("scan_camera.address", "1 to 65535")),
+    ("scan_camera.address", '"10.0.0.20:65536"', ("scan_camera.address", "1 to 65535")),
+    ("scan_camera.address", '"10.0.0.20:-1"', ("scan_camera.address", "1 to 65535")),
+    ("scan_camera.address", '"10.0.0.20"', ("scan_camera.address", "has no port", "HOST:PORT")),
+    ("scan_camera.address", '"10.0.0.256:5000"', ("scan_camera.address", "0 to 255")),
+    ("scan_camera.address", '"10.0.0.20:five"', ("scan_camera.address", "1 to 65535")),
+    ("scan_camera.address", '":5000"', ("scan_camera.address", "HOST:PORT")),
+    ("target_camera.address", '"192.0.2.20:5000"', ("scan_camera.address and target_camera.address are both",)),
+    ("cell.truth", '"nowhere"', ("cell.truth", "HOST:PORT")),
+    ("cell.truth", '"192.0.2.20:5000"', ("scan_camera.address and cell.truth are both",)),
+    # the rail's line
+    ("rail.url", '""', ("rail.url", "no serial port", "/dev/ttyUSB0")),
+    ("rail.url", '"ttyACM0"', ("rail.url", "no serial port")),
+    ("rail.url", '"/dev/"', ("rail.url", "no serial port")),
+    ("rail.url", '"/dev/../etc/passwd"', ("rail.url", "no serial port")),
+    ("rail.url", '"telnet://10.0.0.5:4001"', ("rail.url", '"telnet" is not one of')),
+    ("rail.url", '"socket://10.0.0.5"', ("rail.url", "has no port")),
+    ("rail.url", '"socket://10.0.0.5:70000"', ("rail.url", "1 to 65535")),
+    ("rail.url", '"socket://"', ("rail.url", "names no port")),
+    ("rail.url", '"rfc2217://10.0.0.999:4001"', ("rail.url", "0 to 255")),
+    ("rail.url", '"/dev/ttyUSB0"', ("rail.url and vehicle.channel are both",)),
+    # CAN
+    ("vehicle.interface", '"canfoo"', ("vehicle:", '"canfoo" is unknown', "socketcan")),
+    ("vehicle.interface", '""', ("vehicle:", "is unknown")),
+    ("vehicle.interface", '"virtual"', ("vehicle:", "reaches no vehicle")),
+    ("vehicle.interface", '"socketcan"', ("vehicle:", "/dev/ttyUSB0", '"can0"')),
+    ("vehicle.interface", '"pcan"', ("vehicle:", "PCAN_USBBUS1")),
+    ("vehicle.interface", '"kvaser"', ("vehicle:", "a number")),
+    ("vehicle.interface", '"socketcand"', ("vehicle:", "host and a port")),
+    ("vehicle.interface", '"udp_multicast"', ("vehicle:", "multicast address")),
+    ("vehicle.channel", '"can0"', ("vehicle:", '"slcan"', "no serial port")),
+    ("vehicle.channel", '""', ("vehicle:", "no serial port")),
+    ("vehicle.channel", '"/dev/ttyUSB0@fast"', ("vehicle:", "no speed of a serial line")),
+    ("vehicle.channel", '"socket://10.0.0.5:0"', ("vehicle:", "1 to 65535")),
+    ("vehicle.bitrate", '"123 kbit/s"', ("vehicle:", "123 kbit/s", "500")),
+    ("vehicle.bitrate", '"500 kHz"', ("vehicle.bitrate", "not a quantity in kbit/s")),
+    # inputs and outputs of the arm
+    ("laser.output", "18", ("laser.output", "0 to 17", "16-17 tool")),
+    ("laser.output", "-1", ("laser.output", "0 to 17")),
+    ("laser.output", "true", ("laser.output", "no whole number")),
+    ("laser.output", "1.0", ("laser.output", "no whole number")),
+    ("laser.output", '"0"', ("laser.output", "no whole number")),
+    ("claw.output", "99", ("claw.output", "0-7 standard, 8-15 configurable")),
+    ("claw.output", "0", ("laser.output and claw.output are both 0",)),
+    ("claw.feedback", "18", ("claw.feedback", "0 to 17")),
+    # numbers and units
+    ("rail.lead", "2", ("rail.lead", "has no unit", '"0.1 mm"')),
+    ("rail.lead", '"2"', ("rail.lead", "has no unit")),
+    ("rail.lead", '"2 kg"', ("rail.lead", "not a quantity in mm")),
+    ("rail.lead", '"2 furlongz"', ("rail.lead", "not a quantity in mm")),
+    ("rail.lead", '"two mm"', ("rail.lead", "not a number and a unit")),
+    ("rail.lead", '"nan mm"', ("rail.lead", "not a number and a unit")),
+    ("rail.lead", '"1e999 mm"', ("rail.lead", "outside the allowed range")),
+    ("rail.lead", '"2 mm^9^9^9"', ("rail.lead", "not a number and a unit")),
+    ("rail.lead", '"-2 mm"', ("rail.lead", "0.1 to 50 mm")),
+    ("rail.lead", '""', ("rail.lead", "not a number and a unit")),
+    ("rail.lead", "[2]", ("rail.lead", "has no unit")),
+    ("rail.lead", "1979-05-27", ("rail.lead", "has no unit")),
+    ("rail.microsteps", "3", ("rail.microsteps", "1, 2, 4, 8")),
+    ("rail.microsteps", "true", ("rail.microsteps", "no whole number")),
+    ("rail.motor", "6", ("rail.motor", "0 to 5")),
+    ("rail.address", "0", ("rail.address", "1 to 255")),
+    ("rail.steps_per_turn", "200.5", ("rail.steps_per_turn", "no whole number")),
+    ("rail.travel", '["100 mm", "0 mm"]', ("rail:", "the first must be smaller")),
+    ("rail.travel", '["0 mm", "0 mm"]', ("rail:", "the first must be smaller")),
+    ("rail.travel", '["0 mm"]', ("rail.travel[1]", "missing")),
+    ("rail.travel", '["0 mm", "50 mm", "100 mm"]', ("rail.travel", "at most 2")),
+    ("rail.travel", '"100 mm"', ("rail.travel", "is no list")),
+    ("rail.travel", '["0 mm", "100 m"]', ("rail.travel[1]", "-100 to 2000 mm")),
+    ("rail.max_speed", '"5 kHz"', ("rail.max_speed", "not a quantity in mm/s")),
+    ("rail.acceleration", '"200 mm/s"', ("rail.acceleration", "not a quantity in mm/s^2")),
+    ("arm.max_joint_speed", '"60 Hz"', ("arm.max_joint_speed", "not a quantity in deg/s")),
+    ("arm.max_joint_speed", '"0 deg/s"', ("arm.max_joint_speed", "1 to 120 deg/s")),
+    ("arm.max_tool_speed", '"5 m/s"', ("arm.max_tool_speed", "1 to 1500 mm/s")),
+    ("arm.payload", '"20 kg"', ("arm.payload", "0 to 12.5 kg")),
+    ("arm.payload_centre", '["0 mm", "0 mm", "2 m"]', ("arm.payload_centre[2]", "-500 to 500 mm")),
+    ("arm.settle_time", '"1 hour"', ("arm.settle_time", "0 to 5 s")),
+    ("arm.repeatability", '"0 mm"', ("arm.repeatability", "0.0001 to 2 mm")),
+    ("arm.model", '"UR5"', ("arm.model", '"UR5" is not one of "UR10e"')),
+    ("arm.vehicle_from_base", pose(300, 0, 5500), ("arm:", "off the vehicle")),
+    ("arm.vehicle_from_base", pose(300, 0, 550, 90), ("arm:", "upright")),
+    ("arm.vehicle_from_base", '"here"', ("arm.vehicle_from_base", "is no table")),
+    ("vehicle.max_yaw_rate", '"5 deg/s"', ("vehicle.max_yaw_rate", "25 to 90 deg/s")),
+    ("vehicle.track", '"0 mm"', ("vehicle.track", "100 to 3000 mm")),
+    ("laser.tan_theta", "nan", ("laser.tan_theta", "0.2 to 20")),
+    ("laser.tan_theta", '"3.5"', ("laser.tan_theta", "no plain number")),
+    ("laser.tan_theta", "true", ("laser.tan_theta", "no plain number")),
+    ("laser.baseline", '"350 mm"', ("the laser's line is not in the scan camera's picture",)),
+    ("scan_camera.width", "64000", ("scan_camera.width", "64 to 8192")),
+    ("scan_camera.height", "64", ("scan_camera:", "no shape of a sensor")),
+    ("scan_camera.pixel", '"0 um"', ("scan_camera.pixel", "0.5 to 30 um")),
+    ("target_camera.focal_length", '"200 mm"', ("board.spec", "pixels of 1280 x 1024")),
+    ("scan_camera.photo_exposure", '"1 s"', ("scan_camera.photo_exposure", "0.01 to 100 ms")),
+    ("scan_camera.flange_from_camera", pose(90, -50, 80000), ("scan_camera.flange_from_camera", "-1000 to 1000 mm")),
+    ("target_camera.flange_from_camera", pose(0, 0, 0), ("target_camera.flange_from_camera", "into the claw")),
+    # boards and calibration
+    ("calibration.fine.board", '"marked_dots:11"', ("calibration.fine.board", "KIND:COLSxROWS:PITCH")),
+    ("calibration.fine.board", '"marked_dots:11x9:30mm"', ("calibration.fine.board", "pixels of 640 x 480")),
+    ("calibration.fine.board", '"dots:11x9:3mm"', ("calibration.fine.board", "half a turn")),
+    ("calibration.large.board", '"marked_dots:9x7:1mm"', ("calibration.large.board", "pixels apart")),
+    ("calibration.fine.base_from_board", pose(-5650, 262, 20, 180), ("fine.base_from_board", "not on the deck")),
+    ("calibration.fine.base_from_board", pose(-565, 262, -400, 180), ("fine.base_from_board", "not on the deck")),
+    ("calibration.large.base_from_board", pose(-680, -190, 900, 180), ("calibration.large.base_from_board", "300 mm")),
+    ("calibration.fine.base_from_board", pose(-565, 262, 20), ("calibration view 1",)),
+    ("calibration.max_age", '"0 day"', ("calibration.max_age", "0.01 to 3650 day")),
+    ("calibration.rail_sigma", '"0 mm"', ("calibration.rail_sigma", "0.0001 to 2 mm")),
+    ("calibration.stripe_exposure", '"0 ms"', ("calibration.stripe_exposure", "0.01 to 100 ms")),
+    # the cell as a whole
+    ("cell.name", '""', ("cell.name", "is no name")),
+    ("cell.name", '"a/b"', ("cell.name", "no slash")),
+    ("cell.runs", '"/var/runs"', ("cell.runs", "no absolute path")),
+    ("cell.runs", '"../runs"', ("cell.runs", 'no ".."')),
+    ("cell.runs", '""', ("cell.runs", "no folder beside this file")),
+    ("cell.runs", '"calibrations"', ("cell:", "both")),
+    ("cell.calibrations", '"~/store"', ("cell.calibrations", "no folder beside this file")),
+    ("cell.time_scale", "3.0", ("cell:", "real devices need time_scale = 1")),
+    ("cell.time_scale", "0", ("cell.time_scale", "0.01 to 100")),
+    ("cell.time_scale", "inf", ("cell.time_scale", "0.01 to 100")),
+    ("cell.confirm", '"nobody"', ("cell.confirm", '"person" or "simulated"')),
+    ("cell.confirm", '"simulated"', ("cell.confirm", "only for a simulated cell", "a person looks")),
+    ("cell.colour", '"red"', ("cell.colour", "unknown key")),
+    ("rail.driver", '"plc"', ("rail.driver", '"plc" is not one of "tmcl"')),
+    ("rail.lead", None, ("rail.lead", "missing", "cell init")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "value", "words"), WRONG_CONFIGURATIONS)
+def test_a_wrong_configuration_does_not_pass_the_check(
+    cell: Run, place: Path, key: str, value: str | None, words: tuple[str, ...]
+) -> None:
+    (place / "cell.toml").write_text(changed(default_toml(), key, value))
+    (place / "pot.toml").write_text(job_path("pot").read_text())
+    assert_refused(*cell("check"), words)
+
+
+WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
+    ("job.name", '"a/b"', ("job.name", "no slash")),
+    ("job.name", '""', ("job.name", "is no name")),
+    ("job.name", '"../pot"', ("job.name", "is no name")),
+    ("job.name", '".."', ("job.name", "is no name")),
+    ("job.name", '"two\\nlines"', ("job.name", "is no name")),
+    ("job.name", "7", ("job.name", "write it in quotes")),
+    ("job.colour", '"red"', ("job.colour", "unknown key")),
+    ("board.spec", '"chess:7x6:10mm"', ("board.spec", "unknown kind")),
+    ("board.spec", '"dots:9x7:20mm"', ("board.spec", "half a turn")),
+    ("board.spec", '"marked_dots:9x7:40mm"', ("board.spec", "larger than the plate")),
+    ("board.place_from_board", pose(142, 400, -300, -135, 0, -90), ("board.place_from_board", "above the table")),
+    ("board.place_from_board", pose(142, 40000, 162, -135, 0, -90), ("board.place_from_board", "-20000 to 20000")),
+    ("board.place_from_board", pose(142, 2400, 162, -135, 0, -90), ("looking pose", "out of reach")),
+    ("board.place_from_board", pose(142, 400, 162, 45, 0, -90), ("board", "looking pose")),
+    ("approach.staging", pose(-900, 0, -600), ("approach", "staging has to lie between")),
+    ("approach.start", pose(-1500, 0, -600), ("approach", "staging has to lie between")),
+    ("approach.start", pose(-3050, 2000, -600), ("approach.start", "beside the target's line")),
+    ("approach.staging", pose(-1850, 0, -500), ("approach", "one height")),
+    ("approach.target", pose(-1050, 0, -600, 0, 20), ("approach.target", "tilted")),
+    ("approach.target", pose(-500, 0, -600), ("approach", "of the table")),
+    ("approach.target", pose(-1050, 0, 600), ("approach", "one height")),
+    ("approach.target", pose(-1700, 0, -600), ("out of reach",)),
+    ("approach.speed", '"0.9 m/s"', ("approach.speed 900 mm/s exceeds vehicle.max_speed",)),
+    ("approach.speed", '"0.4"', ("approach.speed", "has no unit")),
+    ("approach.tolerance", '"0 mm"', ("approach.tolerance", "1 to 100 mm")),
+    ("approach.tolerance", '"-5 mm"', ("approach.tolerance", "1 to 100 mm")),
+    ("approach.tolerance", '"5 m"', ("approach.tolerance", "1 to 100 mm")),
+    ("approach.tolerance_angle", '"0.1 deg"', ("approach.tolerance_angle", "0.3 to 10 deg")),
+    ("photo.stand_off", '"150 mm"', ("board.spec", "pixels of 1280 x 1024")),
+    ("photo.stand_off", '"5 m"', ("board.spec", "pixels apart")),
+    ("photo.stand_off", '"2500 mm"', ("out of reach",)),
+    ("photo.count", "0", ("photo.count", "1 to 100")),
+    ("photo.count", "4.0", ("photo.count", "no whole number")),
+    ("photo.max_residual", "nan", ("photo.max_residual", "0.01 to 10")),
+    ("photo.max_residual", '"0.5"', ("photo.max_residual", "no plain number")),
+    ("surface.mesh", '""', ("surface.mesh", "name an STL or PLY")),
+    ("surface.mesh", '"gone.stl"', ("gone.stl", "is not a file")),
+    ("surface.mesh", '"."', ("is not a file",)),
+    ("surface.mesh", '"text.stl"', ("text.stl", "give an STL or PLY")),
+    ("surface.mesh", '"empty.stl"', ("empty.stl", "give an STL or PLY")),
+    ("surface.mesh", '"nan.stl"', ("nan.stl", "not numbers")),
+    ("surface.mesh", '"pot.toml"', ("pot.toml", "give an STL or PLY")),
+    ("surface.mesh", '"large.stl"', ("large.stl", "check surface.mesh_unit")),
+    ("surface.mesh", '"aside.stl"', ("aside.stl", "sees too little of it")),
+    ("surface.mesh", '"high.stl"', ("surface.mesh is", "scan.stand_off")),
+    ("surface.mesh_unit", '"mm"', ("mesh_unit", "1 to 5000 mm")),
+    ("surface.mesh_unit", '"cm"', ("surface.mesh_unit", '"m" or "mm"')),
+    ("surface.place_from_surface", pose(0, 0, -100), ("into the table",)),
+    ("surface.place_from_surface", pose(900, 0, 0), ("beside the table",)),
+    ("surface.place_from_surface", pose(0, 0, 0, 180), ("into the table",)),
+    ("surface.prior_sigma", '"0 mm"', ("surface.prior_sigma", "0.01 to 100 mm")),
+    ("scan.length", '"99.5 mm"', ("scan.length 99.5 mm", "rail.travel")),
+    ("scan.length", '"-64 mm"', ("scan.length", "1 to 2000 mm")),
+    ("scan.speed", '"45 mm/s"', ("scan.speed 45 mm/s exceeds rail.max_speed, 40 mm/s",)),
+    ("scan.speed", '"0.1 mm/s"', ("scan:", "640 s", "at most 100 s")),
+    ("scan.exposure", '"50 ms"', ("scan:", "longer than a frame at 30 Hz", "33.33 ms")),
+    ("scan.frame_rate", '"1 Hz"', ("scan:", "4 lines")),
+    ("scan.frame_rate", '"30 deg/s"', ("scan.frame_rate", "not a quantity in Hz")),
+    ("scan.frame_rate", "30", ("scan.frame_rate", "has no unit")),
+    ("scan.stand_off", '"60 mm"', ("laser's line is not in the scan camera's picture",)),
+    ("scan.mode", '"both"', ("scan.mode", '"rail" or "arm"')),
+    ("scan.swath", "[]", ("scan.swath", "at least 1")),
+    ("scan.swath", '[{ acros = "1 mm" }]', ("scan.swath[0].acros", "unknown key")),
+    ("scan.swath", '["left"]', ("scan.swath[0]", "is no table")),
+    ("scan.swath", '[{ roll = "80 deg" }]', ("scan.swath[0].roll", "-40 to 40 deg")),
+    ("scan.swath", '{ across = "1 mm" }', ("scan.swath", "is no list")),
+    ("scan.largest_hole", '"1 m"', ("scan.largest_hole", "0 to 10 mm")),
+    ("grasp.size", '["-70 mm", "36 mm", "20 mm"]', ("grasp.size[0]", "1 to 1000 mm")),
+    ("grasp.size", '["0 mm", "36 mm", "20 mm"]', ("grasp.size[0]", "1 to 1000 mm")),
+    ("grasp.size", '["70 mm", "36 mm"]', ("grasp.size[2]", "missing")),
+    ("grasp.size", '["700 mm", "700 mm", "20 mm"]', ("part", "beside the table")),
+    ("grasp.size", '["300 mm", "300 mm", "300 mm"]', ("part", "closer than")),
+    ("scan.swath", '[{ across = "150 mm" }]', ("sweep 1", "sees too little of it")),
+    ("photo.look_down", '"0 deg"', ("looking pose", "not in the target camera's picture", "photo.look_down")),
+    ("photo.max_obliquity", '"15 deg"', ("approach.staging", "21 deg from square")),
+    ("photo.max_obliquity", '"0 deg"', ("photo.max_obliquity", "5 to 80 deg")),
+    ("grasp.flange_from_part", pose(0, 0, 17000, 180, 0, 90), ("grasp.flange_from_part", "-1000 to 1000 mm")),
+    ("grasp.flange_from_part", pose(0, 0, 170, 0, 0, 90), ("place.approach",)),
+    ("place.approach", '"0 mm"', ("place.approach", "5 to 500 mm")),
+    ("place.approach", '"5 m"', ("place.approach", "5 to 500 mm")),
+    ("place.speed", '"600 mm/s"', ("place.speed", "0.1 to 500 mm/s")),
+    ("place.speed", '"0.5 mm/s"', ("place:", "exceeds speed")),
+    ("place.contact_speed", '"0 mm/s"', ("place.contact_speed", "0.1 to 50 mm/s")),
+    ("place.contact_force", '"500 N"', ("place.contact_force", "2 to 120 N")),
+    ("place.contact_force", '"8 kg"', ("place.contact_force", "not a quantity in N")),
+    ("place.tolerance", '"0 mm"', ("place.tolerance", "0.01 to 10 mm")),
+    ("place.tolerance", '"-0.6 mm"', ("place.tolerance", "0.01 to 10 mm")),
+    ("place.tolerance", '"600 mm"', ("place.tolerance", "0.01 to 10 mm")),
+    ("place.tolerance_angle", '"6 percent"', ("place.tolerance_angle", "not a quantity in mrad")),
+    ("place.surface_from_part", pose(0, 0, -60), ("into the table",)),
+    ("place.surface_from_part", pose(0, 0, 900), ("place",)),
+    ("place.speed", None, ("place.speed", "missing")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "value", "words"), WRONG_JOBS)
+def test_a_wrong_job_does_not_pass_the_check(
+    cell: Run, place: Path, key: str, value: str | None, words: tuple[str, ...]
+) -> None:
+    (place / "text.stl").write_text("this is no mesh\n" * 40)
+    (place / "empty.stl").write_bytes(b"")
+    write_stl(place / "nan.stl", height=float("nan"))
+    write_stl(place / "large.stl", (70.0, 36.0), 8.0)
+    write_stl(place / "aside.stl", at=0.3)
+    write_stl(place / "high.stl", height=0.14)
+    (place / "pot.toml").write_text(changed(job_path("pot").read_text(), key, value))
+    assert_refused(*cell("check", "-j", "pot.toml"), words)
+
+
+def test_times_that_no_step_has_are_refused(cell: Run, place: Path) -> None:
+    slow = changed(job_path("pot").read_text(), "place.speed", '"2 mm/s"')
+    (place / "pot.toml").write_text(changed(slow, "place.approach", '"500 mm"'))
+    assert_refused(*cell("check"), ("place.approach", "502 s", "at most 150 s"))
+    slow = changed(job_path("pot").read_text(), "approach.speed", '"0.02 m/s"')
+    (place / "pot.toml").write_text(changed(slow, "approach.start", pose(-6050, 0, -600)))
+    assert_refused(*cell("check"), ("the way of 5.00 m", "250 s", "raise approach.speed"))
+
+
+def test_all_that_is_wrong_is_told_at_once_and_as_json(cell: Run, place: Path) -> None:
+    text = changed(changed(default_toml(), "rail.lead", "2"), "laser.output", "18")
+    (place / "cell.toml").write_text(text)
+    code, shown = cell("check", "--json")
+    told = json.loads(shown)
+    assert code == 2
+    assert not told["ok"]
+    assert [problem.split(":")[0] for problem in told["problems"][1:]] == ["rail.lead", "laser.output"]
+
+
+RIGHT_CONFIGURATIONS = [
+    ("arm.address", '"arm-1.factory.local"'),
+    ("rail.url", '"socket://10.0.0.5:4001"'),
+    ("rail.url", '"rfc2217://moxa:4001?logging=debug"'),
+    ("rail.url", '"COM3"'),
+    ("rail.url", '"/dev/serial/by-id/usb-Trinamic_TMCM-1110-if00"'),
+    ("rail.microsteps", "64"),
+    ("rail.travel", '["5 mm", "120 mm"]'),
+    ("rail.lead", '"0.1 inch"'),
+    ("vehicle.channel", '"/dev/ttyUSB0@115200"'),
+    ("vehicle.channel", '"socket://10.0.0.6:3000"'),
+    ("arm.max_tool_speed", '"0.25 m/s"'),
+    ("arm.max_joint_speed", '"1 rad/s"'),
+    ("arm.settle_time", '"500 ms"'),
+    ("arm.vehicle_from_base", pose(300, 20, 550, 0, 0, 3)),
+    ("laser.output", "17"),
+    ("laser.tan_theta", "3"),
+    ("scan_camera.photo_exposure", '"5 ms"'),
+    ("calibration.max_age", '"2 week"'),
+    ("cell.runs", '"data/runs 2026"'),
+    ("cell.confirm", '"person"'),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), RIGHT_CONFIGURATIONS)
+def test_a_right_configuration_passes(cell: Run, place: Path, key: str, value: str) -> None:
+    (place / "cell.toml").write_text(changed(default_toml(), key, value))
+    (place / "pot.toml").write_text(job_path("pot").read_text())
+    code, shown = cell("check")
+    assert code == 0, shown
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("job.name", '"pot no. 7_b"'),
+        ("scan.mode", '"arm"'),
+        ("scan.swath", '[{ across = "-9 mm" }, { across = "9 mm", roll = "6 deg" }]'),
+        ("scan.length", '"80 mm"'),
+        ("approach.target", pose(-1000, 0, -600)),
+        ("approach.start", pose(-3050, 100, -600, 0, 0, 5)),
+        ("place.approach", '"80 mm"'),
+        ("place.tolerance", '"200 um"'),
+        ("photo.stand_off", '"850 mm"'),
+        ("grasp.size", '["60 mm", "40 mm", "25 mm"]'),
+        ("surface.place_from_surface", pose(10, -10, 2)),
+        ("board.spec", '"charuco:8x6:20mm"'),
+    ],
+)
+def test_a_right_job_passes(cell: Run, place: Path, key: str, value: str) -> None:
+    (place / "pot.toml").write_text(changed(job_path("pot").read_text(), key, value))
+    code, shown = cell("check")
+    assert code == 0, shown
+
+
+def test_a_mesh_in_millimetres_passes_with_its_unit(cell: Run, place: Path) -> None:
+    write_stl(place / "pot.stl", (70.0, 36.0), 8.0)
+    (place / "pot.toml").write_text(changed(job_path("pot").read_text(), "surface.mesh_unit", '"mm"'))
+    assert cell("check")[0] == 0
+
+
+WRONG_FILES: list[tuple[str, bytes, tuple[str, ...]]] = [
+    ("folder", b"", ("is a folder", "name the file")),
+    ("binary", bytes(range(256)), ("no text in UTF-8",)),
+    ("latin", '[cell]\nname = "Prüfzelle"\n'.encode("latin-1"), ("no text in UTF-8", "save it as UTF-8")),
+    ("large", b"#" * 1_000_001, ("larger than 1 MB",)),
+    ("open quote", b'[cell]\nname = "cell\n', ("line 2", "name =")),
+    ("open table", b"[cell\n", ("not valid TOML",)),
+    ("open end", b'[cell]\nname = """cell', ("not valid TOML", "close every quote")),
+    ("no value", b"[cell]\nname =\n", ("line 2", "KEY = VALUE")),
+    ("twice", b'[cell]\nname = "a"\nname = "b"\n', ("line 3", "remove one")),
+    ("table twice", b"[cell]\n[cell]\n", ("line 2", "remove one")),
+    ("deep", b"a = " + b"[" * 5000, ("not valid TOML",)),
+    ("nothing", b"", ("missing",)),
+    ("another", b'colour = "red"\n', ("colour", "unknown key")),
+    ("no table", b"cell = 3\n", ("cell", "is no table")),
+]
+
+
+@pytest.mark.parametrize(("kind", "content", "words"), WRONG_FILES, ids=[row[0] for row in WRONG_FILES])
+@pytest.mark.parametrize("option", ["-c", "-j"])
+def test_a_file_that_is_none_is_refused(
+    cell: Run, place: Path, option: str, kind: str, content: bytes, words: tuple[str, ...]
+) -> None:
+    path = place / "wrong.toml"
+    if kind == "folder":
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    if kind in ("another", "no table") and option == "-j":
+        words = (words[0],)
+    assert_refused(*cell("check", option, str(path)), words)
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        (("check", "-c", "gone.toml"), ("gone.toml does not exist", "cell init")),
+        (("check", "-j", "teapot"), ("teapot", "pot")),
+        (("check", "-j", ""), ("neither a file",)),
+        (("check", "-j", "."), ("neither a file",)),
+        (("check", "-j", "../../pot"), ("neither a file",)),
+        (("check", "-j", "gone.toml"), ("gone.toml does not exist",)),
+        (("init", "pot.stl"), ("pot.stl", "is no folder")),
+        (("init", "-j", "teapot"), ("teapot",)),
+        (("run",), ("there is no cell.toml", "-c FILE", "cell init", "cell dry-run")),
+        (("home",), ("there is no cell.toml", "--sim all")),
+        (("diag",), ("there is no cell.toml",)),
+        (("calibrate",), ("there is no cell.toml",)),
+        (("calibrate", "verify"), ("there is no cell.toml",)),
+        (("jog", "rail", "+5mm"), ("there is no cell.toml",)),
+        (("jog", "rail", "5"), ("has no unit", "rail +5mm")),
+        (("jog", "rail", "+5kg"), ("not a quantity", "rail +5mm")),
+        (("jog", "rail", "nanmm"), ("write it like",)),
+        (("jog", "rail", "+5mm^9^9"), ("write it like",)),
+        (("jog", "arm", "q", "5mm"), ("cannot jog", "write it like")),
+        (("jog", "arm", "j7", "5deg"), ("cannot jog", "write it like")),
+        (("jog", "arm", "z", "5deg"), ("write it like",)),
+        (("jog", "tower", "5mm"), ("cannot jog", "write it like")),
+        (("jog", "vehicle", "+9m"), ("outside the allowed range", "-0.5 to 0.5 m")),
+        (("jog", "rail"), ("cell jog --help",)),
+        (("home", "--sim", "some"), ('"all"',)),
+        (("diag", "--sim", "some"), ('"all"',)),
+        (("dry-run", "--seed", "-1"), ("--seed",)),
+        (("dry-run", "--seed", "one"), ("--seed", "whole number", "cell dry-run --help")),
+        (("dry-run", "--seed", "9999999"), ("--seed",)),
+        (("dry-run", "--speed", "0"), ("--speed",)),
+        (("dry-run", "--speed", "nan"), ("--speed",)),
+        (("dry-run", "--level", "hard"), ("--level",)),
+        (("dry-run", "--confirm", "nobody"), ("--confirm",)),
+        (("dry-run", "--inject", "arm.protective_stop"), ("no scheduled fault",)),
+        (("dry-run", "--inject", "arm.falls@place"), ("arm.falls", "known:")),
+        (("dry-run", "--inject", "arm.protective_stop@lunch"), ("no step", "laser_sweep")),
+        (("dry-run", "--inject", "arm.protective_stop@place:140%"), ("outside 0 % to 100 %",)),
+        (("dry-run", "--inject", "arm.protective_stop@place:half"), ("no scheduled fault",)),
+        (("dry-run", "-c", "gone.toml"), ("gone.toml does not exist",)),
+        (("report",), ("no run at all",)),
+        (("report", "nothing"), ("no run nothing",)),
+        (("report", "../../etc"), ("no run ../../etc",)),
+        (("report", "pot.stl"), ("no run pot.stl",)),
+        (("report", ""), ("no run",)),
+        (("resume", "nothing"), ("no run nothing",)),
+        (("abort", "nothing"), ("no run nothing",)),
+        (("export", "nothing"), ("no run nothing",)),
+        (("export", "--limit", "0.2"), ("--limit", "has no unit")),
+        (("export", "--limit", "9 m"), ("--limit", "0.001 to 100 mm")),
+        (("export", "--format", "doc"), ("--format",)),
+        (("runs", "-c", "gone.toml"), ("gone.toml does not exist",)),
+        (("calibrate", "--from", "gone", "--board", "chessboard:7x6:10mm"), ("gone", "not a folder")),
+        (("calibrate", "--from", "pot.stl", "--board", "chessboard:7x6:10mm"), ("pot.stl", "not a folder")),
+        (("calibrate", "--from", ".", "--board", "chessboard:7x6:10mm"), ("holds no pictures",)),
+        (("calibrate", "--from", "."), ("--board",)),
+        (("calibrate", "--board", "chessboard:7x6:10mm"), ("--board belongs to --from",)),
+        (("calibrate", "--from", ".", "--board", "chess:7x6"), ("chess:7x6",)),
+        (("calibrate", "solve", "gone.npz"), ("gone.npz",)),
+        (("calibrate", "solve", "pot.stl"), ("pot.stl",)),
+        (("sim", "serve", "--surface", "teapot"), ("teapot", "pot")),
+        (("sim", "serve", "--config-out", "pot.stl"), ("exists already",)),
+        (("sim", "serve", "--config-out", "no/such/sim.toml"), ("no/such",)),
+        (("fly",), ("No such command",)),
+        (("check", "--colour"), ("No such option",)),
+    ],
+)
+def test_a_wrong_command_line_is_refused(cell: Run, words: tuple[str, ...], shown: tuple[str, ...]) -> None:
+    assert_refused(*cell(*words), shown)

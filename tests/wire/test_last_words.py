@@ -1,0 +1,75 @@
+"""A process that is killed leaves nothing moving: by the simulated world's truth."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from drivers.clock import Clock
+from tests.wire.cells import ask, served
+
+pytestmark = pytest.mark.wire
+
+OPEN = """
+import sys
+from pathlib import Path
+from cell import assembly
+from cell.config import load_config
+from cell.gate import Gate
+from drivers.clock import Clock
+config = load_config(Path("sim.toml"))
+clock = Clock(config.cell.time_scale)
+"""
+DRIVE = """
+vehicle = assembly.connect_vehicle(config, clock)
+vehicle.gate = Gate()
+vehicle.enable()
+while True:
+    vehicle.drive(0.3, 0.0)
+    clock.sleep(0.05)
+"""
+MOVE = """
+rail = assembly.connect_rail(config, clock)
+rail.gate = Gate()
+rail.home().wait(60.0)
+rail.move_to(0.09, 0.01)
+clock.sleep(1e6)
+"""
+SEARCH = """
+rail = assembly.connect_rail(config, clock)
+rail.gate = Gate()
+rail.home()
+clock.sleep(1e6)
+"""
+
+
+@pytest.mark.parametrize(
+    ("script", "moving"),
+    [
+        (DRIVE, lambda truth: truth["vehicle"]["speed"] > 0.2),
+        (MOVE, lambda truth: truth["rail_moving"] and truth["rail"]["carriage"] > 0.001),
+        (SEARCH, lambda truth: truth["rail_moving"]),
+    ],
+    ids=["vehicle", "rail", "rail searching its switch"],
+)
+def test_half_a_second_after_the_kill_nothing_moves(tmp_path: Path, script: str, moving) -> None:
+    # At the wall's speed: the vehicle's own watchdog would only begin to stop it after that time.
+    with served(tmp_path, "--seed", "3", "--speed", "1") as endpoints:
+        owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=tmp_path)
+        try:
+            deadline = time.monotonic() + 60
+            while not moving(ask(endpoints, op="truth")["truth"]):
+                assert owner.poll() is None
+                assert time.monotonic() < deadline
+                Clock().sleep(0.02)
+        finally:
+            owner.kill()
+            owner.wait(10)
+        Clock().sleep(0.5)
+        truth = ask(endpoints, op="truth")["truth"]
+        assert truth["vehicle"]["stopped"]
+        assert not truth["rail_moving"]

@@ -1,0 +1,56 @@
+"""The safe stop brings everything to rest at once, by the world's truth, and shuts the gate for whoever works."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.assembly import connect
+from cell.config import load_config
+from drivers.errors import Aborted
+from statemachine.cancel import CancelToken
+from tests.wire.cells import ask, assert_safe, served
+
+pytestmark = pytest.mark.wire
+
+
+def test_everything_moves_and_shines_and_nothing_does_after_the_stop(tmp_path: Path) -> None:
+    with served(tmp_path, "--seed", "3", "--speed", "1") as endpoints:
+        config = load_config(tmp_path / "sim.toml")
+        devices = connect(config)
+        try:
+            devices.gate.enter(CancelToken())
+            devices.rail.home().wait(60.0)
+            devices.rail.move_to(0.09, 0.01)
+            devices.arm.set_digital_output(config.laser.output, True)
+            away = devices.arm.state().joints + np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
+            devices.arm.move_joints(away, 0.3, 1.0)
+            devices.vehicle.enable()
+            devices.vehicle.drive(-0.2, 0.0)
+            devices.clock.sleep(0.4)
+            truth = ask(endpoints, op="truth")["truth"]
+            assert truth["laser_on"]
+            assert truth["arm"]["moving"]
+            assert truth["rail_moving"]
+            assert not truth["vehicle"]["stopped"]
+
+            assert devices.stop() == []
+            assert_safe(endpoints)
+            for begin in (
+                lambda: devices.arm.move_joints(away, 0.3, 1.0),
+                lambda: devices.rail.move_to(0.01),
+                devices.vehicle.enable,
+                lambda: devices.vehicle.drive(-0.2, 0.0),
+                lambda: devices.laser.lit().__enter__(),
+                devices.claw.release,
+            ):
+                with pytest.raises(Aborted):
+                    begin()
+            assert_safe(endpoints)
+
+            devices.gate.enter(CancelToken())
+            devices.rail.move_to(0.01).wait(60.0)
+        finally:
+            assert devices.close() == []
