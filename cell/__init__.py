@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cell.job_run import RunOutcome as RunOutcome
+    from cell.run.job_run import RunOutcome as RunOutcome
     from cell.supervisor import Cell as Cell
     from drivers.errors import (
         Aborted,
@@ -55,7 +55,7 @@ def __getattr__(name: str) -> object:
 
             return Cell
         case "RunOutcome":
-            from cell.job_run import RunOutcome
+            from cell.run.job_run import RunOutcome
 
             return RunOutcome
     from drivers import errors

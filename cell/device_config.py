@@ -201,7 +201,7 @@ class CalibrationConfig(Table):
 
 def checked_board(text: str) -> str:
     """A board's name, once it is known to be well formed."""
-    from cell.vision.board_spec import parse_board
+    from cell.vision.board.spec import parse_board
 
     try:
         parse_board(text)

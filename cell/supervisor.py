@@ -19,32 +19,32 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from cell.assembly import Devices, connect
 from cell.calibration.archive import Observations
-from cell.config import CellConfig, Confirm, beside, config_to_open
-from cell.fit import require_fit
-from cell.injection import Injection, Injector
-from cell.inversion import NominalSurface
-from cell.job import Job, load_job
-from cell.job_run import JobRun, Observer, RunOutcome
-from cell.recorded_work import Hands, RecordedWork
-from cell.resumption import UnfinishedRun, job_source
-from cell.run import Run
-from cell.runs import CellLock, find_run
-from cell.simulation import SimulatedCell, with_endpoints
-from cell.steps.collect import collect_scan, collect_target
-from cell.steps.moves import HOME, Mover
-from cell.steps.verification import Verification
-from cell.steps.verify import collect_verification
-from cell.steps.whereabouts import Whereabouts
-from cell.stopping import require_healthy, require_no_emergency_stop, stop_cell
-from cell.stored_calibration import (
+from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.store import (
     CellCalibration,
     find_calibration,
     gathered,
     save_with_observations,
     solve_observations,
 )
+from cell.calibration.verify.verdict import Verification
+from cell.calibration.verify.views import collect_verification
+from cell.check.fit import require_fit
+from cell.config import CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import Devices, connect
+from cell.devices.injection import Injection, Injector
+from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
+from cell.inversion import NominalSurface
+from cell.job import Job, load_job
+from cell.run.folder import CellLock, find_run
+from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.resumption import UnfinishedRun, job_source
+from cell.run.run import Run
+from cell.steps.moves import HOME, Mover
+from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
 from statemachine.watch import EndSignals, SignalWatch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cell.bench.whole_job import JobRecord, run_whole_job
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 
 

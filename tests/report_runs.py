@@ -14,19 +14,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cell.bench.lockstep import LockstepCell
-from cell.bench.whole_job import JobRecord
 from cell.config import CellConfig, load_config
-from cell.frames import FrameStore
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.job_run import classify
+from cell.lab.bench.lockstep import LockstepCell
+from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
 from cell.report.truth import Witness
-from cell.resumption import job_source
-from cell.runs import new_run
+from cell.run.folder import new_run
+from cell.run.frames import FrameStore
+from cell.run.job_run import classify
+from cell.run.resumption import job_source
+from cell.run.work import JobWork
 from cell.steps.whereabouts import Whereabouts
-from cell.work import JobWork
 from drivers.errors import CellError
 from sim_backends.peers.truth import TruthPeer
 from statemachine.policy import Failure, Outcome, Policy
@@ -165,7 +165,7 @@ def reported(
     *,
     simulated: bool = True,
 ) -> Ended:
-    """The report of a result, with the facts that `cell.job_run.JobRun` adds."""
+    """The report of a result, with the facts that `cell.run.job_run.JobRun` adds."""
     info: dict[str, Any] = {
         "kind": "job",
         "pid": os.getpid(),

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.bench import artefacts, form_errors
-from cell.bench.acceptance import _flatness, _probing, _spacing
 from cell.geometry.light_plane import LightPlane
-from cell.paper.rig import Noise, RigSpec, draw_head
+from cell.lab.bench import artefacts, form_errors
+from cell.lab.bench.acceptance import _flatness, _probing, _spacing
+from cell.lab.paper.rig import Noise, RigSpec, draw_head
 from cell.reconstruction import ScanGeometry
 from drivers.errors import RefusedError
 

@@ -6,11 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.calibration.collect.aiming import SEARCH_M, Aim
+from cell.calibration.store import nominal_camera
 from cell.config import load_config
 from cell.geometry.poses import difference, from_parts, perturbed
-from cell.planning import View, scan_calibration_views
-from cell.steps.aiming import SEARCH_M, Aim
-from cell.stored_calibration import nominal_camera
+from cell.steps.camera_poses import View, scan_calibration_views
 from cell.vision import BoardView, parse_board
 
 CONFIG = load_config(None)

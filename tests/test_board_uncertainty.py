@@ -11,16 +11,16 @@ import pinocchio as pin
 import pytest
 from scipy.special import erf, ndtr
 
-from cell.bench.board import camera_of
-from cell.bench.board_conditions import LENSES, draw_pose, draw_spec
-from cell.bench.board_render import Placed, true_pixels
 from cell.geometry.poses import difference
+from cell.lab.bench.board import camera_of
+from cell.lab.bench.board_conditions import LENSES, draw_pose, draw_spec
+from cell.lab.bench.board_render import Placed, true_pixels
 from cell.vision import board_pose
-from cell.vision.board_view import BoardView
-from cell.vision.corner_fit import fit_corners
-from cell.vision.dots import measure_dots
-from cell.vision.lattice import Blobs
-from cell.vision.outliers import without_outliers
+from cell.vision.board.corner_fit import fit_corners
+from cell.vision.board.dots import measure_dots
+from cell.vision.board.lattice import Blobs
+from cell.vision.board.outliers import without_outliers
+from cell.vision.board.view import BoardView
 
 BRIGHT, DARK, PSF = 170.0, 14.0, 0.7
 # A fifth of what levels taken beside the edges and light that is only added would do.

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.bench.calibration import observe, one_trial
-from cell.bench.calibration_bound import cramer_rao
-from cell.bench.calibration_world import Noise, draw_head
 from cell.calibration import Priors, TargetObservation, calibrate_scan
-from cell.calibration.advice import advice
 from cell.calibration.archive import Observations, read_archive, write_archive
-from cell.calibration.coverage import Coverage
-from cell.calibration.influence import Places, derivatives, influences, place_rms
-from cell.calibration.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
+from cell.calibration.solve.advice import advice
+from cell.calibration.solve.coverage import Coverage
+from cell.calibration.solve.influence import Places, derivatives, influences, place_rms
+from cell.calibration.solve.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
+from cell.calibration.store import nominal_camera, solve_observations
 from cell.config import load_config
 from cell.geometry.camera import CameraModel
 from cell.geometry.poses import from_matrix, from_parts
-from cell.stored_calibration import nominal_camera, solve_observations
-from cell.vision.board_view import BoardView
+from cell.lab.bench.calibration import observe, one_trial
+from cell.lab.bench.calibration_bound import cramer_rao
+from cell.lab.bench.calibration_world import Noise, draw_head
+from cell.vision.board.view import BoardView
 from drivers.errors import ConfigError
 
 NOISE = Noise()

@@ -19,7 +19,7 @@ with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import cell.supervisor
     from cell.vision import extract
-    from cell.bench.stripe_truth import Cell, draw
+    from cell.lab.bench.stripe_truth import Cell, draw
 
 image, centres = draw(Cell(2, 100), (64, 320), 1)
 error = abs(extract(image).centres - centres).max()
@@ -35,14 +35,14 @@ def test_without_numba_the_cell_says_so_once_and_still_finds_stripes() -> None:
 
 REHEARSED = """
 import importlib, pkgutil
-import cell.vision
-from cell.bench.stripe_truth import Cell, draw
+from cell.vision import stripe
+from cell.lab.bench.stripe_truth import Cell, draw
 from cell.steps.swath import rehearse
 from cell.vision import StripeStream
 from test_reconstruction import GEOMETRY
 
 def loaded():
-    modules = [importlib.import_module(f"cell.vision.{m.name}") for m in pkgutil.iter_modules(cell.vision.__path__)]
+    modules = [importlib.import_module(f"{stripe.__name__}.{m.name}") for m in pkgutil.iter_modules(stripe.__path__)]
     return {name: len(f.signatures) for m in modules for name, f in vars(m).items() if hasattr(f, "signatures")}
 
 before = loaded()

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cell.check.fit import require_fit
 from cell.config import CellConfig, default_toml, load_config, validate
-from cell.fit import require_fit
 from cell.job import job_path, load_job, shipped_jobs
 from cell.units import parse_quantity
 from drivers.errors import ConfigError

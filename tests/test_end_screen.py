@@ -12,7 +12,7 @@ import pytest
 from cell.cli import main
 from cell.cli.display import print_report
 from cell.cli.end_screen import HEIGHT, duration, end_screen
-from cell.runs import new_run, read_report, run_row, write_json
+from cell.run.folder import new_run, read_report, run_row, write_json
 from drivers.errors import CellError
 from statemachine.journal import Journal
 from tests import report_runs

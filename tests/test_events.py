@@ -9,8 +9,8 @@ import time
 
 import pytest
 
-from cell.events import MOST_WAITING, Detached, RunEnded, StepProgress, StepStarted, Subscription
-from cell.run import Run
+from cell.run.events import MOST_WAITING, Detached, RunEnded, StepProgress, StepStarted, Subscription
+from cell.run.run import Run
 from statemachine.step import Event
 from statemachine.watch import EndSignals, SignalInterrupt
 

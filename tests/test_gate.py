@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from cell.gate import Gate
+from cell.devices.gate import Gate
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken
 

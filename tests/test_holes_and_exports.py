@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell.bench.reconstruction_scenes import KINDS, Scene, cut_holes, scene
+from cell.lab.bench.reconstruction_scenes import KINDS, Scene, cut_holes, scene
 from cell.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
 from cell.reconstruction.e57 import write_e57
 from cell.reconstruction.mesh import triangles, write_mesh

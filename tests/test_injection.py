@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cell.injection import Injection
+from cell.devices.injection import Injection
 from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 

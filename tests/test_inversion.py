@@ -13,16 +13,16 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from cell.bench.inversion_parts import PARTS
-from cell.bench.inversion_parts import nominal as part_surface
-from cell.bench.inversion_refusals import judge_case
-from cell.bench.inversion_scenes import Setting, scan
 from cell.geometry.poses import difference, perturbed
 from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.inversion.correspondences import Scan
 from cell.inversion.motions import name as motion_name
 from cell.inversion.motions import sorted_out
 from cell.inversion.registration import register
+from cell.lab.bench.inversion_parts import PARTS
+from cell.lab.bench.inversion_parts import nominal as part_surface
+from cell.lab.bench.inversion_refusals import judge_case
+from cell.lab.bench.inversion_scenes import Setting, scan
 from cell.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.bench.inversion import task
-from cell.bench.inversion_parts import PARTS, nominal
-from cell.bench.inversion_refusals import BOARD, TOLERANCE, judge_case
-from cell.bench.inversion_scenes import TRUE, Setting, scan
 from cell.inversion import Prior
 from cell.inversion.correspondences import Scan
 from cell.inversion.dissent import Dissent, dissent
 from cell.inversion.registration import register
+from cell.lab.bench.inversion import task
+from cell.lab.bench.inversion_parts import PARTS, nominal
+from cell.lab.bench.inversion_refusals import BOARD, TOLERANCE, judge_case
+from cell.lab.bench.inversion_scenes import TRUE, Setting, scan
 from cell.reconstruction import Cloud
 
 Array = NDArray[np.float64]

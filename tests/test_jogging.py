@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from cell.jogging import Jog, parse_jog
+from cell.devices.jogging import Jog, parse_jog
 from drivers.errors import ConfigError
 
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.bench.accuracy import LIMITS, figures, summed_up
-from cell.bench.expected import mean_distance
-from cell.bench.lockstep import LockstepCell
-from cell.bench.whole_job import JobRecord, run_whole_job
 from cell.config import load_config
 from cell.inversion import NominalSurface
 from cell.job import load_job
+from cell.lab.bench.accuracy import LIMITS, figures, summed_up
+from cell.lab.bench.expected import mean_distance
+from cell.lab.bench.lockstep import LockstepCell
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from drivers.errors import InterlockError
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics

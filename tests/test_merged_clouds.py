@@ -21,7 +21,7 @@ from cell.reconstruction import (
     lean_motions,
     merge,
 )
-from cell.vision.stripe import StripeProfile
+from cell.vision.stripe.extract import StripeProfile
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
 

@@ -10,11 +10,11 @@ from typer.testing import CliRunner
 
 from cell.cli.app import app
 from cell.geometry.light_plane import closed_form
-from cell.paper import equations as eq
-from cell.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
-from cell.paper.equation_table import equation_table
-from cell.paper.figure2 import figure2, smallest_baseline
-from cell.paper.traced import light_point, oblique_image
+from cell.lab.paper import equations as eq
+from cell.lab.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
+from cell.lab.paper.equation_table import equation_table
+from cell.lab.paper.figure2 import figure2, smallest_baseline
+from cell.lab.paper.traced import light_point, oblique_image
 from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
 from sim_backends.optics.stripe import crossings
 

@@ -7,13 +7,13 @@ import pinocchio as pin
 import pytest
 
 from cell.geometry.poses import from_parts
-from cell.paper import campaign, solved
-from cell.paper.cited import SYSTEMS, cited
-from cell.paper.rig import RigSpec, dot_centres, draw_head
-from cell.paper.spoiled import spoil
-from cell.paper.stitching import surface_of
-from cell.paper.systems import one_system
-from cell.paper.table1 import SPEC, one_seed
+from cell.lab.paper import campaign, solved
+from cell.lab.paper.cited import SYSTEMS, cited
+from cell.lab.paper.rig import RigSpec, dot_centres, draw_head
+from cell.lab.paper.spoiled import spoil
+from cell.lab.paper.stitching import surface_of
+from cell.lab.paper.systems import one_system
+from cell.lab.paper.table1 import SPEC, one_seed
 from cell.reconstruction import Cloud
 from sim_backends.optics import Board
 
@@ -48,7 +48,7 @@ def test_outliers_of_every_kind_are_found(run) -> None:
 
 
 def test_outliers_are_put_in_at_the_share_asked_for() -> None:
-    from cell.paper.rig import Sweep
+    from cell.lab.paper.rig import Sweep
 
     centres = np.full((60, 480), 300.0)
     sweep = Sweep(centres, np.zeros(60), np.zeros((60, 480, 3)))

@@ -9,19 +9,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.bench.lockstep import LockstepCell
-from cell.bench.lockstep_arm import LockstepArm
-from cell.bench.whole_job import NoFrames
 from cell.config import load_config
 from cell.geometry.poses import from_matrix, from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import load_job
-from cell.resumption import UnfinishedRun
+from cell.lab.bench.lockstep import LockstepCell
+from cell.lab.bench.lockstep_arm import LockstepArm
+from cell.lab.bench.whole_job import NoFrames
+from cell.run.resumption import UnfinishedRun
+from cell.run.work import JobWork
 from cell.steps.moves import HOME, Mover
 from cell.steps.place import PartProgress, PartState, PlaceResult, place
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import parse_board
-from cell.work import JobWork
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from sim_backends.world.nominal import inverse

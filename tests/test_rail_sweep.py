@@ -10,20 +10,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.bench.lockstep import LockstepCell
-from cell.bench.lockstep_arm import LockstepArm
-from cell.bench.lockstep_camera import LockstepCamera
-from cell.bench.lockstep_rail import LockstepRail
+from cell.calibration.store import nominal_camera
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_ur
 from cell.job import load_job
-from cell.planning import ScanPlan
+from cell.lab.bench.lockstep import LockstepCell
+from cell.lab.bench.lockstep_arm import LockstepArm
+from cell.lab.bench.lockstep_camera import LockstepCamera
+from cell.lab.bench.lockstep_rail import LockstepRail
 from cell.reconstruction import ScanGeometry
+from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors
-from cell.stored_calibration import nominal_camera
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
 

@@ -23,7 +23,7 @@ from cell.reconstruction import (
     write_ply,
 )
 from cell.reconstruction.outliers import find_outliers
-from cell.vision.stripe import StripeProfile
+from cell.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
 Array = NDArray[np.float64]

@@ -15,15 +15,15 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
-from cell.bench.whole_job import JobRecord, run_whole_job
-from cell.frames import FrameStore
 from cell.job import SwathSection
-from cell.job_run import RunOutcome
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.reconstruction.ply import read_cloud
 from cell.report.bound import stated_bound
 from cell.report.panels import SurfacePanel, draw_surface
 from cell.report.report import strict
-from cell.runs import write_json
+from cell.run.folder import write_json
+from cell.run.frames import FrameStore
+from cell.run.job_run import RunOutcome
 from cell.steps.reconstruct import Reconstruction
 from drivers.errors import CellError, Measured, RefusedError
 from drivers.interfaces import Frame

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cell.config import CellConfig, load_config
-from cell.runs import (
+from cell.run.folder import (
     CellLock,
     awaited_word,
     find_going,

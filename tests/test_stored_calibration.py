@@ -11,10 +11,10 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration import ScanCalibration, TargetCalibration
-from cell.calibration.results import KEPT, Quality
+from cell.calibration.solve.results import KEPT, Quality
+from cell.calibration.store import CellCalibration, find_calibration, nominal_camera, save_calibration
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
-from cell.stored_calibration import CellCalibration, find_calibration, nominal_camera, save_calibration
 from drivers.errors import CalibrationStale
 
 DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}

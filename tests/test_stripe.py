@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from cell.vision.stripe import StripeSettings, extract
+from cell.vision.stripe.extract import StripeSettings, extract
 
 RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HEIGHT, WIDTH = 480, 640

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.bench.stripe_accuracy import measure
-from cell.bench.stripe_truth import Cell, bound, draw
+from cell.lab.bench.stripe_accuracy import measure
+from cell.lab.bench.stripe_truth import Cell, bound, draw
 from cell.vision.pictures import PictureRefused
-from cell.vision.stripe import Method, StripeSettings, extract
-from cell.vision.stripe_stream import BLOCK, StripeStream, extract_all
+from cell.vision.stripe.extract import Method, StripeSettings, extract
+from cell.vision.stripe.stream import BLOCK, StripeStream, extract_all
 
 LIKELIHOOD = (Method.MAXIMUM_LIKELIHOOD,)
 SMALL = (256, 384)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.bench.stripe_truth import Cell, draw
-from cell.vision import stripe_numpy, stripe_search
-from cell.vision.stripe_find import CANDIDATES, CUT, ENERGY, NOWHERE, START
+from cell.lab.bench.stripe_truth import Cell, draw
+from cell.vision.stripe import search as stripe_search
+from cell.vision.stripe import without_compiler as stripe_numpy
+from cell.vision.stripe.find import CANDIDATES, CUT, ENERGY, NOWHERE, START
 
 SHAPE = (200, 333)
 LEAST_PEAK, SATURATION = 8.0, 255

@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.bench.observed_cell import ObservedCell, shifted
-from cell.bench.verification import disturbances, look_again
 from cell.calibration import Priors
-from cell.calibration.faults import refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
-from cell.calibration.joint import solve_joint, solve_staged
-from cell.calibration.reference import Reference
-from cell.calibration.results import Quality, ScanCalibration, TargetCalibration
-from cell.calibration.verification_looks import verify
+from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
+from cell.calibration.solve.joint import solve_joint, solve_staged
+from cell.calibration.solve.reference import Reference
+from cell.calibration.solve.results import Quality, ScanCalibration, TargetCalibration
+from cell.calibration.store import CellCalibration, nominal_camera, read_calibration, save_calibration
+from cell.calibration.verify.looks import verify
+from cell.calibration.verify.verdict import Verification
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix
 from cell.job import load_job
-from cell.planning import rail_ends, verification_views
-from cell.steps.verification import Verification
-from cell.stored_calibration import CellCalibration, nominal_camera, read_calibration, save_calibration
-from cell.vision.board import board_pose
+from cell.lab.bench.observed_cell import ObservedCell, shifted
+from cell.lab.bench.verification import disturbances, look_again
+from cell.steps.camera_poses import rail_ends, verification_views
+from cell.vision.board.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
 from sim_backends.world.scene import draw
 

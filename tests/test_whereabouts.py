@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from cell.bench.lockstep import LockstepCell
 from cell.config import load_config
 from cell.geometry.poses import from_matrix
 from cell.job import Job, load_job
+from cell.lab.bench.lockstep import LockstepCell
 from cell.steps.approach import Planar, RelativeOdometry, turn_to
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.photograph import BoardFix

@@ -19,8 +19,8 @@ from cell.config import (
     require_confirm,
     require_real_addresses,
 )
+from cell.devices.simulated import with_endpoints
 from cell.job import job_path
-from cell.simulation import with_endpoints
 
 MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
 ENDPOINTS = {

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from cell.bench.lockstep import LockstepCell
-from cell.bench.whole_job import NoFrames
 from cell.config import load_config
 from cell.inversion import NominalSurface
 from cell.job import load_job
+from cell.lab.bench.lockstep import LockstepCell
+from cell.lab.bench.whole_job import NoFrames
+from cell.run.work import JobWork
 from cell.steps.whereabouts import Whereabouts
-from cell.work import JobWork
 from drivers.errors import Aborted
 from statemachine.cancel import Cancelled, CancelToken
 from statemachine.control import RunControl

@@ -1,8 +1,8 @@
 """Calibration of cameras, light plane, rail and hand-eye, from closed form to the joint adjustment."""
 
-from cell.calibration.adjustment import Priors
 from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.results import ScanCalibration, TargetCalibration, calibrate_scan, calibrate_target
+from cell.calibration.solve.adjustment import Priors
+from cell.calibration.solve.results import ScanCalibration, TargetCalibration, calibrate_scan, calibrate_target
 
 __all__ = [
     "Priors",

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.adjustment import Priors
 from cell.calibration.observations import ScanObservation, TargetObservation
+from cell.calibration.solve.adjustment import Priors
 from cell.geometry.camera import Array, CameraModel
-from cell.vision.board_spec import parse_board
-from cell.vision.board_view import BoardView
-from cell.vision.stripe import StripeProfile
+from cell.vision.board.spec import parse_board
+from cell.vision.board.view import BoardView
+from cell.vision.stripe.extract import StripeProfile
 from drivers.errors import ConfigError
 
 FORMAT = 1

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from typing import Annotated
 
 import typer
 
-from cell.cli import (
-    bench_acceptance,
-    bench_accuracy,
-    bench_board,
-    bench_calibration,
-    bench_endings,
-    bench_inversion,
-    bench_reconstruction,
-    bench_stripe,
-    bench_verify,
-    calibrate,
-    devices,
-    export,
-    paper,
-    run,
-    setup,
-    sim,
-)
+from cell.cli import calibrate, devices, export, run, setup, sim
 from cell.cli.usage import App
+
+COMMANDS = "assembly_cell.commands"
+"""Entry points that add commands: called with the command line, a `typer.Typer`."""
 
 app = App(
     name="cell",
@@ -54,30 +41,14 @@ def _cell(
     ] = 0,
 ) -> None:
     """Options before any command."""
-    from cell.logs import console_log
+    from cell.run.logs import console_log
 
     console_log(verbose)
 
 
-for register in (
-    run.register, export.register, calibrate.register, devices.register, setup.register, paper.register,
-):  # fmt: skip
+for register in (run.register, export.register, calibrate.register, devices.register, setup.register):
     register(app)
 app.add_typer(sim.app, name="sim")
-
-bench = typer.Typer(
-    help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
-)
-for register_bench in (
-    bench_acceptance.register,
-    bench_accuracy.register,
-    bench_board.register,
-    bench_calibration.register,
-    bench_endings.register,
-    bench_inversion.register,
-    bench_reconstruction.register,
-    bench_stripe.register,
-    bench_verify.register,
-):
-    register_bench(bench)
-app.add_typer(bench, name="bench")
+# Whole groups of commands that stand beside the product, such as the laboratory's, bring themselves.
+for group in sorted(entry_points(group=COMMANDS), key=lambda found: found.name):
+    group.load()(app)

@@ -58,10 +58,10 @@ def calibrate(
         _from_folder(source, board, json)
         return
     from cell.calibration.archive import read_archive
-    from cell.calibration_report import examine
+    from cell.calibration.report import examine
+    from cell.calibration.store import archive_of, solve_observations
     from cell.cli.calibration_tables import print_examination
     from cell.cli.display import ProgressDisplay, print_calibration
-    from cell.stored_calibration import archive_of, solve_observations
     from cell.supervisor import Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
@@ -79,7 +79,7 @@ def calibrate(
 
 
 def _from_folder(folder: Path, board: str | None, json: bool) -> None:
-    from cell.calibration.recorded import calibrate_folder
+    from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
     from cell.vision import parse_board
     from drivers.errors import ConfigError

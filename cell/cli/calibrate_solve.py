@@ -29,11 +29,11 @@ def solve(
     from dataclasses import replace
 
     from cell.calibration.archive import SUFFIX, read_archive
-    from cell.calibration_report import examine
+    from cell.calibration.report import examine
+    from cell.calibration.store import gathered, solve_observations
     from cell.cli.calibration_tables import print_examination
     from cell.cli.display import print_calibration
     from cell.config import find_config, load_config
-    from cell.stored_calibration import gathered, solve_observations
 
     observations = read_archive(archive)
     loaded = load_config(find_config(config, simulated=True))

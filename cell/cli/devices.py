@@ -18,7 +18,7 @@ from cell.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from cell.diagnosis import Diagnosis
+    from cell.devices.diagnosis import Diagnosis
 
 
 def register(app: typer.Typer) -> None:
@@ -40,8 +40,8 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
-    from cell.jogging import jog as perform
-    from cell.jogging import parse_jog
+    from cell.devices.jogging import jog as perform
+    from cell.devices.jogging import parse_jog
     from cell.supervisor import Cell
 
     wish = parse_jog(device, motion)
@@ -73,7 +73,7 @@ def diag(
     json: JsonOption = False,
 ) -> None:
     """Ask every device how it is: connection, identity, round trips, errors, state. Exit code 1 if any fails."""
-    from cell.diagnosis import diagnose
+    from cell.devices.diagnosis import diagnose
 
     rows = diagnose(config, sim=sim, seed=seed, level=level.value, speed=speed)
     if json:

@@ -41,7 +41,7 @@ def export(
     """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
     from cell.config import beside, find_config, load_config
     from cell.report.export import SUFFIXES, export_run
-    from cell.runs import find_run
+    from cell.run.folder import find_run
     from cell.units import parse_quantity
     from drivers.errors import ConfigError
 

@@ -20,7 +20,7 @@ from cell.cli.options import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from cell.job_run import Observer, RunOutcome
+    from cell.run.job_run import Observer, RunOutcome
 
 RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
 NoiseOption = Annotated[
@@ -83,9 +83,9 @@ def dry_run(
     noise: NoiseOption = False,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
+    from cell.check.fit import require_fit
     from cell.config import find_config, load_config
-    from cell.fit import require_fit
-    from cell.injection import Injection
+    from cell.devices.injection import Injection
     from cell.job import load_job
     from cell.supervisor import SIM_SPEED, Cell
 
@@ -118,8 +118,8 @@ def resume(
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
     from cell.job import load_job
-    from cell.resumption import UnfinishedRun
-    from cell.runs import find_run
+    from cell.run.folder import find_run
+    from cell.run.resumption import UnfinishedRun
     from cell.supervisor import SIM_SPEED, Cell
 
     before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
@@ -154,7 +154,7 @@ def abort(
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
-    from cell.runs import is_going, list_runs
+    from cell.run.folder import is_going, list_runs
 
     going = [run for run in list_runs(_runs_folder(config)) if is_going(run)] if name is None else []
     if not going:
@@ -182,7 +182,7 @@ def confirm(
     """Say that you have looked at the cell and that the waiting run may clear its fault and go on."""
     import getpass
 
-    from cell.runs import awaited_word
+    from cell.run.folder import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
@@ -205,7 +205,7 @@ def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: 
 
 
 def _going(name: str | None, config: Path | None) -> Path:
-    from cell.runs import find_going
+    from cell.run.folder import find_going
 
     return find_going(_runs_folder(config), name)
 
@@ -213,7 +213,7 @@ def _going(name: str | None, config: Path | None) -> Path:
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
     """List what was run, newest last, a line each: when, what, how it ended, how long it took, and why."""
     from cell.cli.display import print_runs
-    from cell.runs import list_runs, run_row
+    from cell.run.folder import list_runs, run_row
 
     rows = [run_row(folder) for folder in list_runs(_runs_folder(config))]
     if json:
@@ -227,7 +227,7 @@ def report(
 ) -> None:
     """Show the report of a run."""
     from cell.cli.display import print_report
-    from cell.runs import find_run, read_report
+    from cell.run.folder import find_run, read_report
 
     folder = find_run(_runs_folder(config), name)
     data = read_report(folder)

@@ -50,8 +50,8 @@ def init(
 
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
+    from cell.check.fit import require_fit
     from cell.config import example_addresses, find_config, load_config, require_confirm
-    from cell.fit import require_fit
     from cell.job import job_path, load_job
     from drivers.errors import ConfigError
 

@@ -46,7 +46,7 @@ def serve(
 
     def ready(endpoints: dict[str, object]) -> None:
         if config_out is not None:
-            from cell.simulation import endpoint_toml
+            from cell.devices.simulated import endpoint_toml
 
             config_out.write_text(endpoint_toml(endpoints), encoding="utf-8")
 

@@ -17,7 +17,7 @@ from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane, triangulate
 from cell.reconstruction.cloud import Array, Cloud
 from cell.reconstruction.outliers import find_outliers
-from cell.vision.stripe import StripeProfile
+from cell.vision.stripe.extract import StripeProfile
 
 
 @dataclass(frozen=True)

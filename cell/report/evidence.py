@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cell.frames import FrameStore
 from cell.inversion import PlacePose, fit_figures
 from cell.job import Job
+from cell.run.frames import FrameStore
 from cell.steps.photograph import BoardFix
 from cell.steps.place import PlaceResult
 from drivers.errors import Measured, RefusedError

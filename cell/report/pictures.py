@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
 
-from cell.frames import FrameStore
 from cell.geometry.poses import transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
@@ -31,6 +30,7 @@ from cell.report.panels import (
     draw_surface,
     empty,
 )
+from cell.run.frames import FrameStore
 from cell.steps.drive_to_target import Arrival
 from cell.steps.laser_sweep import SweepRecord
 from cell.steps.photograph import BoardFix

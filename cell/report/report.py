@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from cell.config import CellConfig
-from cell.frames import FrameStore
 from cell.geometry.poses import to_ur
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.report.bound import stated_bound
 from cell.report.evidence import last_frames, measured, refusal
 from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
-from cell.runs import REPORT, when, write_json
+from cell.run.folder import REPORT, when, write_json
+from cell.run.frames import FrameStore
 from cell.steps.laser_sweep import SweepRecord
 from cell.steps.reconstruct import Reconstruction
 from cell.version import release

@@ -1,1 +1,1 @@
-"""Placeholder."""
+"""The six steps of a job, a file each, and what they share."""

@@ -10,10 +10,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from cell.assembly import Devices
+from cell.devices.assembly import Devices
 from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
-from cell.planning import ScanPlan
+from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
 from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import CellError, DeviceFault

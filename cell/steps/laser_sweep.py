@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from cell.assembly import Devices
+from cell.devices.assembly import Devices
 from cell.job import ScanSection
-from cell.planning import ScanPlan
 from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
+from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors, rehearse

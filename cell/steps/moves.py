@@ -15,7 +15,7 @@ from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
-from cell.planning import centre_of
+from cell.steps.camera_poses import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
 from drivers.interfaces import Arm, ArmMotion, Vector

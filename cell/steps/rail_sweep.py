@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.assembly import Devices
+from cell.devices.assembly import Devices
 from cell.geometry.poses import from_ur
-from cell.planning import ScanPlan
+from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
 from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault

@@ -14,8 +14,8 @@ import pinocchio as pin
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
-from cell.planning import centre_of
 from cell.steps.approach import Planar, line_command, wrap
+from cell.steps.camera_poses import centre_of
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import parse_board
 from drivers.errors import RefusedError

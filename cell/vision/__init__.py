@@ -1,11 +1,11 @@
 """Images to numbers: stripe centres and board points, each with its own uncertainty or the reason of its refusal."""
 
-from cell.vision.board import BoardPose, board_pose, find_board
-from cell.vision.board_spec import BoardSpec, parse_board
-from cell.vision.board_view import BoardView
+from cell.vision.board.board import BoardPose, board_pose, find_board
+from cell.vision.board.spec import BoardSpec, parse_board
+from cell.vision.board.view import BoardView
 from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-from cell.vision.stripe import StripeProfile, StripeSettings, extract
-from cell.vision.stripe_stream import StripeStream
+from cell.vision.stripe.extract import StripeProfile, StripeSettings, extract
+from cell.vision.stripe.stream import StripeStream
 
 __all__ = [
     "BoardPose",

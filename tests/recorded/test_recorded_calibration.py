@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.calibration.recorded import calibrate_folder
+from cell.calibration.recorded.command import calibrate_folder
 from cell.vision import parse_board
 from drivers.errors import ConfigError
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cell.calibration.recorded import calibrate_folder
+from cell.calibration.recorded.command import calibrate_folder
 from cell.cli.app import app
 from cell.vision import parse_board
 from drivers.errors import ConfigError

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cell.resumption import UnfinishedRun
+from cell.run.resumption import UnfinishedRun
 from cell.steps.stored_sweep import FILE
 from drivers.errors import ConfigError
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step

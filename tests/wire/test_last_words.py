@@ -17,9 +17,9 @@ pytestmark = pytest.mark.wire
 OPEN = """
 import sys
 from pathlib import Path
-from cell import assembly
+from cell.devices import assembly
 from cell.config import load_config
-from cell.gate import Gate
+from cell.devices.gate import Gate
 from drivers.clock import Clock
 config = load_config(Path("sim.toml"))
 clock = Clock(config.cell.time_scale)

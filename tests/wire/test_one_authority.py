@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from cell import Cell, RunOutcome
-from cell.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
 from cell.report.truth import ask_truth
-from cell.run import Run
-from cell.runs import is_going, list_runs, read_report
+from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
+from cell.run.folder import is_going, list_runs, read_report
+from cell.run.run import Run
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from statemachine.journal import request

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.assembly import connect
 from cell.config import load_config
+from cell.devices.assembly import connect
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken
 from tests.wire.cells import ask, assert_safe, served

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.runs import list_runs
+from cell.run.folder import list_runs
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire

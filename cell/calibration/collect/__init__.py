@@ -1,0 +1,1 @@
+"""Collecting what a calibration is solved from."""

@@ -1,0 +1,154 @@
+"""Collecting what a calibration is solved from: the cell moves through its own poses over the boards on its deck."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import TypeVar
+
+from cell.calibration import ScanObservation, TargetObservation
+from cell.calibration.collect.aiming import Aim
+from cell.calibration.store import nominal_camera
+from cell.config import CellConfig
+from cell.devices.assembly import Devices
+from cell.geometry.poses import from_ur
+from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
+from cell.steps.moves import HOME, Mover
+from cell.vision import BoardSpec, BoardView, extract, find_board, parse_board
+from drivers.errors import DeviceFault, RefusedError
+from drivers.interfaces import Camera
+
+PHOTO_RATE = 10.0
+LEAST_SHARE = 0.75
+"""Share of the planned views that have to show the board."""
+
+RAIL_MOVE_VIEWS, RAIL_MOVE = (6, 10, 14), 0.015
+"""Views, with the rail near its middle, at which it moves by this much (m) either way while the arm rests."""
+
+Progress = Callable[[float, str], None]
+Check = Callable[[], None]
+Made = TypeVar("Made")
+
+
+def collect_scan(
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+) -> list[ScanObservation]:
+    """Dots and stripe on the fine board, at several depths, tilts and rail positions.
+
+    At each view the laser is off for the photograph and on for the stripe; at some of them the rail moves either way
+    for further photographs while the arm rests (`same_rest`), right after their view in the list. A view that does not
+    show the board is aimed anew by what the others showed. Raises `RefusedError` when too few views show it even then.
+    """
+    board = parse_board(config.calibration.fine.board)
+    views = scan_calibration_views(config, board)
+    camera, rail = devices.scan_camera, devices.rail
+    if not rail.state().homed_here:
+        progress(0.0, "homing the rail")
+        rail.home().wait(60.0)
+    mover.to_joints(HOME)
+    aim = Aim(config, nominal_camera(config.scan_camera))
+    made: list[ScanObservation] = []
+    moved: list[ScanObservation] = []
+    refusals = Counter[str]()
+    for k, view in enumerate(views):
+        check()
+        progress(k / len(views), f"fine board, view {k + 1} of {len(views)}")
+        mover.hold()
+        travel = rail.move_to(view.rail_position)
+        move_to_view(devices, mover, view, k)
+        travel.wait(30.0)
+        camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
+        seen = look_for(camera, lambda image: find_board(image, board), refusals)
+        for other in aim.instead_of(view) if seen is None else ():
+            check()
+            progress(k / len(views), f"fine board, view {k + 1} of {len(views)}, aimed anew")
+            if _can_move(devices, mover, other, k):
+                seen = look_for(camera, lambda image: find_board(image, board), refusals)
+            if seen is not None:
+                break
+        if seen is None:
+            continue
+        aim.learn(seen, from_ur(devices.arm.state().flange), rail.state().position)
+        camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
+        with devices.laser.lit():
+            stripe = extract(camera.grab().image)
+        base_from_flange = from_ur(devices.arm.state().flange)
+        made.append(ScanObservation(seen, stripe, base_from_flange, rail.state().position, f"fine {k + 1}"))
+        if k in RAIL_MOVE_VIEWS:
+            camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
+            moved.extend(_rail_moves(config, devices, board, made[-1]))
+    _enough(made, views, refusals)
+    return [o for view in made for o in (view, *(m for m in moved if m.name.startswith(view.name + " ")))]
+
+
+def _rail_moves(config: CellConfig, devices: Devices, board: BoardSpec, here: ScanObservation) -> list[ScanObservation]:
+    """Photographs of the fine board with the rail moved either way and the arm where it is; those that show it."""
+    made = []
+    low, high = config.rail.travel
+    for way in (-RAIL_MOVE, RAIL_MOVE):
+        position = min(max(here.rail_position + way, low), high)
+        devices.rail.move_to(position).wait(30.0)
+        seen = look_for(devices.scan_camera, lambda image: find_board(image, board), Counter())
+        if seen is not None:
+            name = f"{here.name} {'+' if way > 0 else '-'}"
+            rail = devices.rail.state().position
+            made.append(ScanObservation(seen, None, here.base_from_flange, rail, name, same_rest=True))
+    return made
+
+
+def collect_target(
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+) -> list[TargetObservation]:
+    """Dots of the large board, at several distances and tilts. Raises `RefusedError` when too few views show it."""
+    board = parse_board(config.calibration.large.board)
+    views = target_calibration_views(config, board)
+    devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
+    made: list[TargetObservation] = []
+    refusals = Counter[str]()
+    for k, view in enumerate(views):
+        check()
+        progress(k / len(views), f"large board, view {k + 1} of {len(views)}")
+        move_to_view(devices, mover, view, k)
+        seen = look_for(devices.target_camera, lambda image: find_board(image, board), refusals)
+        if seen is not None:
+            made.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
+    return _enough(made, views, refusals)
+
+
+def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
+    """To a view; after a stop that a program may clear, once more."""
+    try:
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+    except DeviceFault as fault:
+        if fault.device != devices.arm.name or not fault.recoverable:
+            raise
+        devices.gate.require()
+        devices.arm.recover()
+        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+
+
+def _can_move(devices: Devices, mover: Mover, view: View, k: int) -> bool:
+    """To a view that was not planned; False when it cannot be reached, or not without touching something."""
+    try:
+        move_to_view(devices, mover, view, k)
+    except RefusedError:
+        return False
+    return True
+
+
+def look_for(camera: Camera, find: Callable[..., BoardView], refusals: Counter[str]) -> BoardView | None:
+    """The board in a new picture; None when it is refused, with the reason counted."""
+    try:
+        return find(camera.grab().image)
+    except RefusedError as error:
+        refusals[str(error)] += 1
+        return None
+
+
+def _enough(made: list[Made], views: list[View], refusals: Counter[str]) -> list[Made]:
+    if len(made) < LEAST_SHARE * len(views):
+        raise RefusedError(
+            f"only {len(made)} of {len(views)} calibration views show the board; check its place, the light and the "
+            "lens: " + "; ".join(f"{count} times: {reason}" for reason, count in refusals.most_common())
+        )
+    return made

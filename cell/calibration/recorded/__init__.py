@@ -1,0 +1,1 @@
+"""Calibration from frames that were recorded elsewhere."""

@@ -1,0 +1,247 @@
+"""The joint adjustment: camera, light plane, rail, hand-eye and board in one robust least-squares problem.
+
+The arm's poses and the rail's readings are unknowns too, held by their repeatability; groups of measurements whose
+noise is not known get it from their own residuals (variance components). Views between which only the rail moved share
+the flange's pose, wherever that was. Theory sheet, part 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.solve.blocks import (
+    CAMERA,
+    COLUMNS,
+    HAND,
+    OWN,
+    PLANE,
+    RAIL,
+    SHARED,
+    State,
+    ViewData,
+    dots_block,
+    rests_of,
+    stripe_block,
+)
+from cell.calibration.solve.normal import Block, Inverse, Normal
+from cell.geometry.camera import Array
+from cell.geometry.poses import difference
+
+DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01)
+HUBER = 2.5
+# Mean robust cost of a Gaussian residual, per component, for the dots' two components together and the stripe's one.
+_OVER, _DENSITY = math.erfc(HUBER / math.sqrt(2)), math.exp(-(HUBER**2) / 2)
+HUBER_COST = {
+    "dots": 1 - _DENSITY + HUBER * math.sqrt(math.pi / 2) * _OVER,
+    "stripe": 1 - _OVER + HUBER * _DENSITY * math.sqrt(2 / math.pi) - HUBER**2 * _OVER,
+}
+STEPS = 25
+VARIANCE_ROUNDS = 4
+# Measurements without any noise would leave the priors no digits.
+LEAST_SCALE = 0.1
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known beforehand: one standard deviation each.
+
+    `arm_translation` (m) and `arm_rotation` (rad) per axis of a reported flange pose, `rail` (m) of a rail reading.
+    With `estimate_arm` the first two are starting values only and the residuals decide. `dots_scale` multiplies the
+    σ of the dots, `stripe_scale` that of the stripe; the residuals always decide on these.
+    """
+
+    arm_translation: float = 3e-5
+    arm_rotation: float = 6e-5
+    rail: float = 2e-5
+    estimate_arm: bool = False
+    dots_scale: float = 2.0
+    stripe_scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Result: the state, the covariance (27, 27) of the shared parameters, χ² per degree of freedom, found noise.
+
+    The covariance is for the noise in `priors`; `reliable_covariance` allows for the scatter that was found.
+    `excess` says by how much the flange's shifts and turns and the rail's readings scatter more than the priors say
+    ("shift", "turn", "rail": found over stated standard deviation; 1 where nothing was found).
+    """
+
+    state: State
+    covariance: Array
+    chi2_per_dof: float
+    dots_rms_px: float
+    stripe_rms_m: float
+    priors: Priors
+    iterations: int
+    excess: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def inflation(self) -> float:
+        """Factor of all deviations for a flange that scatters more than the priors say; it makes most of them."""
+        return max(1.0, self.excess.get("shift", 1.0), self.excess.get("turn", 1.0))
+
+    @property
+    def reliable_covariance(self) -> Array:
+        """The covariance (27, 27) with this factor."""
+        return self.covariance * self.inflation**2
+
+
+class Adjustment:
+    """One problem: views, what is free, and the priors. `solve` iterates from a start."""
+
+    def __init__(self, views: Sequence[ViewData], free: NDArray[np.bool_], priors: Priors) -> None:
+        """`free` (27,) says which shared parameters move, in the order of `blocks`."""
+        self.views = list(views)
+        self.rests = rests_of(self.views)
+        self.free = free
+        self.own_free = np.ones(OWN, dtype=np.bool_)
+        self.own_free[6] = bool(free[RAIL].any())
+        self.priors = priors
+
+    def solve(self, start: State, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
+        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals."""
+        state = replace(
+            start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
+        )
+        iterations = 0
+        normal = self.normal_at(state)
+        for turn in range(variance_rounds + 1):
+            # Until the noise is settled there is no point in the last digits.
+            settled = 1e-3 if turn < variance_rounds else 1e-9
+            state, normal, used = self._minimise(state, normal, settled)
+            iterations += used
+            if turn < variance_rounds:
+                self._update_noise(normal)
+                normal = self.normal_at(state)
+        inverse = normal.inverse()
+        expected = sum(expected_cost(name, block, inverse) for name, block in normal.groups.items())
+        return Adjusted(
+            state,
+            inverse.shared,
+            normal.total / expected,
+            *self.residual_rms(state),
+            self.priors,
+            iterations,
+            {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
+        )
+
+    def residual_rms(self, state: State) -> tuple[float, float]:
+        """RMS of the dots in px (per component) and of the stripe's distances from the board in m; NaN when unseen."""
+        dots, stripe = [np.zeros(0)], [np.zeros(0)]
+        for view, flange, rail in zip(self.views, state.flanges, state.rails, strict=True):
+            if len(view.points):
+                dots.append(dots_block(state, view, flange, float(rail))[0].ravel())
+            if len(view.stripe) and state.plane is not None:
+                stripe.append(stripe_block(state, view, flange, float(rail))[0])
+        return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
+
+    def _minimise(self, state: State, normal: Normal, settled: float) -> tuple[State, Normal, int]:
+        damping = 1e-6
+        used = 0
+        for _ in range(STEPS):
+            step = normal.step(damping)
+            # A minimum that is reached promises nothing; trying on would only meet the last digits' noise.
+            if normal.promised(step) < settled * normal.total + 1e-9:
+                break
+            used += 1
+            candidate = state.moved(step)
+            new = self.normal_at(candidate)
+            if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
+                state, normal = candidate, new
+                damping = max(1e-9, 0.1 * damping)
+            else:
+                damping *= 20
+                if damping > 1e4:
+                    break
+        return state, normal, used
+
+    def normal_at(self, state: State) -> Normal:
+        """The normal equations at a state whose flanges and rails are those of the views, with the present priors."""
+        normal = Normal(self.rests, self.free, self.own_free)
+        settles = np.diff(self.rests, prepend=-1) > 0
+        for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
+            if len(view.points):
+                residual, jacobian = dots_block(state, view, flange, float(rail))
+                sigma = self.priors.dots_scale * view.sigma
+                white = residual / sigma[:, None]
+                weight, cost = _huber(np.linalg.norm(white, axis=1))
+                root = (np.sqrt(weight) / sigma)[:, None]
+                rows = (jacobian * root[:, :, None]).reshape(-1, COLUMNS)
+                normal.add_view("dots", k, rows, (residual * root).ravel(), cost)
+            if len(view.stripe) and state.plane is not None:
+                residual, jacobian, sigma = stripe_block(state, view, flange, float(rail))
+                sigma = self.priors.stripe_scale * sigma
+                weight, cost = _huber(np.abs(residual / sigma))
+                root = np.sqrt(weight) / sigma
+                normal.add_view("stripe", k, jacobian * root[:, None], residual * root, cost)
+            if settles[k]:
+                apart = -difference(flange, view.base_from_flange)
+                shift, turn = self.priors.arm_translation, self.priors.arm_rotation
+                normal.add_prior("shift", k, 0, apart[:3] / shift, shift)
+                normal.add_prior("turn", k, 3, apart[3:] / turn, turn)
+            if self.own_free[6]:
+                normal.add_prior("rail", k, 6, np.array([view.rail - rail]) / self.priors.rail, self.priors.rail)
+        lens = np.arange(4, 8)[self.free[4:8]]
+        deviation = np.array(DISTORTION_PRIOR)[lens - 4]
+        normal.add_shared_prior("lens", lens, -state.camera.parameters[lens] / deviation, deviation)
+        return normal
+
+    def _update_noise(self, normal: Normal) -> None:
+        """Scale each group's σ so that its χ² meets its redundancy."""
+        inverse = normal.inverse()
+        factors = {}
+        groups = ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else [])
+        for name in groups:
+            if normal.groups[name].count:
+                factors[name] = _scatter(normal, inverse, name)
+        p = self.priors
+        self.priors = replace(
+            p,
+            dots_scale=max(p.dots_scale * factors.get("dots", 1.0), LEAST_SCALE),
+            stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), LEAST_SCALE),
+            arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
+            arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
+        )
+
+
+def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:
+    """Found over assumed standard deviation of a group: the root of its cost over the expected; 1 for an empty one."""
+    block = normal.groups[name]
+    if block.count == 0:
+        return 1.0
+    return float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
+
+
+def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:
+    """Which of the 27 shared parameters move: always fx … k1, hand-eye and board; k3 never (it is not observable)."""
+    free = np.ones(SHARED, dtype=np.bool_)
+    free[CAMERA.start + 8] = False
+    free[5] = k2
+    free[6:8] = tangential
+    free[PLANE] = plane
+    free[RAIL] = rail
+    free[HAND] = True
+    return free
+
+
+def expected_cost(name: str, block: Block, inverse: Inverse) -> float:
+    """What a group's robust cost is on average, when its noise is Gaussian and as large as assumed."""
+    redundancy = max(block.count - inverse.taken(block), 0.02 * block.count)
+    return redundancy * HUBER_COST.get(name, 1.0)
+
+
+def _huber(size: Array) -> tuple[Array, float]:
+    """Weights (n,) and cost of whitened residual lengths (n,)."""
+    weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
+    cost = np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2)
+    return weight, float(cost.sum())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -1,0 +1,116 @@
+"""What a calibration's views cover, and what is left over in the pictures: the figures behind its residual maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.solve.blocks import dots_block, stripe_block
+from cell.calibration.solve.joint import Joint
+from cell.geometry.camera import Array
+from cell.geometry.poses import transform
+
+GRID = (8, 6)
+"""Cells of the picture, columns and rows."""
+LEAST_IN_CELL = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Dots: pixels and residuals (n, 2) in px; stripe: pixels (m, 2), residuals (m,) in px across it, depths (m,) in m.
+
+    The stripe's points are means of neighbouring rows, and its residuals are theirs.
+
+    One entry for each view: `depth` (v,) of the board's middle in m, `tilt` (v, 2) of its normal about the picture's
+    x and y in rad, `rail` (v,) in m. `size` is that of the picture in px.
+    """
+
+    size: tuple[int, int]
+    dots: Array
+    dots_off: Array
+    stripe: Array
+    stripe_off: Array
+    stripe_depth: Array
+    depth: Array
+    tilt: Array
+    rail: Array
+
+    @classmethod
+    def of(cls, joint: Joint) -> Coverage:
+        """At the solution of a joint adjustment."""
+        state = joint.adjusted.state
+        dots, off, stripe, away, reach = [], [], [], [], []
+        depth, tilt = [], []
+        for view, flange, rail in zip(joint.views, state.flanges, state.rails.tolist(), strict=True):
+            pose = state.camera_from_board(flange, rail)
+            if len(view.points):
+                dots.append(view.pixels)
+                off.append(dots_block(state, view, flange, rail)[0])
+                depth.append(float(transform(pose, view.points)[:, 2].mean()))
+                normal = pose.rotation[:, 2]
+                tilt.append((float(np.arctan2(-normal[1], normal[2])), float(np.arctan2(normal[0], normal[2]))))
+            if len(view.stripe) and state.plane is not None:
+                residual, _, sigma = stripe_block(state, view, flange, rail)
+                stripe.append(view.stripe)
+                away.append(residual / sigma * view.stripe_sigma)
+                reach.append(state.plane.intersect(state.camera.rays(view.stripe))[:, 2])
+        return cls(
+            (state.camera.width, state.camera.height),
+            np.concatenate([np.zeros((0, 2)), *dots]),
+            np.concatenate([np.zeros((0, 2)), *off]),
+            np.concatenate([np.zeros((0, 2)), *stripe]),
+            np.concatenate([np.zeros(0), *away]),
+            np.concatenate([np.zeros(0), *reach]),
+            np.array(depth),
+            np.array(tilt).reshape(-1, 2),
+            np.asarray(state.rails),
+        )
+
+    def cells(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Column and row (n,) of the cell of `GRID` in which pixels (n, 2) lie."""
+        at = (pixels + 0.5) / np.array(self.size) * np.array(GRID)
+        return np.clip(at[:, 0], 0, GRID[0] - 1).astype(np.intp), np.clip(at[:, 1], 0, GRID[1] - 1).astype(np.intp)
+
+    def counts(self, pixels: Array) -> Array:
+        """Number of points (rows, columns) in each cell."""
+        made = np.zeros((GRID[1], GRID[0]))
+        columns, rows = self.cells(pixels)
+        np.add.at(made, (rows, columns), 1.0)
+        return made
+
+    def cell_means(self) -> Array:
+        """Mean residual (rows, columns, 2) in px of the dots in each cell; NaN where there are fewer than three."""
+        count = self.counts(self.dots)
+        total = np.zeros((GRID[1], GRID[0], 2))
+        columns, rows = self.cells(self.dots)
+        np.add.at(total, (rows, columns), self.dots_off)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(count[..., None] >= LEAST_IN_CELL, total / count[..., None], np.nan)
+
+    def summary(self) -> dict[str, Any]:
+        """Figures in px, mm and degrees; the stripe's are None without one."""
+        means = np.linalg.norm(self.cell_means(), axis=2)
+        lit = len(self.stripe) > 0
+        return {
+            "views": len(self.depth),
+            "dots": len(self.dots),
+            "field_covered": float(np.mean(self.counts(self.dots) >= LEAST_IN_CELL)),
+            "dots_rms_px": float(np.sqrt(np.mean(self.dots_off**2))),
+            "largest_cell_mean_px": float(np.nanmax(means)) if np.isfinite(means).any() else None,
+            "depth_mm": _range(1e3 * self.depth),
+            "tilt_about_x_deg": _range(np.degrees(self.tilt[:, 0])),
+            "tilt_about_y_deg": _range(np.degrees(self.tilt[:, 1])),
+            "rail_mm": _range(1e3 * self.rail),
+            "stripe_points": len(self.stripe),
+            "stripe_rms_px": float(np.sqrt(np.mean(self.stripe_off**2))) if lit else None,
+            "stripe_depth_mm": _range(1e3 * self.stripe_depth) if lit else None,
+            "stripe_columns_px": _range(self.stripe[:, 0]) if lit else None,
+            "stripe_rows_px": _range(self.stripe[:, 1]) if lit else None,
+        }
+
+
+def _range(values: Array) -> list[float]:
+    return [float(values.min()), float(values.max())]

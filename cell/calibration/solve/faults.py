@@ -1,0 +1,198 @@
+"""Faults of a calibration's set-up that it can name itself: exchanged pictures, a bent board, a slipped mount, a lead.
+
+Each check looks at what only its own fault disturbs, so that one fault is not taken for another: pictures against the
+flange's turns; the dots of each view by themselves; where the views put the board, before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+from scipy.special import fdtrc
+
+from cell.calibration.solve.adjustment import Adjusted
+from cell.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
+from cell.calibration.solve.consistency import angle_apart
+from cell.geometry.camera import Array
+from cell.geometry.poses import difference, from_parts, perturbed
+from drivers.errors import RefusedError
+
+LARGEST_TURN = float(np.deg2rad(0.5))
+"""How much more or less than the flange a board may seem to turn between two views; repeatability is far below."""
+LARGEST_BEND = 1.5e-3
+"""How far a board may stand out of its plane, as a share of its diagonal."""
+LARGEST_SLIP_M, LARGEST_SLIP_RAD = 0.1e-3, float(np.deg2rad(0.03))
+"""A change of the mount within the collection that may stay."""
+SCALE_RANGE = (0.98, 1.02)
+"""Travel found per travel commanded: what is beyond is no screw's error."""
+CHANCE = 1e-6
+LEAST_VIEWS_APART = 3
+
+
+def refuse_exchanged(names: Sequence[str], flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> None:
+    """Refuse views whose pictures belong to other flange poses; `boards` are camera_from_board by picture.
+
+    Whatever the hand-eye, the flange turns between two views by the angle by which the board seems to turn.
+    """
+    count = len(flanges)
+    apart = np.array([[[_apart(flanges, boards, i, p, j, j) for j in range(count)] for p in range(count)]
+                      for i in range(count)])  # fmt: skip
+    own = np.array([np.median(np.delete(apart[i, i], i)) for i in range(count)])
+    odd = np.flatnonzero(own > LARGEST_TURN)
+    if not len(odd):
+        return
+    good = np.setdiff1d(np.arange(count), odd)
+    which = ", ".join(names[int(i)] for i in odd[:4]) + (", …" if len(odd) > 4 else "")
+    found = (
+        f"{len(odd)} of {count} pictures do not belong to their flange poses ({which}): the board turned by up to "
+        f"{np.degrees(own.max()):.1f}° more or less than the flange, allowed {np.degrees(LARGEST_TURN):g}°"
+    )
+    advice = "see how pictures are paired with poses (no frame may be lost or kept back), then collect anew"
+    if len(good) >= LEAST_VIEWS_APART:
+        pairs = [(i, j) for i, j in combinations(odd.tolist(), 2)
+                 if max(np.median(apart[i, j][good]), np.median(apart[j, i][good])) < LARGEST_TURN]  # fmt: skip
+        if pairs:
+            text = " and ".join(f"those of {names[i]} and {names[j]} are exchanged" for i, j in pairs)
+            raise RefusedError(f"{found}; {text}: {advice}")
+    for shift, words in ((1, "one late"), (-1, "one early")):
+        order = [(i + shift) % count for i in range(count)]
+        moved = np.array([
+            np.median([_apart(flanges, boards, i, order[i], j, order[j]) for j in range(count) if j != i])
+            for i in range(count)
+        ])  # fmt: skip
+        if np.mean(moved < LARGEST_TURN) > 0.7:
+            raise RefusedError(f"{found}; the frames come {words}: {advice}")
+    raise RefusedError(f"{found}; {advice}, and see that the board lies still")
+
+
+def _apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], i: int, p: int, j: int, q: int) -> float:
+    """`angle_apart` of flange i with picture p against flange j with picture q."""
+    return 0.0 if i == j else angle_apart(flanges[i], boards[p], flanges[j], boards[q])
+
+
+def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> None:
+    """Refuse a board that is bent or twisted: dots out of its plane like a second-degree surface.
+
+    Every view has a pose of its own here and the lens is free, so that arm, rail and mount play no part.
+    """
+    state = adjusted.state
+    whole = max((v.points for v in views), key=len)
+    middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+    half = 0.5 * float(np.linalg.norm(np.ptp(whole, axis=0)))
+    rows, right = [], []
+    for view, flange, rail in zip(views, state.flanges, state.rails, strict=True):
+        if len(view.points) < 6:
+            continue
+        residual, jacobian = dots_block(state, view, flange, float(rail))
+        # Board columns are derivatives by a move of the board: along its normal they are what a dot's height does.
+        height = jacobian[:, :, 21:24] @ state.base_from_board.rotation[:, 2]
+        shapes = height[:, :, None] * _shapes((view.points - middle) / half)[:, None, :]
+        wanted = np.concatenate([jacobian[:, :, CAMERA][:, :, :8], shapes], axis=2).reshape(-1, 11)
+        pose, _ = np.linalg.qr(jacobian[:, :, FLANGE].reshape(-1, 6))
+        both = np.column_stack([wanted, residual.ravel()]) / np.repeat(view.sigma, 2)[:, None]
+        pose = np.linalg.qr(pose / np.repeat(view.sigma, 2)[:, None])[0]
+        both -= pose @ (pose.T @ both)
+        rows.append(both[:, :-1])
+        right.append(both[:, -1])
+    design, measured = np.concatenate(rows), np.concatenate(right)
+    scale = np.linalg.norm(design, axis=0)
+    covariance = np.linalg.inv((design / scale).T @ (design / scale)) / scale[:, None] / scale
+    solution = covariance @ design.T @ measured
+    freedom = len(measured) - 11 - 6 * len(rows)
+    variance = float(np.sum((measured - design @ solution) ** 2)) / freedom
+    bend = solution[8:]
+    test = float(bend @ np.linalg.solve(covariance[8:, 8:] * variance, bend)) / 3
+    heights = _shapes((whole - middle) / half) @ bend
+    size, allowed = float(np.ptp(heights)), LARGEST_BEND * 2 * half
+    if size > allowed and fdtrc(3, freedom, test) < CHANCE:
+        across = [np.ptp(_shapes((whole - middle) * axis / half) @ bend) for axis in (np.eye(3)[0], np.eye(3)[1])]
+        raise RefusedError(
+            f"the {board} board is not flat: its dots stand {1e3 * size:.2f} mm out of a plane "
+            f"({1e3 * across[0]:.2f} mm along its rows, {1e3 * across[1]:.2f} mm down its columns), allowed "
+            f"{1e3 * allowed:.2f} mm; see how it is fastened, flatten or replace it, then run `cell calibrate`"
+        )
+
+
+def _shapes(at: Array) -> Array:
+    """The second-degree shapes (n, 3) at places (n, 3) in half diagonals: along x, twisted, along y."""
+    x, y = at[:, 0], at[:, 1]
+    return np.column_stack([x * x, x * y, y * y])
+
+
+def refuse_slipped(
+    camera: str, names: Sequence[str], adjusted: Adjusted, views: Sequence[ViewData], boards: Sequence[pin.SE3]
+) -> None:
+    """Refuse a collection in the middle of which the camera moved on the flange; `boards` are camera_from_board.
+
+    Where the views put the board in the base is explained by one hand-eye, board and rail, and better by a second
+    hand-eye from some view on. An F test tells, so that an arm that repeats worse than stated raises no alarm.
+    """
+    state, count = adjusted.state, len(views)
+    if count < 2 * LEAST_VIEWS_APART:
+        return
+    hand, rail = state.flange_from_camera, state.rail_direction
+
+    def place(k: int, h: pin.SE3, direction: Array) -> pin.SE3:
+        return views[k].base_from_flange * h * from_parts(views[k].rail * direction) * boards[k]
+
+    blocks, right, slips = [], [], []
+    step = 1e-6
+    for k in range(count):
+        here = place(k, hand, rail)
+        by_hand = np.column_stack(
+            [difference(place(k, perturbed(hand, step * e), rail), here) / step for e in np.eye(6)]
+        )
+        by_rail = np.column_stack([difference(place(k, hand, rail + step * e), here) / step for e in np.eye(3)])
+        root = np.linalg.inv(np.linalg.cholesky(_scatter(adjusted, views[k], here)))
+        blocks.append(root @ np.hstack([by_hand, by_rail, -np.eye(6)]))
+        slips.append(root @ by_hand)
+        right.append(-root @ difference(here, state.base_from_board))
+    design, measured = np.concatenate(blocks), np.concatenate(right)
+    plain = _squares(design, measured)[0]
+    best: tuple[float, int, Array] = (0.0, 0, np.zeros(6))
+    freedom = len(measured) - np.linalg.matrix_rank(design) - 6
+    for first in range(LEAST_VIEWS_APART, count - LEAST_VIEWS_APART + 1):
+        later = np.concatenate([slip * (k >= first) for k, slip in enumerate(slips)])
+        squares, solution = _squares(np.hstack([later, design]), measured)
+        test = (plain - squares) / 6 / max(squares / freedom, 1e-12)
+        if test > best[0]:
+            best = float(test), first, solution[:6]
+    test, first, moved = best
+    shift, turn = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
+    if fdtrc(6, freedom, test) * count < CHANCE and (shift > LARGEST_SLIP_M or turn > LARGEST_SLIP_RAD):
+        raise RefusedError(
+            f"the {camera} camera's mount slipped on the flange before {names[first]}: from there on the camera sits "
+            f"{1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from where it was, allowed {1e3 * LARGEST_SLIP_M:g} mm "
+            f"and {np.degrees(LARGEST_SLIP_RAD):.2f}°; tighten the mount and the claw, then run `cell calibrate`"
+        )
+
+
+def _scatter(adjusted: Adjusted, view: ViewData, base_from_board: pin.SE3) -> Array:
+    """Covariance (6, 6) of where one view puts the board, from the arm, the rail and a little of the picture."""
+    p = adjusted.priors
+    lever = np.eye(6)
+    lever[:3, 3:] = -pin.skew(base_from_board.translation - view.base_from_flange.translation)
+    arm = np.diag(np.repeat([p.arm_translation**2 + p.rail**2, p.arm_rotation**2], 3))
+    picture = np.diag(np.repeat([1e-6**2, 1e-5**2], 3))
+    return np.asarray(lever @ arm @ lever.T + picture, dtype=np.float64)
+
+
+def _squares(design: Array, measured: Array) -> tuple[float, Array]:
+    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-30)
+    solution = np.linalg.lstsq(design / scale, measured, rcond=1e-10)[0]
+    left = measured - (design / scale) @ solution
+    return float(left @ left), np.asarray(solution / scale, dtype=np.float64)
+
+
+def refuse_wrong_lead(rail_direction: Array, lead: float) -> None:
+    """Refuse a rail that moves much more or less than commanded under the configured `lead` in m per turn."""
+    scale = float(np.linalg.norm(rail_direction))
+    if not SCALE_RANGE[0] <= scale <= SCALE_RANGE[1]:
+        raise RefusedError(
+            f"the rail moves {scale:.3f} mm per mm commanded, allowed {SCALE_RANGE[0]:g} to {SCALE_RANGE[1]:g}: "
+            f"rail.lead is configured as {1e3 * lead:g} mm, the screw seems to have {1e3 * lead * scale:.3g} mm; "
+            "correct rail.lead (or steps_per_turn, microsteps), then run `cell calibrate`"
+        )

@@ -1,0 +1,224 @@
+"""From observations to the joint adjustment and its cross-checks: the common part of all calibrations with poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from cell.calibration.observations import ScanObservation
+from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
+from cell.calibration.solve.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
+from cell.calibration.solve.hand_eye import HandEye, solve_hand_eye
+from cell.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
+from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.poses import from_parts
+from drivers.errors import RefusedError
+
+STRIPE_POINTS = 120
+"""About so many means of neighbouring rows stand for a stripe: quicker than all rows, and no less is known.
+
+Rows that share their speckle are less independent than their stated σ says; that scale is found from the residuals.
+"""
+FOLDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Staged:
+    """The closed-form solution: camera and its RMS per view, hand-eye, light plane (None without a stripe).
+
+    From the first view of each rest of the arm. `plane` holds the stripe's usable rows of all observations; its plane
+    is that of the paper's steps (`paper`) where they give one.
+    """
+
+    camera: CameraModel
+    view_rms: Array
+    camera_from_board: list[pin.SE3]
+    hand_eye: HandEye
+    plane: PlaneStart | None
+    paper: PaperPlane | None
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Staged and joint solution, the data they were made of, and how well held-out views are predicted."""
+
+    staged: Staged
+    adjusted: Adjusted
+    views: list[ViewData]
+    held_out_px: float
+    held_out_stripe_m: float
+
+
+def solve_staged(
+    observations: Sequence[ScanObservation],
+    nominal: CameraModel | None = None,
+    rail_direction: Array | None = None,
+    stripe: bool = True,
+    lens: bool = True,
+) -> Staged:
+    """Camera, then hand-eye, then light plane, each from the result before. All observations need a view."""
+    every, observations = observations, [o for o in observations if not o.same_rest]
+    views = [o.view for o in observations if o.view is not None]
+    camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
+    with_view = [o for o in observations if o.view is not None]
+    hand_eye = solve_hand_eye(
+        [o.base_from_flange for o in with_view], poses, [o.rail_position for o in with_view], rail_direction
+    )
+    plane, paper = None, None
+    if stripe and any(o.profile is not None for o in observations):
+        everywhere = [
+            (
+                o.base_from_flange * hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
+            ).inverse()
+            * hand_eye.base_from_board
+            for o in observations
+        ]
+        for k, pose in zip([k for k, o in enumerate(observations) if o.view is not None], poses, strict=True):
+            everywhere[k] = pose
+        stand_in = [o.view if o.view is not None else views[0] for o in observations]
+        plane = plane_from_board(camera, everywhere, stand_in, [o.profile for o in observations])
+        paper = paper_plane_of(camera, everywhere, observations, plane.rows)
+        if paper is not None:
+            plane = replace(plane, plane=paper.plane, rms=paper.rms)
+        rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
+        plane = replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
+    return Staged(camera, view_rms, poses, hand_eye, plane, paper)
+
+
+def paper_plane_of(
+    camera: CameraModel,
+    camera_from_board: Sequence[pin.SE3],
+    observations: Sequence[ScanObservation],
+    rows: Sequence[NDArray[np.intp]],
+) -> PaperPlane | None:
+    """The paper's plane over the observations that show dots and stripe; None when it crosses too few rows."""
+    used = [
+        (pose, o.view, stripe_pixels(o.profile, r))
+        for o, pose, r in zip(observations, camera_from_board, rows, strict=True)
+        if o.view is not None and o.profile is not None and len(r)
+    ]
+    try:
+        return paper_plane(camera, [p for p, _, _ in used], [v for _, v, _ in used], [s for _, _, s in used])
+    except RefusedError:
+        return None
+
+
+def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
+    """Measurements of one observation, the stripe as about `STRIPE_POINTS` means of neighbouring rows."""
+    view, profile = observation.view, observation.profile
+    stripe, sigma = np.zeros((0, 2)), np.zeros(0)
+    if profile is not None and len(rows):
+        stripe, sigma = stripe_means(profile, rows, STRIPE_POINTS)
+    return ViewData(
+        points=np.zeros((0, 3)) if view is None else view.object_points,
+        pixels=np.zeros((0, 2)) if view is None else view.pixels,
+        sigma=np.zeros(0) if view is None else view.sigma,
+        dot_radius=0.0 if view is None else view.dot_radius,
+        stripe=stripe,
+        stripe_sigma=sigma,
+        base_from_flange=observation.base_from_flange,
+        rail=observation.rail_position,
+        stripe_axis=1 if profile is not None and profile.axis == "columns" else 0,
+        same_rest=observation.same_rest,
+    )
+
+
+def start_state(staged: Staged) -> State:
+    """The joint adjustment's start."""
+    return State(
+        staged.camera,
+        None if staged.plane is None else staged.plane.plane,
+        staged.hand_eye.rail_direction,
+        staged.hand_eye.flange_from_camera,
+        staged.hand_eye.base_from_board,
+    )
+
+
+def solve_joint(
+    observations: Sequence[ScanObservation],
+    staged: Staged,
+    priors: Priors,
+    tangential: bool = True,
+    held_out: bool = True,
+) -> Joint:
+    """Adjust everything together, and predict the views of every fourth rest from the others in turn."""
+    if staged.plane is None:
+        rows = [np.empty(0, dtype=np.intp)] * len(observations)
+    else:
+        rows = staged.plane.rows
+    views = [view_data(o, r) for o, r in zip(observations, rows, strict=True)]
+    rail = float(np.ptp([o.rail_position for o in observations])) > 1e-3
+    free = shared_mask(plane=staged.plane is not None, rail=rail, tangential=tangential)
+    adjusted = Adjustment(views, free, priors).solve(start_state(staged))
+    px, stripe = float("nan"), float("nan")
+    if held_out and len(views) > FOLDS:
+        px, stripe = _held_out(views, free, adjusted)
+    return Joint(staged, adjusted, views, px, stripe)
+
+
+def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:
+    """RMS in px and m of the views of the rests that each fold leaves out, at the flange poses that the arm reports."""
+    dots, stripe = [np.zeros(0)], [np.zeros(0)]
+    folds = rests_of(views) % FOLDS
+    for fold in range(FOLDS):
+        kept = [v for v, of in zip(views, folds, strict=True) if of != fold]
+        result = Adjustment(kept, free, adjusted.priors).solve(adjusted.state, variance_rounds=0)
+        for view in (v for v, of in zip(views, folds, strict=True) if of == fold):
+            off, away = residuals_as_reported(result.state, view)
+            dots.append(off.ravel())
+            stripe.append(away)
+    return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
+
+
+def residuals_as_reported(state: State, view: ViewData) -> tuple[Array, Array]:
+    """Residuals of the dots (n, 2) in px and of the stripe (m,) in m at the flange pose that the arm reports."""
+    off, away = np.zeros((0, 2)), np.zeros(0)
+    if len(view.points):
+        off = dots_block(state, view, view.base_from_flange, view.rail)[0]
+    if len(view.stripe) and state.plane is not None:
+        away = stripe_block(state, view, view.base_from_flange, view.rail)[0]
+    return off, away
+
+
+def effective_hand_eye_covariance(joint: Joint) -> Array:
+    """6×6 covariance of flange_from_camera as it counts for a board's pose in the flange.
+
+    The camera's parameters and the hand-eye are known together much better than apart (a shift of the principal point
+    looks like a turn of the camera): what remains, when a board is seen through both, is given here as if it were the
+    hand-eye's alone, as the mean over the calibration's views.
+    """
+    state, covariance = joint.adjusted.state, joint.adjusted.covariance
+    both = np.r_[np.arange(CAMERA.start, CAMERA.stop), np.arange(HAND.start, HAND.stop)]
+    known = covariance[np.ix_(both, both)]
+    parts = []
+    for view, flange, rail in zip(joint.views, state.flanges, state.rails, strict=True):
+        if len(view.points) < 6:
+            continue
+        jacobian = dots_block(state, view, flange, float(rail))[1].reshape(-1, COLUMNS)
+        # A move of the hand-eye moves all pixels as a move of the board in the camera would: the picture's six
+        # degrees of freedom, in the hand-eye's own terms.
+        by_hand, by_camera = jacobian[:, HAND], jacobian[:, CAMERA]
+        absorbed = np.linalg.lstsq(by_hand, by_camera, rcond=None)[0]
+        to_hand = np.hstack([absorbed, np.eye(6)])
+        parts.append(to_hand @ known @ to_hand.T)
+    if not parts:
+        return np.asarray(covariance[HAND, HAND], dtype=np.float64)
+    mean = np.mean(parts, axis=0)
+    return np.asarray(0.5 * (mean + mean.T), dtype=np.float64)
+
+
+def without(staged: Staged, index: int) -> Staged:
+    """The staged start without the rows of one observation."""
+    if staged.plane is None:
+        return staged
+    rows = [r for k, r in enumerate(staged.plane.rows) if k != index]
+    return replace(staged, plane=replace(staged.plane, rows=rows))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

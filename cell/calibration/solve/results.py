@@ -1,0 +1,244 @@
+"""What a calibration gives: the scan head's and the target camera's, with their covariance and residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.observations import ScanObservation, TargetObservation
+from cell.calibration.solve.adjustment import Priors
+from cell.calibration.solve.blocks import HAND, SHARED, State
+from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped
+from cell.calibration.solve.joint import (
+    Joint,
+    Staged,
+    effective_hand_eye_covariance,
+    solve_joint,
+    solve_staged,
+)
+from cell.calibration.solve.reference import Reference
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.covariance import covariance_root
+from cell.geometry.light_plane import LightPlane
+from cell.geometry.poses import from_matrix, from_parts
+from cell.reconstruction.build import ScanGeometry
+from cell.vision.board.board import board_pose
+
+PARAMETERS = (
+    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
+    "rail x", "rail y", "rail z", "hand-eye x", "hand-eye y", "hand-eye z", "hand-eye rx", "hand-eye ry", "hand-eye rz",
+)  # fmt: skip
+"""Names of the parameters that a calibration keeps the covariance of, in its order; px, 1, m and rad."""
+
+KEPT = HAND.stop
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well the observations fit. Held-out figures predict every fourth view from the others, at the flange poses as
+    reported; `stripe` in m is the distance of the triangulated stripe from the board's plane, None without a laser."""
+
+    views: int
+    chi2_per_dof: float
+    dots_rms_px: float
+    stripe_rms: float | None
+    held_out_px: float
+    held_out_stripe: float | None
+
+    @classmethod
+    def of(cls, joint: Joint) -> Quality:
+        """The figures of a joint adjustment."""
+        a = joint.adjusted
+        lit = a.state.plane is not None
+        stripe, held_out = (a.stripe_rms_m, joint.held_out_stripe_m) if lit else (None, None)
+        return cls(len(joint.views), a.chi2_per_dof, a.dots_rms_px, stripe, joint.held_out_px, held_out)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCalibration:
+    """The scan head: camera, light plane in the camera's frame, rail and hand-eye.
+
+    `rail_direction` (3,): metres that the camera moves, in its own axes, per metre of rail reading (direction times
+    scale). `flange_from_camera` holds at rail position 0. `covariance` (21, 21) in the order of `PARAMETERS`; the light
+    plane's tilts are about the tangents of `cell.calibration.solve.blocks.tangents`, the hand-eye's are (translation,
+    rotation) in flange axes. `reference` is what a verification compares with; files of older programs have none.
+    """
+
+    camera: CameraModel
+    light_plane: LightPlane
+    rail_direction: Array
+    flange_from_camera: pin.SE3
+    covariance: Array
+    quality: Quality
+    reference: Reference | None = None
+
+    @classmethod
+    def of(cls, joint: Joint) -> ScanCalibration:
+        """What a joint adjustment with a stripe found."""
+        state, reference = joint.adjusted.state, Reference.of(joint.adjusted)
+        assert state.plane is not None
+        return cls(
+            state.camera,
+            state.plane,
+            state.rail_direction,
+            state.flange_from_camera,
+            reference.covariance[:KEPT, :KEPT],
+            Quality.of(joint),
+            reference,
+        )
+
+    def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
+        """The camera's pose in the flange frame at a rail position in m."""
+        return self.flange_from_camera * from_parts(rail_position * self.rail_direction)
+
+    def geometry(self) -> ScanGeometry:
+        """What triangulation needs."""
+        return ScanGeometry(self.camera, self.light_plane, self.rail_direction, self.flange_from_camera)
+
+    def variants(self) -> list[ScanGeometry]:
+        """The geometry moved by one standard deviation along each independent direction of the covariance."""
+        state = State(
+            self.camera,
+            self.light_plane,
+            self.rail_direction,
+            self.flange_from_camera,
+            pin.SE3.Identity(),
+            [],
+            np.zeros(0),
+        )
+        made = []
+        for column in covariance_root(self.covariance).T:
+            moved = state.moved(np.concatenate([column, np.zeros(SHARED - KEPT)]))
+            assert moved.plane is not None
+            made.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
+        return made
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return {
+            "camera": _camera_dict(self.camera),
+            "light_plane": {"normal": list(self.light_plane.normal), "distance": self.light_plane.distance},
+            "rail_direction": self.rail_direction.tolist(),
+            "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
+            "covariance": self.covariance.tolist(),
+            "quality": vars(self.quality),
+            "reference": None if self.reference is None else self.reference.as_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> ScanCalibration:
+        """From storage; KeyError, TypeError or ValueError when it is not one."""
+        return cls(
+            _camera(data["camera"]),
+            LightPlane.of(data["light_plane"]["normal"], float(data["light_plane"]["distance"])),
+            np.array(data["rail_direction"], dtype=np.float64),
+            from_matrix(data["flange_from_camera"]),
+            np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
+            Quality(**data["quality"]),
+            Reference.read(data.get("reference")),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TargetCalibration:
+    """The target camera and its hand-eye; `hand_eye_covariance` (6, 6) in flange axes counts for a board seen by it."""
+
+    camera: CameraModel
+    flange_from_camera: pin.SE3
+    hand_eye_covariance: Array
+    quality: Quality
+    reference: Reference | None = None
+
+    @classmethod
+    def of(cls, joint: Joint) -> TargetCalibration:
+        """What a joint adjustment found."""
+        state = joint.adjusted.state
+        return cls(
+            state.camera,
+            state.flange_from_camera,
+            effective_hand_eye_covariance(joint),
+            Quality.of(joint),
+            Reference.of(joint.adjusted),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return {
+            "camera": _camera_dict(self.camera),
+            "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
+            "hand_eye_covariance": self.hand_eye_covariance.tolist(),
+            "quality": vars(self.quality),
+            "reference": None if self.reference is None else self.reference.as_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> TargetCalibration:
+        """From storage; KeyError, TypeError or ValueError when it is not one."""
+        return cls(
+            _camera(data["camera"]),
+            from_matrix(data["flange_from_camera"]),
+            np.array(data["hand_eye_covariance"], dtype=np.float64).reshape(6, 6),
+            Quality(**data["quality"]),
+            Reference.read(data.get("reference")),
+        )
+
+
+def calibrate_scan(
+    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
+) -> ScanCalibration:
+    """Closed form and joint adjustment; raises `RefusedError` when the observations do not determine it."""
+    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors))
+
+
+def adjust_scan(
+    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
+) -> Joint:
+    """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
+    return _solve(observations, solve_staged(observations, nominal, rail_direction), priors, "scan", "fine")
+
+
+def calibrate_target(
+    observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors
+) -> TargetCalibration:
+    """The same for a camera without laser and rail."""
+    return TargetCalibration.of(adjust_target(observations, nominal, priors))
+
+
+def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
+    """The joint adjustment of a camera without laser and rail."""
+    same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
+    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large")
+
+
+def _solve(observations: Sequence[ScanObservation], staged: Staged, priors: Priors, camera: str, board: str) -> Joint:
+    """The joint adjustment, after and before the checks for faults that have a name."""
+    rests = [o for o in observations if not o.same_rest]
+    names = [o.name for o in rests]
+    if all(o.view is not None for o in rests):
+        refuse_exchanged(names, [o.base_from_flange for o in rests], staged.camera_from_board)
+    joint = solve_joint(observations, staged, priors)
+    refuse_bent(board, joint.adjusted, joint.views)
+    seen = [o.view for o in rests if o.view is not None]
+    if len(seen) == len(rests):
+        poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
+        alone = [view for view in joint.views if not view.same_rest]
+        refuse_slipped(camera, names, joint.adjusted, alone, poses)
+    return joint
+
+
+def sigmas(covariance: Array) -> dict[str, float]:
+    """Standard deviations of the scan head's parameters by name."""
+    return dict(zip(PARAMETERS, np.sqrt(np.maximum(0.0, np.diag(covariance))).tolist(), strict=True))
+
+
+def _camera_dict(camera: CameraModel) -> dict[str, Any]:
+    return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
+
+
+def _camera(data: dict[str, Any]) -> CameraModel:
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    return model.with_parameters(data["parameters"])

@@ -1,0 +1,268 @@
+"""The cell's calibration as a whole: solved, tied to its devices and configuration, stored and found again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.calibration import (
+    Priors,
+    ScanCalibration,
+    ScanObservation,
+    TargetCalibration,
+    TargetObservation,
+)
+from cell.calibration.archive import SUFFIX, Observations, write_archive
+from cell.calibration.solve.faults import refuse_wrong_lead
+from cell.calibration.solve.joint import Joint
+from cell.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
+from cell.config import CameraConfig, CellConfig
+from cell.geometry.camera import CameraModel
+from cell.report.html import table
+from cell.run.folder import write_json
+from drivers.errors import CalibrationStale
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class CellCalibration:
+    """Scan head and target camera, with the serial numbers and the configuration that they belong to.
+
+    `made` is in seconds since the epoch; `identities` are serial numbers by device name.
+    """
+
+    scan: ScanCalibration
+    target: TargetCalibration
+    identities: dict[str, str]
+    configuration: str
+    made: float
+
+    @classmethod
+    def solve(
+        cls,
+        scan: list[ScanObservation],
+        target: list[TargetObservation],
+        identities: dict[str, str],
+        config: CellConfig,
+    ) -> CellCalibration:
+        """From the observations; raises `RefusedError` when they do not determine it."""
+        return solve_observations(gathered(scan, target, identities, config)).calibration
+
+    def __str__(self) -> str:
+        return f"calibration of {self.date}, hash {self.hash()}"
+
+    def __repr__(self) -> str:
+        return f"<CellCalibration of {self.date}, hash {self.hash()}>"
+
+    def _repr_html_(self) -> str:
+        rows = [(device, serial) for device, serial in sorted(self.identities.items())]
+        for name, quality in (("scan head", self.scan.quality), ("target camera", self.target.quality)):
+            fit = f"χ²/dof {quality.chi2_per_dof:.3f}, {quality.views} views, dots {quality.dots_rms_px:.4f} px RMS"
+            rows.append((name, fit))
+        return table(f"calibration of {self.date}", [*rows, ("hash", self.hash())])
+
+    @property
+    def date(self) -> str:
+        """When it was made, for people."""
+        return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made))
+
+    @property
+    def name(self) -> str:
+        """What its file is called: the serial numbers that it belongs to."""
+        return "-".join(self.identities[device] for device in sorted(self.identities))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return {
+            "format": FORMAT,
+            "made": self.made,
+            "date": self.date,
+            "identities": self.identities,
+            "configuration": self.configuration,
+            "scan": self.scan.as_dict(),
+            "target": self.target.as_dict(),
+        }
+
+    def hash(self) -> str:
+        """Hash of its content, for reports."""
+        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
+
+    def summary(self) -> dict[str, Any]:
+        """Values, standard deviations and residuals by name, units in the names."""
+        scan, target = self.scan, self.target
+        sigma = sigmas(scan.covariance)
+        return {
+            "date": self.date,
+            "identities": self.identities,
+            "scan_camera": {
+                **_lens(scan.camera),
+                **{f"sigma_{name}": round(sigma[name], 5) for name in ("fx", "fy", "cx", "cy", "k1")},
+            },
+            "light_plane": {
+                "normal": [round(v, 7) for v in scan.light_plane.normal],
+                "distance_mm": round(1e3 * scan.light_plane.distance, 4),
+                "sigma_distance_mm": round(1e3 * sigma["plane distance"], 5),
+            },
+            "rail": {
+                "direction": [round(float(v), 6) for v in scan.rail_direction / np.linalg.norm(scan.rail_direction)],
+                "scale": round(float(np.linalg.norm(scan.rail_direction)), 6),
+                "sigma_scale": round(sigma["rail x"], 6),
+            },
+            "hand_eye": {
+                "translation_mm": [round(1e3 * float(v), 4) for v in scan.flange_from_camera.translation],
+                "sigma_mm": [round(1e3 * sigma[f"hand-eye {axis}"], 4) for axis in "xyz"],
+                "sigma_mrad": [round(1e3 * sigma[f"hand-eye r{axis}"], 4) for axis in "xyz"],
+            },
+            "scan_quality": _quality(scan.quality),
+            "target_camera": _lens(target.camera),
+            "target_hand_eye": {
+                "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation],
+            },
+            "target_quality": _quality(target.quality),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A calibration and the two adjustments that it came from, with their residuals."""
+
+    calibration: CellCalibration
+    scan: Joint
+    target: Joint
+
+
+def gathered(
+    scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str], config: CellConfig
+) -> Observations:
+    """The observations with all else that their solution depends on, as of now."""
+    priors = Priors(
+        arm_translation=config.arm.repeatability,
+        arm_rotation=config.arm.repeatability_angle,
+        rail=config.calibration.rail_sigma,
+    )
+    cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
+    return Observations(
+        scan, target, *cameras, priors, config.rail.lead, identities, config.calibration_hash(), time.time()
+    )
+
+
+def solve_observations(observations: Observations) -> Solved:
+    """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
+    o = observations
+    scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
+    head = ScanCalibration.of(scan)
+    refuse_wrong_lead(head.rail_direction, o.rail_lead)
+    target = adjust_target(o.target, o.target_camera, o.priors)
+    made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made)
+    return Solved(made, scan, target)
+
+
+def nominal_camera(config: CameraConfig) -> CameraModel:
+    """The camera as the configuration draws it: no distortion, principal point in the middle."""
+    focal = config.focal_length / config.pixel
+    return CameraModel(
+        config.width, config.height, focal, focal, (config.width - 1) / 2, (config.height - 1) / 2, (0.0,) * 5
+    )
+
+
+def save_calibration(calibration: CellCalibration, path: Path) -> None:
+    """Write it; a reader finds the old file or the new one, never half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, calibration.as_dict())
+
+
+def archive_of(folder: Path, calibration: CellCalibration) -> Path:
+    """Where the observations of a stored calibration are kept."""
+    return folder / f"{calibration.name}{SUFFIX}"
+
+
+def save_with_observations(calibration: CellCalibration, observations: Observations, folder: Path) -> None:
+    """Write the calibration and, beside it, what it can be solved from again."""
+    write_archive(archive_of(folder, calibration), observations)
+    save_calibration(calibration, folder / f"{calibration.name}.json")
+
+
+def read_calibration(path: Path) -> CellCalibration:
+    """Read a stored calibration; raises `CalibrationStale` when the file is none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
+        return CellCalibration(
+            ScanCalibration.from_dict(data["scan"]),
+            TargetCalibration.from_dict(data["target"]),
+            {str(name): str(serial) for name, serial in data["identities"].items()},
+            str(data["configuration"]),
+            float(data["made"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
+
+
+CLOCK_SLACK_S = 3600.0
+"""How far a calibration's date may lie in the future: clocks of two machines differ."""
+
+
+def find_calibration(folder: Path, identities: dict[str, str], configuration: str, max_age: float) -> CellCalibration:
+    """The stored calibration of these devices under this configuration, not older than `max_age` s.
+
+    Raises `CalibrationStale` that says what is missing or what differs.
+    """
+    found, unreadable = [], []
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        try:
+            found.append(read_calibration(path))
+        except CalibrationStale:
+            unreadable.append(path.name)
+    own = [entry for entry in found if entry.identities == identities]
+    if not own:
+        devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
+        raise CalibrationStale(
+            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
+            + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + "; run `cell calibrate`"
+        )
+    current = [entry for entry in own if entry.configuration == configuration]
+    if not current:
+        raise CalibrationStale(
+            f"the calibration of {own[-1].date} was made under another configuration ({own[-1].configuration}, now "
+            f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
+        )
+    newest = max(current, key=lambda entry: entry.made)
+    age = time.time() - newest.made
+    if age > max_age:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} is {age / 86400:.1f} days old, allowed are {max_age / 86400:.1f}; run "
+            "`cell calibrate`"
+        )
+    if age < -CLOCK_SLACK_S:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} lies {-age / 3600:.1f} hours in the future, so its age is not known; "
+            "set this machine's clock, or run `cell calibrate`"
+        )
+    return newest
+
+
+def _lens(camera: CameraModel) -> dict[str, float]:
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    return {name: round(float(value), 6) for name, value in zip(names, camera.parameters[:8], strict=True)}
+
+
+def _quality(quality: Quality) -> dict[str, float]:
+    figures = {
+        "views": quality.views,
+        "chi2_per_dof": round(quality.chi2_per_dof, 3),
+        "dots_rms_px": round(quality.dots_rms_px, 5),
+        "held_out_dots_rms_px": round(quality.held_out_px, 4),
+    }
+    if quality.stripe_rms is not None and quality.held_out_stripe is not None:
+        figures["stripe_rms_mm"] = round(1e3 * quality.stripe_rms, 5)
+        figures["held_out_stripe_rms_mm"] = round(1e3 * quality.held_out_stripe, 5)
+    return figures

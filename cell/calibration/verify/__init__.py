@@ -1,0 +1,1 @@
+"""How good a stored calibration is today."""

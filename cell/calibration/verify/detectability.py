@@ -1,0 +1,149 @@
+"""How small a change a verification can find today: what its "good" is worth.
+
+Noise, the arm's scatter and the calibration's own covariance hide small changes. For each part and kind of change the
+smallest size is reckoned that would have exceeded the threshold in `DETECTED` of all checks like this one, whatever its
+direction: the scores drawn for a good calibration are shifted by what the change adds to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, State, tangents
+from cell.calibration.verify.evidence import Evidence
+from cell.calibration.verify.hypotheses import (
+    SCAN_DEPTH,
+    SHIFT,
+    TARGET_DEPTH,
+    TURN,
+    Hypothesis,
+    hypotheses,
+    log_mean,
+    quadratic,
+)
+from cell.geometry.camera import Array
+
+DETECTED = 0.95
+DRAWS = 2_000
+DOUBLINGS, HALVINGS = 40, 10
+LEAD_WAY = 0.1
+"""The way, in m, over which an error of the rail's lead is stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A kind of change of one part: the columns (27, k) of `directions` change it by 1 m or 1 rad each.
+
+    `wanted` is the size in `unit`, "m" or "rad", that has to be found. `where` says of a size in m what it is the
+    effect of: a focal length's shift of the depth at some distance, a lead's after some way.
+    """
+
+    chain: str
+    part: str
+    kind: str
+    wanted: float
+    unit: str
+    directions: Array
+    where: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Detectable:
+    """The smallest `size` (m or rad, as its kind of change; infinite where nothing shows) that is found in `DETECTED`.
+
+    `step` (27,) is this change in its least visible direction, zero for an infinite size.
+    """
+
+    change: Change
+    size: float
+    step: Array
+
+    @property
+    def enough(self) -> bool:
+        """Whether a change of the size that has to be found shows."""
+        return self.size <= self.change.wanted
+
+
+def changes(chain: str, state: State) -> list[Change]:
+    """Every kind of change of the "scan" or the "target" chain, for its calibrated state."""
+    unit = np.eye(SHARED)
+    mount, lens, *others = dict.fromkeys(h.part for h in hypotheses(chain, state.camera.fx))
+    depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
+    focal = unit[:, CAMERA][:, :4] * state.camera.fx
+    made = [
+        Change(chain, mount, "shift", SHIFT, "m", unit[:, HAND][:, :3]),
+        Change(chain, mount, "turn", TURN, "rad", unit[:, HAND][:, 3:]),
+        Change(chain, lens, "principal point", TURN, "rad", focal[:, 2:]),
+        Change(
+            chain, lens, "focal length", SHIFT, "m", (focal[:, :1] + focal[:, 1:2]) / depth, f" at {1e3 * depth:.0f} mm"
+        ),
+    ]
+    if others:
+        plane, rail = others
+        length = float(np.linalg.norm(state.rail_direction))
+        along = state.rail_direction / length
+        across = np.column_stack(tangents(along))
+        lead = unit[:, RAIL] @ along[:, None] / LEAD_WAY
+        made += [
+            Change(chain, plane, "turn", TURN, "rad", unit[:, PLANE][:, :2]),
+            Change(chain, plane, "shift", SHIFT, "m", unit[:, PLANE][:, 2:]),
+            Change(chain, rail, "turn", TURN, "rad", unit[:, RAIL] @ across * length),
+            Change(chain, rail, "lead", SHIFT, "m", lead, f" in {1e3 * LEAD_WAY:.0f} mm"),
+        ]
+    return made
+
+
+def detectable(
+    evidences: Mapping[str, Evidence],
+    states: Mapping[str, State],
+    tests: Sequence[tuple[str, Hypothesis]],
+    scores: Mapping[str, Array],
+    factors: Array,
+    threshold: float,
+) -> list[Detectable]:
+    """For every kind of change of every chain.
+
+    `scores` (n, 27) by chain are drawn for a good calibration, `factors` (n, tests) their logarithms of the Bayes
+    factors of `tests`, a chain with a hypothesis each. A check is an alarm above `threshold`.
+    """
+    scores = {name: drawn[:DRAWS] for name, drawn in scores.items()}
+    factors = factors[:DRAWS]
+    made = []
+    for chain, weighed in evidences.items():
+        for change in changes(chain, states[chain]):
+            d = change.directions
+            least = d @ np.linalg.eigh(d.T @ weighed.information @ d)[1][:, 0]
+            linear, square = np.zeros_like(factors), np.zeros(len(tests))
+            added = weighed.information @ least
+            for k, (name, h) in enumerate(tests):
+                if name == chain:
+                    index = list(h.index)
+                    pulled = quadratic(weighed, h)[0] @ added[index]
+                    linear[:, k], square[k] = scores[chain][:, index] @ pulled, 0.5 * added[index] @ pulled
+            size = _smallest(factors, linear, square, threshold, change.wanted)
+            made.append(Detectable(change, size, size * least if np.isfinite(size) else np.zeros(SHARED)))
+    return made
+
+
+def _smallest(factors: Array, linear: Array, square: Array, threshold: float, start: float) -> float:
+    """The size x at which factors + x linear + x² square (n, k) exceed the threshold in `DETECTED` of the n draws."""
+
+    def found(size: float) -> bool:
+        exceeding = log_mean(factors + size * linear + size**2 * square) > threshold
+        return float(np.mean(exceeding)) >= DETECTED
+
+    high = start / 16
+    for _ in range(DOUBLINGS):
+        if found(high):
+            break
+        high *= 2
+    else:
+        return float("inf")
+    low = high / 2
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if found(middle) else (middle, high)
+    return high

@@ -1,0 +1,142 @@
+"""What new observations say about a stored calibration: the score and information of every parameter.
+
+The observations are predicted from the calibration. What the arm's repeatability, the rail's reading, the noise and the
+calibration's own covariance explain of the misfit is taken out; what is left speaks for a change since.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.observations import ScanObservation
+from cell.calibration.solve.blocks import (
+    BOARD,
+    CAMERA,
+    COLUMNS,
+    FLANGE,
+    POSITION,
+    SHARED,
+    State,
+    ViewData,
+    dots_block,
+    stripe_block,
+)
+from cell.calibration.solve.reference import Reference
+from cell.geometry.camera import Array
+
+# The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.
+LEAST_DOTS_PX = 0.02
+# 8 ms at 12 mm/s: generous, so that a busy computer does not look like a moved laser.
+SWEEP_RAIL_M = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One picture's measurements; `rest` numbers the approach of the arm, `stop` that of the rail, each from 0.
+
+    A `sweeping` rail is one stop: where it was then is as sure as the camera's clock is read, `SWEEP_RAIL_M`.
+    """
+
+    data: ViewData
+    rest: int
+    stop: int = 0
+    sweeping: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Score (27,) and information (27, 27) of a change of the shared parameters, in the order of the blocks.
+
+    With the calibration as it was, the score has mean 0 and the information as its covariance. The parameters (k,) of
+    a change along the columns of a matrix D (27, k) are estimated by (DᵀFD)⁻¹Dᵀs with covariance (DᵀFD)⁻¹.
+    `dots` and `stripe` are the RMS of whitened residuals that no move of the camera and no plane explains, 1 for the
+    noise that the calibration found; NaN where nothing of the kind was seen.
+    """
+
+    score: Array
+    information: Array
+    dots: float
+    stripe: float
+
+    def change(self, directions: Array) -> tuple[Array, Array]:
+        """Estimate (k,) and covariance (k, k) of a change along the columns (27, k); any other is excluded."""
+        inverse = np.linalg.inv(directions.T @ self.information @ directions)
+        return np.asarray(inverse @ directions.T @ self.score), np.asarray(0.5 * (inverse + inverse.T))
+
+
+def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evidence:
+    """Weigh observations against a calibration whose `state` holds the calibrated values and the board.
+
+    With residual r, derivative J of all parameters q and their prior covariance Σ the misfit's covariance is
+    S = R + JΣJᵀ; JᵀS⁻¹r = (I + HΣ)⁻¹g and JᵀS⁻¹J = (I + HΣ)⁻¹H for H = JᵀR⁻¹J, g = JᵀR⁻¹r (matrix inversion lemma).
+    """
+    rests = 1 + max(look.rest for look in looks)
+    stops = 1 + max(look.stop for look in looks)
+    size = SHARED + 6 * rests + stops
+    prior = np.zeros((size, size))
+    prior[:SHARED, :SHARED] = reference.covariance
+    arm = np.repeat([reference.arm_translation**2, reference.arm_rotation**2], 3)
+    rails = np.full(stops, reference.rail**2)
+    rails[[look.stop for look in looks if look.sweeping]] += SWEEP_RAIL_M**2
+    own = np.concatenate([np.tile(arm, rests), rails])
+    prior[np.arange(SHARED, size), np.arange(SHARED, size)] = own
+    kinds: dict[str, list[tuple[Array, Array]]] = {"dots": [], "stripe": []}
+    for look in looks:
+        index = np.concatenate([
+            np.arange(SHARED), SHARED + 6 * look.rest + np.arange(6), [SHARED + 6 * rests + look.stop]
+        ])  # fmt: skip
+        view = look.data
+        if len(view.points):
+            residual, jacobian = dots_block(state, view, view.base_from_flange, view.rail)
+            sigma = np.repeat(np.maximum(reference.dots_scale * view.sigma, LEAST_DOTS_PX), 2)
+            kinds["dots"].append(_white(residual.ravel(), jacobian.reshape(-1, COLUMNS), sigma, index, size))
+        if len(view.stripe) and state.plane is not None:
+            residual, jacobian, sigma = stripe_block(state, view, view.base_from_flange, view.rail)
+            kinds["stripe"].append(_white(residual, jacobian, reference.stripe_scale * sigma, index, size))
+    rows = [pair for pairs in kinds.values() for pair in pairs]
+    normal = np.sum([j.T @ j for _, j in rows], axis=0)
+    right = np.sum([j.T @ r for r, j in rows], axis=0)
+    mixed = np.eye(size) + normal @ prior
+    score, information = np.linalg.solve(mixed, right), np.linalg.solve(mixed, normal)
+    shared = information[:SHARED, :SHARED]
+    # Dots may be anywhere that a camera's move or lens puts them, the stripe on any plane.
+    dots = _misfit(kinds["dots"], np.r_[CAMERA, SHARED:size])
+    return Evidence(score[:SHARED], 0.5 * (shared + shared.T), dots, _misfit(kinds["stripe"], np.r_[BOARD]))
+
+
+def dots_of(photo: ScanObservation) -> ViewData:
+    """The dots of an observation, without its stripe."""
+    assert photo.view is not None
+    return ViewData(
+        points=photo.view.object_points,
+        pixels=photo.view.pixels,
+        sigma=photo.view.sigma,
+        dot_radius=photo.view.dot_radius,
+        stripe=np.zeros((0, 2)),
+        stripe_sigma=np.zeros(0),
+        base_from_flange=photo.base_from_flange,
+        rail=photo.rail_position,
+    )
+
+
+def _misfit(rows: list[tuple[Array, Array]], columns: NDArray[np.intp]) -> float:
+    """RMS of what is left of whitened residuals after the best fit of some parameters; NaN without rows."""
+    if not rows:
+        return float("nan")
+    residual, jacobian = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    chosen = jacobian[:, columns]
+    chosen = chosen / np.maximum(np.linalg.norm(chosen, axis=0), 1e-30)
+    left = residual - chosen @ np.linalg.lstsq(chosen, residual, rcond=1e-9)[0]
+    return float(np.sqrt(np.mean(left**2)))
+
+
+def _white(residual: Array, jacobian: Array, sigma: Array, index: NDArray[np.intp], size: int) -> tuple[Array, Array]:
+    wide = np.zeros((len(residual), size))
+    wide[:, index[:SHARED]] = jacobian[:, :SHARED]
+    wide[:, index[SHARED:-1]] = jacobian[:, FLANGE]
+    wide[:, index[-1:]] = jacobian[:, POSITION]
+    return residual / sigma, wide / sigma[:, None]

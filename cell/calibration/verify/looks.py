@@ -1,0 +1,126 @@
+"""From a verification's observations to its verdict: the scan camera's photographs and sweep, the target's views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.collect.stripe_on_board import points_on_board
+from cell.calibration.observations import ScanObservation, TargetObservation
+from cell.calibration.solve.blocks import State, ViewData
+from cell.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.calibration.solve.starts import stripe_means
+from cell.calibration.verify.decision import Verdict, verdict
+from cell.calibration.verify.evidence import Look, dots_of, evidence
+from cell.geometry.poses import from_parts
+from cell.vision.board.board import board_pose
+from drivers.errors import CalibrationStale, RefusedError
+
+SWEEP_PROFILES, STRIPE_POINTS = 24, 40
+"""Enough of a sweep, as means of neighbouring rows: neighbouring profiles share the rail's error."""
+LEAST_PROFILES = 10
+LEAST_SWEEP_M = 0.01
+"""Of rail between the first and the last profile on the board.
+
+All stripes in one place fit any board that is turned about them: what is left of their scatter is nothing at all, and
+the light plane's evidence is made of rounding errors.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class CheckObservations:
+    """What a verification sees. Everything of one approach is taken with the arm at rest.
+
+    `photographs` holds, for each approach of the arm, the photographs of the fine board at the ends of the rail's way
+    (no stripe); `sweep` the profiles of the sweep over it in the last approach (no views); `target` one view of the
+    large board for each approach.
+    """
+
+    photographs: list[list[ScanObservation]]
+    sweep: list[ScanObservation]
+    target: list[TargetObservation]
+
+
+def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservations) -> Verdict:
+    """Compare with what the calibration predicts.
+
+    Raises `CalibrationStale` for a calibration that was stored without its reference, `RefusedError` when the sweep
+    does not show the board.
+    """
+    if scan.reference is None or target.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference to verify against, it was made by an older program; run "
+            "`cell calibrate` once"
+        )
+    states = {
+        "scan": State(
+            scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
+        ),
+        "target": State(
+            target.camera, None, np.zeros(3), target.flange_from_camera, target.reference.base_from_board
+        ),
+    }  # fmt: skip
+    evidences = {
+        "scan": evidence(states["scan"], scan.reference, scan_looks(states["scan"], seen)),
+        "target": evidence(states["target"], target.reference, target_looks(seen.target)),
+    }
+    return verdict(evidences, states)
+
+
+def scan_looks(state: State, seen: CheckObservations) -> list[Look]:
+    """Dots of every photograph, and the sweep's stripe where it lies cleanly on the board."""
+    looks: list[Look] = []
+    for rest, photographs in enumerate(seen.photographs):
+        looks += [Look(dots_of(photo), rest, len(looks) + k) for k, photo in enumerate(photographs)]
+    rest, stop = len(seen.photographs) - 1, len(looks)
+    near = seen.photographs[-1][0]
+    assert near.view is not None
+    pose = board_pose(near.view, state.camera).camera_from_board
+    few = seen.sweep[:: max(1, len(seen.sweep) // SWEEP_PROFILES)]
+    lit = [look for profile in few if (look := _stripe(state, profile, near, pose, rest, stop)) is not None]
+    if len(lit) < LEAST_PROFILES:
+        raise RefusedError(
+            f"{len(lit)} of {len(few)} profiles of the sweep cross the fine board, at least {LEAST_PROFILES} are "
+            "needed; is the laser on, and does it light the board?"
+        )
+    way = float(np.ptp([look.data.rail for look in lit]))
+    if way < LEAST_SWEEP_M:
+        raise RefusedError(
+            f"the stripe crosses the fine board over {1e3 * way:.1f} mm of the rail's way, at least "
+            f"{1e3 * LEAST_SWEEP_M:.0f} mm are needed: does the rail move, and does the board lie in the sweep?"
+        )
+    return looks + lit
+
+
+def target_looks(views: Sequence[TargetObservation]) -> list[Look]:
+    """Dots of every view; each has its own approach."""
+    same = [ScanObservation(o.view, None, o.base_from_flange) for o in views]
+    return [Look(dots_of(o), k) for k, o in enumerate(same)]
+
+
+def _stripe(
+    state: State, lit: ScanObservation, near: ScanObservation, pose: pin.SE3, rest: int, stop: int
+) -> Look | None:
+    """The stripe on the board, whose pose in the camera is known from a photograph `near`; None when it misses it."""
+    assert lit.profile is not None
+    assert near.view is not None
+    here = from_parts((near.rail_position - lit.rail_position) * state.rail_direction) * pose
+    rows = points_on_board(state.camera, here, near.view.spec, lit.profile, near.view.dot_radius)
+    if not len(rows):
+        return None
+    stripe, sigma = stripe_means(lit.profile, rows, STRIPE_POINTS)
+    data = ViewData(
+        points=np.zeros((0, 3)),
+        pixels=np.zeros((0, 2)),
+        sigma=np.zeros(0),
+        dot_radius=0.0,
+        stripe=stripe,
+        stripe_sigma=sigma,
+        base_from_flange=lit.base_from_flange,
+        rail=lit.rail_position,
+        stripe_axis=1 if lit.profile.axis == "columns" else 0,
+    )
+    return Look(data, rest, stop, sweeping=True)

@@ -1,0 +1,145 @@
+"""Verifying the calibration: one view of each deck board, approached several times, and one sweep over the fine board.
+
+The views are the calibration's own, aimed with what it found: near enough to its poses that the arm's kinematic error
+is the same. Approaching them anew averages the arm's repeatability. In each approach the scan camera photographs its
+board from both ends of the way that the rail can go with the board in view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration import ScanObservation, TargetObservation
+from cell.calibration.collect.boards import PHOTO_RATE, Check, Progress, move_to_view
+from cell.calibration.store import CellCalibration
+from cell.calibration.verify.looks import CheckObservations
+from cell.config import CellConfig
+from cell.devices.assembly import Devices
+from cell.geometry.poses import from_ur
+from cell.job import ScanSection
+from cell.reconstruction import ScanGeometry
+from cell.steps.camera_poses import ScanPlan, View, rail_ends, verification_views
+from cell.steps.moves import HOME, Mover
+from cell.steps.rail_sweep import rail_sweep
+from cell.steps.swath import Collector, SweepErrors, rehearse
+from cell.vision import BoardSpec, BoardView, StripeProfile, find_board, parse_board
+from drivers.errors import RefusedError
+from drivers.interfaces import Camera
+
+SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
+BACK_M = 0.02
+"""How far the flange leaves a view, each time another way, before it approaches it again."""
+SWEEP_SPEED, SWEEP_RATE = "12 mm/s", "10 Hz"
+MAX_SHIFT = 0.15e-3
+"""Farthest, in m, that the sweep may lie off because of its times: less than the changes that are looked for."""
+
+
+def collect_verification(
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check, progress: Progress
+) -> CheckObservations:
+    """Take all pictures. Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference."""
+    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
+    scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
+    assert calibration.scan.reference is not None
+    base_from_board = calibration.scan.reference.base_from_board
+    ends = rail_ends(calibration.scan, base_from_board, scan_view, fine, config.rail.travel)
+    if not devices.rail.state().homed_here:
+        progress(0.0, "homing the rail")
+        devices.rail.home().wait(60.0)
+    mover.to_joints(HOME)
+    photographs: list[list[ScanObservation]] = []
+    sweep: list[ScanObservation] = []
+    for k in range(SCAN_APPROACHES):
+        check()
+        progress(0.6 * k / SCAN_APPROACHES, f"fine board, approach {k + 1} of {SCAN_APPROACHES}")
+        if k:
+            move_to_view(devices, mover, _beside(scan_view, k), k)
+        if k == SCAN_APPROACHES - 1:
+            sweep = _sweep(
+                config,
+                devices,
+                mover,
+                calibration.scan.geometry(),
+                scan_view,
+                ends,
+                lambda f, t: progress(0.3 + 0.2 * f, t),
+            )
+        else:
+            move_to_view(devices, mover, scan_view, k)
+        photographs.append(_photographs(config, devices, fine, ends))
+    target: list[TargetObservation] = []
+    devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
+    for k in range(TARGET_APPROACHES):
+        check()
+        progress(0.6 + 0.4 * k / TARGET_APPROACHES, f"large board, approach {k + 1} of {TARGET_APPROACHES}")
+        if k:
+            move_to_view(devices, mover, _beside(target_view, k), k)
+        move_to_view(devices, mover, target_view, k)
+        seen = _found(devices.target_camera, large, "large")
+        target.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
+    return CheckObservations(photographs, sweep, target)
+
+
+def _photographs(
+    config: CellConfig, devices: Devices, board: BoardSpec, ends: tuple[float, float]
+) -> list[ScanObservation]:
+    devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
+    made = []
+    for end in ends:
+        devices.rail.move_to(end).wait(30.0)
+        seen = _found(devices.scan_camera, board, "fine")
+        flange = from_ur(devices.arm.state().flange)
+        made.append(ScanObservation(seen, None, flange, devices.rail.state().position))
+    return made
+
+
+def _sweep(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    geometry: ScanGeometry,
+    view: View,
+    ends: tuple[float, float],
+    progress: Callable[[float, str], None],
+) -> list[ScanObservation]:
+    """To the view and over the board's plate from end to end."""
+    section = ScanSection.model_validate(
+        {
+            "stand_off": "130 mm",
+            "length": f"{1e3 * (ends[1] - ends[0])} mm",
+            "speed": SWEEP_SPEED,
+            "frame_rate": SWEEP_RATE,
+            "exposure": f"{1e3 * config.calibration.stripe_exposure} ms",
+        }
+    )
+    profiles: list[StripeProfile] = []
+    plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
+    errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)
+    collector = Collector(geometry, section, lambda _: None, progress, profiles.append)
+    rehearse(geometry)
+    swath = rail_sweep(plan, mover, devices, errors, collector)
+    return [
+        ScanObservation(None, profiles[line], swath.base_from_flange, float(position))
+        for line, position in zip(swath.lines, swath.rail, strict=True)
+    ]
+
+
+def _found(camera: Camera, board: BoardSpec, name: str) -> BoardView:
+    try:
+        return find_board(camera.grab().image, board)
+    except RefusedError as error:
+        raise RefusedError(
+            f"the {name} board on the deck is not seen where the calibration has it: {error}; clean it, see that it "
+            "and the camera are in place, then run `cell calibrate`"
+        ) from error
+
+
+def _beside(view: View, turn: int) -> View:
+    """A pose near a view, up and to another side each time."""
+    side = 2.4 * turn
+    away = np.array([BACK_M * np.cos(side), BACK_M * np.sin(side), BACK_M])
+    moved = pin.SE3(view.base_from_flange.rotation, view.base_from_flange.translation + away)
+    return View(moved, view.rail_position)

@@ -1,0 +1,1 @@
+"""Whether a job fits a cell, told before anything moves."""

@@ -1,0 +1,120 @@
+"""Whether the arm reaches every pose of a job and of a calibration without touching anything, as drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration import ScanCalibration
+from cell.calibration.solve.results import PARAMETERS, Quality
+from cell.calibration.store import nominal_camera
+from cell.config import CellConfig
+from cell.geometry.light_plane import LightPlane
+from cell.geometry.poses import from_parts
+from cell.job import Job
+from cell.motion.bodies import arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.collision import CollisionError, CollisionModel, Pair
+from cell.motion.kinematics import ArmKinematics, Unreachable
+from cell.motion.planning import Planner
+from cell.steps.arm_sweep import RUN_UP_S
+from cell.steps.camera_poses import (
+    base_from_place_at_target,
+    centre_of,
+    look_pose,
+    photo_pose,
+    scan_calibration_views,
+    scan_plans,
+    target_calibration_views,
+)
+from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates
+from cell.steps.place import TOUCHES
+from cell.vision import parse_board
+from drivers.interfaces import Vector
+
+Goal = tuple[str, pin.SE3, tuple[Pair, ...]]
+"""What a pose is for, the pose base_from_flange, and which bodies may touch there."""
+
+
+def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:
+    """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m."""
+    kinematics = ArmKinematics()
+    deck = vehicle_bodies(deck_plates(config))
+    empty = Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(), *tool_bodies(), *deck]))
+    yield from _unreached(empty, _views(config))
+    part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3())
+    board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
+    x, y, z = extent[1].tolist()
+    station = station_bodies(
+        base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
+        (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
+    )  # fmt: skip
+    held = Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(), *part, *deck, *station]))
+    try:
+        held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")
+    except CollisionError as error:
+        yield str(error)
+        return
+    yield from _unreached(held, _goals(job, config))
+
+
+def nominal_scan(config: CellConfig) -> ScanCalibration:
+    """The scan head as drawn, for planning only: its covariance is zero, its quality empty."""
+    laser, size = config.laser, len(PARAMETERS)
+    return ScanCalibration(
+        nominal_camera(config.scan_camera),
+        LightPlane.from_baseline(laser.baseline, float(np.arctan(laser.tan_theta))),
+        np.array([1.0, 0.0, 0.0]),
+        config.scan_camera.flange_from_camera.se3(),
+        np.zeros((size, size)),
+        Quality(0, 0.0, 0.0, None, 0.0, None),
+    )
+
+
+def _views(config: CellConfig) -> Iterator[Goal]:
+    deck = config.calibration
+    for k, view in enumerate(scan_calibration_views(config, parse_board(deck.fine.board))):
+        yield f"calibration view {k + 1} of calibration.fine", view.base_from_flange, ()
+    for k, view in enumerate(target_calibration_views(config, parse_board(deck.large.board))):
+        yield f"calibration view {k + 1} of calibration.large", view.base_from_flange, ()
+
+
+def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
+    """The poses of a job in their order, with the vehicle at its target."""
+    board = parse_board(job.board.spec)
+    base_from_place = base_from_place_at_target(config, job)
+    camera = config.target_camera.flange_from_camera.se3()
+    yield "the looking pose (photo.look_down, photo.stand_off)", look_pose(config, job, board, camera), ()
+    photo = photo_pose(job, board, base_from_place * job.place_from_board, camera)
+    yield "the photograph's pose (board.place_from_board, photo.stand_off)", photo, ()
+    surface = base_from_place * job.surface.place_from_surface.se3()
+    for k, plan in enumerate(scan_plans(config, job, surface, nominal_scan(config))):
+        way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
+        run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)
+        yield f"the begin of sweep {k + 1} (scan, surface)", from_parts(-run_up) * plan.base_from_flange, ()
+        yield f"the end of sweep {k + 1} (scan, surface)", from_parts(run_up) * plan.base_from_flange_end, ()
+    part = surface * job.place.surface_from_part.se3()
+    part_from_flange = job.grasp.flange_from_part.se3().inverse()
+    for what, height, touching in (
+        ("the pose above the place (place.approach)", job.place.approach, ()),
+        ("the place pose (place, surface)", -job.place.contact_travel, TOUCHES),
+    ):
+        yield what, part * from_parts((0.0, 0.0, height)) * part_from_flange, touching
+
+
+def _unreached(planner: Planner, goals: Iterator[Goal]) -> Iterator[str]:
+    """At most three lines: what follows from one wrong pose need not be told for each."""
+    joints, told = HOME, 0
+    for what, goal, allowed in goals:
+        try:
+            joints = planner.reach(goal, joints, what, allowed)
+        except Unreachable as error:
+            yield f"{what}: {error}"
+        except CollisionError as error:
+            yield str(error)
+        else:
+            continue
+        told += 1
+        if told == 3:
+            return

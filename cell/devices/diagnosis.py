@@ -1,0 +1,178 @@
+"""How every device is: connected, who it is, round trips, errors, state. One device's failure hides no other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.config import CellConfig, config_to_open
+from cell.devices import assembly
+from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.run.folder import CellLock
+from drivers.clock import Clock
+from drivers.errors import CellError, ConfigError
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
+
+PINGS = 100
+
+Entry = tuple[str, str, Callable[[], Any], Callable[[Any], str]]
+"""Name, address, how to connect, and how to tell its state."""
+
+
+@dataclass
+class Diagnosis:
+    """One device's row. Round trips in ms on the wall."""
+
+    device: str
+    ok: bool
+    address: str
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+    p50_ms: float | None = None
+    p99_ms: float | None = None
+    errors: dict[str, int] = field(default_factory=dict)
+    state: str = ""
+
+    @property
+    def p50_text(self) -> str:
+        """Median round trip for people."""
+        return "" if self.p50_ms is None else f"{self.p50_ms:.2f}"
+
+    @property
+    def p99_text(self) -> str:
+        """99th percentile for people."""
+        return "" if self.p99_ms is None else f"{self.p99_ms:.2f}"
+
+    @property
+    def errors_text(self) -> str:
+        """Counters for people."""
+        return ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
+    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or held cell."""
+    if sim not in (None, "all"):
+        raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
+    _, config = config_to_open(path, simulated=sim is not None)
+    if sim is None:
+        return _diagnose(config)
+    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
+    try:
+        return _diagnose(with_endpoints(config, simulated.endpoints))
+    finally:
+        simulated.close()
+
+
+def _diagnose(config: CellConfig) -> list[Diagnosis]:
+    clock = Clock(config.cell.time_scale)
+    with CellLock(config):
+        rows, arm = _open_and_ask(
+            "arm", config.arm.address, partial(assembly.connect_arm, config, clock, control=False), _arm_state
+        )
+        scan, target = config.scan_camera, config.target_camera
+        connect_camera = assembly.connect_camera
+        try:
+            others: tuple[Entry, ...] = (
+                ("rail", config.rail.url, partial(assembly.connect_rail, config, clock), _rail_state),
+                ("vehicle", config.vehicle.channel, partial(assembly.connect_vehicle, config, clock), _vehicle_state),
+                ("scan_camera", scan.address, partial(connect_camera, "scan_camera", scan, clock), _camera_state),
+                (
+                    "target_camera",
+                    target.address,
+                    partial(connect_camera, "target_camera", target, clock),
+                    _camera_state,
+                ),
+            )
+            for entry in others:
+                found, device = _open_and_ask(*entry)
+                rows += found
+                if device is not None:
+                    device.close()
+            rows += _switches(config, arm, clock)
+        finally:
+            if arm is not None:
+                arm.close()
+    return rows
+
+
+def _open_and_ask(
+    name: str, address: str, build: Callable[[], Any], state: Callable[[Any], str]
+) -> tuple[list[Diagnosis], Any]:
+    try:
+        device = build()
+    except CellError as error:
+        return [Diagnosis(name, False, address, state=str(error))], None
+    return [_ask(name, address, device, state)], device
+
+
+def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -> Diagnosis:
+    row = Diagnosis(name, False, address)
+    try:
+        identity = device.identity()
+        row.model, row.serial, row.firmware = identity.model, identity.serial, identity.firmware
+        times = [1e3 * device.ping() for _ in range(PINGS)]
+        row.p50_ms, row.p99_ms = (float(v) for v in np.percentile(times, [50, 99]))
+        row.state = state(device)
+        row.ok = True
+    except CellError as error:
+        row.state = str(error)
+    row.errors = dict(device.statistics.errors)
+    return row
+
+
+def _switches(config: CellConfig, arm: Arm | None, clock: Clock) -> list[Diagnosis]:
+    outputs = {"laser": config.laser.output, "claw": config.claw.output}
+    if arm is None:
+        return [
+            Diagnosis(name, False, f"arm output {output}", state="the arm that switches it is not connected")
+            for name, output in outputs.items()
+        ]
+    laser, claw = assembly.connect_switches(config, arm, clock)
+    return [
+        _ask("laser", f"arm output {outputs['laser']}", laser, _laser_state),
+        _ask("claw", f"arm output {outputs['claw']}", claw, _claw_state),
+    ]
+
+
+def _arm_state(arm: Arm) -> str:
+    state = arm.state()
+    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg"
+
+
+def _rail_state(rail: Rail) -> str:
+    state = rail.state()
+    return f"{'homed' if state.homed else 'not homed'}, at {1e3 * state.position:.2f} mm"
+
+
+def _vehicle_state(vehicle: Vehicle) -> str:
+    state = vehicle.state()
+    if state.emergency_stop:
+        return "emergency stop"
+    # The brake's feedback is not on the bus.
+    brake = {None: "brake unknown", True: "braked", False: "brake open"}[state.braked]
+    errors = "; ".join(state.trouble) or f"errors {state.error_bits:#06x}"
+    return f"{brake}, {state.battery_volts:.1f} V, {errors}"
+
+
+def _camera_state(camera: Camera) -> str:
+    frame = camera.grab()
+    return f"frame {frame.frame_id}, {camera.shape[1]}×{camera.shape[0]}, mean {frame.image.mean():.0f} DN"
+
+
+def _laser_state(laser: Laser) -> str:
+    return "ON" if laser.is_on else "off"
+
+
+def _claw_state(claw: Claw) -> str:
+    return "holds a part" if claw.holding else "empty"

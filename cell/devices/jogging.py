@@ -1,0 +1,133 @@
+"""Jogging: one small motion of one device, checked against its limits before anything moves."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.poses import from_parts, from_ur
+from cell.run.recorded_work import Hands
+from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
+from cell.units import parse_quantity
+from drivers.errors import ConfigError, LimitError
+
+if TYPE_CHECKING:
+    from cell.supervisor import Cell
+
+MAX_LENGTH_MM = 500.0
+MAX_ANGLE_DEG = 90.0
+JOG_SPEED = 0.05  # m/s
+_USAGE = "rail +5mm · arm z -10mm · arm rx +2deg · arm j3 +5deg · vehicle +0.1m · vehicle +5deg"
+
+
+@dataclass(frozen=True)
+class Jog:
+    """What to move: `axis` is empty, x y z rx ry rz (arm base axes) or j1 … j6; `amount` in m or rad."""
+
+    device: str
+    axis: str
+    amount: float
+
+
+def parse_jog(device: str, words: list[str]) -> Jog:
+    """Read "arm z -10mm" and the like; raises `ConfigError` that shows how it is written."""
+    if device == "arm" and len(words) >= 2:
+        axis, text = words[0].lower(), "".join(words[1:])
+        if re.fullmatch(r"[xyz]", axis):
+            return Jog(device, axis, _amount(text, "mm"))
+        if re.fullmatch(r"r[xyz]|j[1-6]", axis):
+            return Jog(device, axis, _amount(text, "deg"))
+    if device == "rail" and words:
+        return Jog(device, "", _amount("".join(words), "mm"))
+    if device == "vehicle" and words:
+        text = "".join(words)
+        turning = text.lower().endswith(("deg", "rad"))
+        return Jog(device, "yaw" if turning else "x", _amount(text, "deg" if turning else "m"))
+    raise ConfigError(f"cannot jog {' '.join([device, *words])!r}; write it like: {_USAGE}")
+
+
+def _amount(text: str, unit: str) -> float:
+    bound = {"mm": MAX_LENGTH_MM, "deg": MAX_ANGLE_DEG, "m": MAX_LENGTH_MM / 1e3}[unit]
+    try:
+        return parse_quantity(text, unit, -bound, bound)
+    except ValueError as error:
+        raise ConfigError(f"jog by {error}; write it like: {_USAGE}") from error
+
+
+def jog(cell: Cell, wish: Jog) -> dict[str, str]:
+    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell."""
+
+    def work(hands: Hands) -> dict[str, str]:
+        match wish.device:
+            case "rail":
+                return _jog_rail(cell, wish)
+            case "arm":
+                return _jog_arm(cell, wish)
+            case _:
+                return _jog_vehicle(cell, wish, hands.check)
+
+    return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()})
+
+
+def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
+    rail = cell.devices.rail
+    here = rail.state()
+    said = {} if here.homed else {"homing": "the rail was not homed: searched its switch first"}
+    if not here.homed:
+        rail.home().wait(60.0)
+        here = rail.state()
+    rail.move_to(here.position + wish.amount).wait(60.0)
+    return {**said, "rail": f"{1e3 * here.position:.3f} mm → {1e3 * rail.state().position:.3f} mm"}
+
+
+def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
+    mover = cell.mover(None)
+    if wish.axis.startswith("j"):
+        number = int(wish.axis[1]) - 1
+        joints = mover.joints
+        goal = joints.copy()
+        goal[number] += wish.amount
+        low, high = mover.kinematics.limits.lower[number], mover.kinematics.limits.upper[number]
+        if not low <= goal[number] <= high:
+            raise LimitError(
+                "arm",
+                f"joint {number + 1} to {math.degrees(goal[number]):.1f} deg is outside its limits "
+                f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg); jog by less",
+            )
+        mover.to_joints(goal)
+        reached = mover.joints
+        return {wish.axis: f"{math.degrees(joints[number]):.3f} deg → {math.degrees(reached[number]):.3f} deg"}
+    start = from_ur(cell.devices.arm.state().flange)
+    direction = np.eye(3)["xyz".index(wish.axis[-1])]
+    if wish.axis.startswith("r"):
+        goal_pose = from_parts(start.translation, pin.exp3(direction * wish.amount) @ start.rotation)
+    else:
+        goal_pose = from_parts(start.translation + direction * wish.amount, start.rotation)
+    mover.line(goal_pose, JOG_SPEED)
+    reached_pose = from_ur(cell.devices.arm.state().flange)
+    shown = ", ".join(f"{1e3 * v:.2f}" for v in reached_pose.translation)
+    way = np.linalg.norm(reached_pose.translation - start.translation)
+    return {"flange": f"({shown}) mm in the base, moved {1e3 * way:.2f} mm"}
+
+
+def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, str]:
+    vehicle, clock = cell.devices.vehicle, cell.devices.clock
+    vehicle.enable()
+    odometry = RelativeOdometry(vehicle)
+    try:
+        if wish.axis == "yaw":
+            turn_to(vehicle, odometry, wish.amount, clock, check)
+        else:
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, check)
+    finally:
+        vehicle.brake()
+    pose = odometry.pose()
+    return {
+        "vehicle": f"moved {1e3 * pose.x:.1f} mm ahead, {1e3 * pose.y:.1f} mm left, {math.degrees(pose.yaw):.2f} deg"
+    }

@@ -1,0 +1,60 @@
+"""The safe stop as every run and every ending uses it, and what in the cell's health ends a run."""
+
+from __future__ import annotations
+
+from cell.devices.assembly import Devices
+from drivers.errors import DeadlineError, DeviceError, DeviceFault
+from drivers.interfaces import ArmSafety
+
+
+def stop_cell(devices: Devices) -> None:
+    """Bring every device to rest; raises `DeviceFault` that lists what could not be confirmed."""
+    if problems := devices.stop():
+        raise stop_not_confirmed("; ".join(problems))
+
+
+def stop_not_confirmed(message: str) -> DeviceFault:
+    """The fault of a cell of which it is not known that it stands."""
+    return DeviceFault("cell", "safe_stop", message, recoverable=False, hint="Look at the cell before going near it.")
+
+
+def require_healthy(devices: Devices) -> None:
+    """Raise when a safety system has stopped the arm, or the vehicle has a fault, whichever device is waited for.
+
+    A reading that is too old says nothing here: the next command to that device finds a silent link.
+    """
+    _require_arm(devices)
+    try:
+        devices.vehicle.check()
+    except DeadlineError:
+        return
+
+
+def require_no_emergency_stop(devices: Devices) -> None:
+    """Raise when an emergency stop is pressed. For jogs, whose work may be to clear any other fault."""
+    _require_arm(devices, ArmSafety.EMERGENCY_STOP)
+    try:
+        pressed = devices.vehicle.state().emergency_stop
+    except DeviceError:
+        return
+    if pressed:
+        devices.vehicle.check()
+
+
+def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
+    """Raise when the arm's safety system has stopped it; with `unfit` only in these states."""
+    try:
+        safety = devices.arm.state().safety
+    except DeviceError as error:
+        # A link that is lost, or closed to be recovered: the next command to the arm finds that.
+        if isinstance(error, DeadlineError) or getattr(error, "code", "") == "arm.link_lost":
+            return
+        raise
+    if safety in unfit if unfit else safety is not ArmSafety.NORMAL:
+        raise DeviceFault(
+            "arm",
+            f"arm.{safety.name.lower()}",
+            f"the arm is in {safety.value}",
+            recoverable=safety is ArmSafety.PROTECTIVE_STOP,
+            hint="Look for the reason and clear the way.",
+        )

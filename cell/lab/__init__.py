@@ -1,0 +1,1 @@
+"""The laboratory: campaigns, comparisons and the paper's figures. Nothing of the product imports it."""

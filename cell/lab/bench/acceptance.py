@@ -1,0 +1,153 @@
+"""Acceptance tests of the trade on a simulated head: probing error, sphere spacing error and flatness.
+
+After VDI/VDE 2634 part 2 and ISO 10360-13: a ball at ten places, a ball bar at seven, a flat at six. What counts in
+such a test is the worst place, so the worst of each figure is given first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.lab.bench import artefacts, form_errors
+from cell.lab.paper.rig import Noise, RigSpec, draw_head, observe
+from cell.lab.paper.solved import in_scan_frame, solve
+from cell.reconstruction import Cloud
+from sim_backends.world.levels import deviations
+
+Array = NDArray[np.float64]
+
+CAP = float(np.radians(50.0))
+"""Part of a ball that is judged: within this angle of the direction to the head, where stripe and lens can see it."""
+FLAT_BORDER = 0.001
+"""Border of the flat that is left out, m: mixed pixels."""
+NOISE_FACTOR = {"ideal": 0.1, "nominal": 1.0, "harsh": 2.5}
+GAUSS_95 = 2 * 1.959964
+"""Width of the band that holds 95 % of a Gaussian variable, in standard deviations."""
+
+Progress = Callable[[int, int], None]
+
+
+def acceptance(seed: int, level: str = "nominal", progress: Progress | None = None) -> dict[str, Any]:
+    """The three tests on the head of `seed` at a level of deviations, calibrated first. Lengths in mm.
+
+    `worst` has the figures that a limit would be set on: `probing_form_mm` (all points but 3 ‰), `probing_form_95_mm`
+    (95 % of them), `probing_size_mm` (measured minus true diameter), `sphere_spacing_mm` (measured minus true distance
+    of the balls' centres), `flatness_mm` and `flatness_95_mm`; errors of size and spacing keep the sign of the largest.
+    `expected` has the 95 % forms that the stated σ of the points lets one expect from noise alone. ValueError for an
+    unknown level.
+    """
+    sigma = deviations(level)
+    spec = RigSpec(noise=Noise().times(NOISE_FACTOR[level]))
+    rng = np.random.default_rng([seed, 2634])
+    head = draw_head(spec, rng, level)
+    geometry = in_scan_frame(solve(spec, observe(spec, head, rng)).joint)
+    balls, bars, flats = artefacts.ball_places(spec), artefacts.bar_places(spec), artefacts.flat_poses(spec)
+    total, done = len(balls) + len(bars) + len(flats), 0
+    found: dict[str, list[dict[str, float]]] = {"ball": [], "bar": [], "flat": []}
+
+    def step(name: str, row: dict[str, float]) -> None:
+        nonlocal done
+        found[name].append(row)
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    for centre in balls:
+        cloud = artefacts.scan_balls(spec, head, geometry, [centre], rng)[0]
+        step("ball", _probing(cloud, artefacts.BALL_DIAMETER))
+    for ends in bars:
+        clouds = artefacts.scan_balls(spec, head, geometry, list(ends), rng)
+        step("bar", _spacing(clouds, float(np.linalg.norm(ends[1] - ends[0]))))
+    for pose in flats:
+        step("flat", _flatness(artefacts.scan_flat(spec, head, geometry, pose, rng)))
+    return {
+        "note": "simulated; after VDI/VDE 2634 part 2 and ISO 10360-13, raw points, no smoothing",
+        "seed": seed,
+        "level": level,
+        "assumed_noise": {
+            **spec.noise.as_dict(),
+            "speckle_contrast": sigma.speckle_contrast,
+            "read_noise_dn": sigma.read_noise,
+        },
+        "artefacts": {
+            "ball_diameter_mm": 1e3 * artefacts.BALL_DIAMETER,
+            "ball_spacing_mm": 1e3 * artefacts.SPACING,
+            "flat_mm": [1e3 * side for side in artefacts.FLAT],
+            "cap_deg": float(np.degrees(CAP)),
+            "volume_mm": [1e3 * spec.travel, 1e3 * (2 * 0.008 + artefacts.BALL_DIAMETER),
+                          1e3 * (spec.depths[1] - spec.depths[0])],
+        },
+        "worst": {
+            "probing_form_mm": _worst(found["ball"], "form_mm"),
+            "probing_form_95_mm": _worst(found["ball"], "form_95_mm"),
+            "probing_size_mm": _worst(found["ball"], "size_mm"),
+            "sphere_spacing_mm": _worst(found["bar"], "spacing_mm"),
+            "flatness_mm": _worst(found["flat"], "form_mm"),
+            "flatness_95_mm": _worst(found["flat"], "form_95_mm"),
+        },
+        "expected": {
+            "probing_form_95_mm": _worst(found["ball"], "expected_95_mm"),
+            "flatness_95_mm": _worst(found["flat"], "expected_95_mm"),
+        },
+        "positions": found,
+    }  # fmt: skip
+
+
+def _ball(cloud: Cloud) -> tuple[form_errors.SphereFit, NDArray[np.bool_]]:
+    """The sphere through the part of a ball that is judged, and which of the cloud's valid points those are."""
+    points = cloud.points[cloud.valid]
+    first = form_errors.fit_sphere(points)
+    chosen = form_errors.cap(points, first.centre, np.array([0.0, 0.0, -1.0]), CAP)
+    return form_errors.fit_sphere(points[chosen]), chosen
+
+
+def _probing(cloud: Cloud, diameter: float) -> dict[str, float]:
+    fit, chosen = _ball(cloud)
+    points = cloud.points[cloud.valid][chosen]
+    normals = (points - fit.centre) / np.linalg.norm(points - fit.centre, axis=1, keepdims=True)
+    return {
+        "points": len(points),
+        "form_mm": 1e3 * form_errors.form_all(fit.deviations),
+        "form_95_mm": 1e3 * form_errors.form_95(fit.deviations),
+        "size_mm": 1e3 * (2 * fit.radius - diameter),
+        "expected_95_mm": 1e3 * _noise_band(cloud, chosen, normals),
+    }
+
+
+def _spacing(clouds: list[Cloud], true: float) -> dict[str, float]:
+    first, second = (_ball(cloud)[0] for cloud in clouds)
+    return {"spacing_mm": 1e3 * (float(np.linalg.norm(second.centre - first.centre)) - true)}
+
+
+def _flatness(cloud: Cloud) -> dict[str, float]:
+    points = cloud.points[cloud.valid]
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    along = centred @ axes[:2].T
+    inside = (along > along.min(axis=0) + FLAT_BORDER).all(axis=1) & (along < along.max(axis=0) - FLAT_BORDER).all(
+        axis=1
+    )
+    deviations_m = form_errors.plane_deviations(points[inside])
+    normals = np.broadcast_to(axes[2], (int(inside.sum()), 3))
+    return {
+        "points": int(inside.sum()),
+        "form_mm": 1e3 * form_errors.form_all(deviations_m),
+        "form_95_mm": 1e3 * form_errors.form_95(deviations_m),
+        "expected_95_mm": 1e3 * _noise_band(cloud, inside, normals),
+    }
+
+
+def _noise_band(cloud: Cloud, chosen: NDArray[np.bool_], normals: Array) -> float:
+    """Width in m of the band that holds 95 % of the chosen points when only their stated noise moves them."""
+    lines, rows = cloud.valid.nonzero()
+    sigma = cloud.sigma_along(lines[chosen], rows[chosen], normals)
+    return float(GAUSS_95 * np.sqrt(np.mean(sigma**2)))
+
+
+def _worst(rows: list[dict[str, float]], key: str) -> float:
+    values = [row[key] for row in rows]
+    return float(max(values, key=abs))

@@ -1,0 +1,234 @@
+"""The campaign behind `cell bench calibration`: many heads calibrated from drawn observations, errors beside the bound.
+
+Each seed draws a head and its noise (`calibration_world`), the product's own calibration solves it, and points are
+measured with both. Frames are kept apart: the camera's alone is partly gauge, the arm's base is what placing feels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from cell.lab.bench.calibration_bound import cramer_rao
+from cell.lab.bench.calibration_frames import FRAMES, measured_errors
+from cell.lab.bench.calibration_world import (
+    HEIGHT,
+    STRIPE_WIDTH_PX,
+    WIDTH,
+    Array,
+    HeadWorld,
+    Noise,
+    draw_head,
+    seen_dots,
+    seen_rows,
+)
+
+TANGENTIAL = (6, 7)
+LENS_TO_MOUNT = 20
+"""So many of the generator's parameters describe the head itself; the rest is the board."""
+THEORY_MM = {
+    "scan_radial_lens": {"mean": 0.047, "max": 0.112, "p85": 0.063},
+    "base": {"mean": 0.067, "max": 0.108, "p85": 0.082},
+}
+"""What the theory sheet's prototype reached (part 4), for the same noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One seed: χ² per degree of freedom (with the noise found, and with the noise drawn), z-scores of the parameters,
+    and for each frame the errors in mm (`calibration_frames.measured_errors`).
+
+    `z_whitened` is the RMS of the z-scores' independent parts, `best_z_whitened` the same of the best calibration on
+    the same noise: 1 but for luck, which both share.
+    """
+
+    seed: int
+    chi2_per_dof: float
+    chi2_drawn_noise: float
+    noise_found: dict[str, float]
+    z: dict[str, float]
+    z_whitened: float
+    best_z_whitened: float
+    errors: dict[str, dict[str, float]]
+
+
+def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
+    """Run the seeds on all cores and sum them up; `tell` hears how many are done."""
+    trials: list[Trial] = []
+    for trial in _trials(seeds, noise):
+        trials.append(trial)
+        tell(len(trials))
+    return summed_up(trials, noise)
+
+
+def _trials(seeds: Sequence[int], noise: Noise) -> Iterator[Trial]:
+    workers = min(os.cpu_count() or 1, len(seeds))
+    if workers < 2:
+        yield from (one_trial(seed, noise) for seed in seeds)
+        return
+    # There are as many processes as cores: a thread each is enough, and is set before their libraries load.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        yield from pool.map(one_trial, seeds, [noise] * len(seeds))
+
+
+def one_trial(seed: int, noise: Noise) -> Trial:
+    """Draw, calibrate, measure."""
+    from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+    from cell.calibration.solve.joint import solve_joint, solve_staged, start_state
+    from cell.calibration.store import nominal_camera
+    from cell.config import load_config
+
+    rng = np.random.default_rng(seed)
+    world = draw_head(rng)
+    observations = observe(world, noise, rng)
+    nominal = nominal_camera(load_config(None).scan_camera)
+    priors = Priors(noise.arm / np.sqrt(3), noise.arm_angle, noise.rail)
+    joint = solve_joint(observations, solve_staged(observations, nominal), priors, held_out=False)
+    found = joint.adjusted
+    exact = Adjustment(joint.views, shared_mask(plane=True, rail=True), Priors(*_as_drawn(priors)))
+    fixed = exact.solve(start_state(joint.staged), variance_rounds=0)
+    radial = solve_joint(observations, joint.staged, priors, tangential=False, held_out=False).adjusted
+    estimates = {frame: _as_world(world, found.state) for frame in FRAMES}
+    estimates["scan_radial_lens"] = _as_world(world, radial.state)
+    error = _parameter_errors(found.state, world)
+    covariance = found.covariance[: len(error), : len(error)]
+    sigma = np.sqrt(np.diag(covariance))
+    free = sigma > 0
+    best = cramer_rao(world, noise, observations)
+    errors = {}
+    for frame in FRAMES:
+        known = best.with_known(TANGENTIAL) if frame == "scan_radial_lens" else best
+        errors[frame] = measured_errors(world, estimates[frame], known, frame, noise, rng)
+    head = slice(0, LENS_TO_MOUNT)
+    return Trial(
+        seed,
+        found.chi2_per_dof,
+        fixed.chi2_per_dof,
+        {"dots": found.priors.dots_scale, "stripe": found.priors.stripe_scale},
+        {n: float(e / s) for n, e, s in zip(_names(), error, sigma, strict=True) if s > 0},
+        _whitened(error[free], covariance[np.ix_(free, free)]),
+        _whitened(best.error[head], best.covariance[head, head]),
+        errors,
+    )
+
+
+def _whitened(error: Array, covariance: Array) -> float:
+    """RMS of the independent standard scores of an error (n,) with covariance (n, n)."""
+    scale = np.sqrt(np.diag(covariance))
+    z = error / scale
+    return float(np.sqrt(z @ np.linalg.solve(covariance / scale[:, None] / scale, z) / len(z)))
+
+
+def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[Any]:
+    """What the head sees and its devices report, as `ScanObservation`s with noise; the flange is said to be as sent."""
+    from cell.calibration import ScanObservation
+    from cell.geometry.poses import from_matrix
+    from cell.vision.board.view import BoardView
+    from cell.vision.stripe.extract import StripeProfile
+
+    made = []
+    for view in range(len(world.rails)):
+        own = noise.own * rng.normal(size=7)
+        own[6] = 0.0
+        pixels = world.dots(view, own)
+        pixels += noise.dots * rng.normal(size=pixels.shape)
+        ids = seen_dots(pixels)
+        columns, _ = seen_rows(world, view, own)
+        columns += noise.stripe * rng.normal(size=HEIGHT)
+        flat, none = np.ones(HEIGHT), np.zeros(HEIGHT, dtype=np.bool_)
+        board = BoardView(
+            world.spec, (WIDTH, HEIGHT), ids, pixels[ids], np.full(len(ids), noise.dots), False, world.spec.dot_radius
+        )
+        stripe = StripeProfile("rows", columns, noise.stripe * flat, 150 * flat, STRIPE_WIDTH_PX * flat, none, none)
+        reading = float(world.rails[view] + noise.rail * rng.normal())
+        made.append(ScanObservation(board, stripe, from_matrix(world.flanges[view]), reading, f"view {view + 1}"))
+    return made
+
+
+def _as_drawn(priors: Any) -> tuple[Any, ...]:
+    """The priors with the noise of dots and stripe taken as stated."""
+    return priors.arm_translation, priors.arm_rotation, priors.rail, False, 1.0, 1.0
+
+
+def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
+    """The estimate in the generator's terms, so that both measure with the same independent code."""
+    parameters = np.concatenate(
+        [state.camera.parameters[:8], state.plane.n / state.plane.distance, state.rail_direction]
+    )
+    return HeadWorld(
+        parameters,
+        state.flange_from_camera.homogeneous,
+        state.base_from_board.homogeneous,
+        world.flanges,
+        world.rails,
+        world.spec,
+    )
+
+
+def _names() -> tuple[str, ...]:
+    from cell.calibration.solve.results import PARAMETERS
+
+    return PARAMETERS
+
+
+def _parameter_errors(state: Any, world: HeadWorld) -> Array:
+    """Errors (21,) of the estimate in the order and the terms of the calibration's covariance."""
+    from cell.calibration.solve.blocks import tangents
+    from cell.geometry.poses import difference, from_matrix
+
+    length = np.linalg.norm(world.plane)
+    normal, distance = world.plane / length, 1 / length
+    if state.plane.distance < 0:
+        normal, distance = -normal, -distance
+    across = tangents(state.plane.n)
+    return np.concatenate(
+        [
+            state.camera.parameters - world.lens,
+            [(state.plane.n - normal) @ a for a in across],
+            [state.plane.distance - distance],
+            state.rail_direction - world.rail,
+            difference(state.flange_from_camera, from_matrix(world.hand)),
+        ]
+    )
+
+
+def summed_up(trials: Sequence[Trial], noise: Noise) -> dict[str, Any]:
+    """Means over the seeds; `z_rms` of all z-scores, by parameter, and of their independent parts; lengths in mm.
+
+    `ratio` compares with the bound, `ratio_same_noise` with what the best calibration makes of the very noise drawn.
+    """
+    z = {name: np.array([t.z[name] for t in trials]) for name in trials[0].z}
+    frames = {}
+    for frame in FRAMES:
+        mean = {key: float(np.mean([t.errors[frame][key] for t in trials])) for key in trials[0].errors[frame]}
+        ratios = {"ratio": mean["mean"] / mean["bound_mean"], "ratio_same_noise": mean["mean"] / mean["best_mean"]}
+        frames[frame] = {**mean, **ratios, "theory": THEORY_MM.get(frame)}
+    chi2 = [t.chi2_per_dof for t in trials]
+    drawn = [t.chi2_drawn_noise for t in trials]
+    return {
+        "seeds": len(trials),
+        "assumed_noise": {
+            "dots_px": noise.dots, "stripe_px": noise.stripe, "rail_mm": 1e3 * noise.rail,
+            "arm_radial_mm": 1e3 * noise.arm, "arm_rotation_mrad": 1e3 * noise.arm_angle,
+        },
+        "chi2_per_dof": {"mean": float(np.mean(chi2)), "least": min(chi2), "most": max(chi2)},
+        "chi2_per_dof_drawn_noise": {"mean": float(np.mean(drawn)), "least": min(drawn), "most": max(drawn)},
+        "noise_found": {key: float(np.mean([t.noise_found[key] for t in trials])) for key in ("dots", "stripe")},
+        "z_rms": float(np.sqrt(np.mean([v**2 for v in z.values()]))),
+        "z_rms_whitened": _rms([t.z_whitened for t in trials]),
+        "best_z_rms_whitened": _rms([t.best_z_whitened for t in trials]),
+        "z_rms_by_parameter": {name: float(np.sqrt(np.mean(v**2))) for name, v in z.items()},
+        "frames_mm": frames,
+        "trials": [asdict(t) for t in trials],
+    }  # fmt: skip
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

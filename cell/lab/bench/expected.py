@@ -1,0 +1,240 @@
+"""What the world's declared noise leaves the whole job with at best: covariances, and the mean distances to expect.
+
+Propagated to first order through the product's own chain: dots and stripe as their residuals show them; the arm's
+repeatability at every calibration view, for the sweep and for placing; its kinematic error, one draw of link lengths
+and joint zeros that shifts all postures together and is partly taken up by the hand-eye; the grasp and the vehicle's
+lean. Least squares with these covariances attains the Cramér–Rao bound, save for the kinematic error, which the
+adjustment does not know of: for that part the figure is what this estimator is expected to make of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+from cell.calibration.solve.blocks import SHARED, State
+from cell.calibration.solve.joint import solve_joint, solve_staged
+from cell.calibration.store import nominal_camera
+from cell.config import CellConfig
+from cell.geometry.covariance import covariance_root
+from cell.geometry.poses import composition_jacobians, transform
+from cell.inversion import NominalSurface
+from cell.job import Job
+from cell.lab.bench.scan_errors import by_pose
+from cell.lab.bench.whole_job import JobRecord
+from cell.reconstruction import Cloud, calibration_motions, flange_motions
+from cell.reconstruction.build import ScanGeometry
+from cell.report.bound import part_points
+from cell.steps.laser_sweep import SweepRecord
+from drivers.interfaces import Vector
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+
+POINTS = 1500
+_STEP = 1e-6
+_DRAWS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Covariances (6, 6) of (translation, rotation) in base axes about the surface's origin, m² and rad².
+
+    `absolute`: of the surface in the arm's true base. `own`: in the base as the arm itself realises it where it places.
+    `placing`: of the part on the surface, with all that placing adds. The mean distances to expect of them over
+    the part's 45 points are `absolute_m`, `own_m` and `placing_m`; `sensor_m` that of single points in the camera's
+    frame at rail zero.
+    """
+
+    absolute: Vector
+    own: Vector
+    placing: Vector
+    absolute_m: float
+    own_m: float
+    placing_m: float
+    sensor_m: float
+    kinematic_own: Vector
+
+
+def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurface) -> Expected:
+    """For a record that got as far as the place pose."""
+    assert record.calibration is not None and record.at_sweep is not None and record.rests is not None
+    noise = {name: entry["sigma"] for name, entry in record.at_sweep["assumed_noise"].items()}
+    cloud: Cloud = record.results["reconstruct"].cloud
+    sweep: SweepRecord = record.results["laser_sweep"]
+    pose = record.results["invert_pose"]
+    kinematics = _Kinematics(record.rests)
+    shared, by_kinematics = _calibration(record, config, noise, kinematics)
+    rest = np.diag([noise["arm_repeatability"] ** 2 / 3] * 3 + [noise["arm_repeatability_rotation"] ** 2] * 3)
+    head = _Head(record, cloud, [rest] * len(sweep.swaths), nominal, pose.base_from_surface)
+
+    at_surface = _carried(sweep.base_from_flange, pose.base_from_surface)
+    place_flange = (
+        pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()
+    )
+    at_part = _carried(place_flange, pose.base_from_surface)
+    lengths, zeros = noise["arm_dh_length"], noise["arm_dh_angle"]
+    sigma = np.concatenate([np.full(12, lengths), np.full(6, zeros)])
+    scan = -at_surface @ kinematics.shifts(sweep.base_from_flange) * sigma - head.poses(by_kinematics * sigma)
+    own = scan + at_part @ kinematics.shifts(place_flange) * sigma
+    common = pose.random + _square(head.by_rests) + _square(head.poses(covariance_root(shared)))
+    placing = common + _square(own) + at_part @ rest @ at_part.T + _grasp(noise, pose.base_from_surface)
+    placing = placing + _square(_lean(noise, config, sweep.base_from_flange, place_flange, pose.base_from_surface))
+    absolute, of_own = common + _square(scan), common + _square(own)
+    points = transform(pose.base_from_surface, part_points(nominal)) - pose.base_from_surface.translation
+
+    def mean(covariance: Vector) -> float:
+        arms = by_pose(points)
+        return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
+
+    in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
+    return Expected(
+        absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera), _square(own)
+    )
+
+
+def mean_distance(covariances: Vector) -> float:
+    """Mean length in m of Gaussian errors with covariances (n, 3, 3), over all of them."""
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    draws = np.random.default_rng(0).standard_normal((_DRAWS, 1, 3, 1))
+    return float(np.linalg.norm((roots @ draws)[..., 0], axis=-1).mean())
+
+
+class _Kinematics:
+    """How the flange moves with the 18 lengths and zeros of the arm's table, at the postures that it rested in."""
+
+    def __init__(self, rests: Vector) -> None:
+        self._rests = rests
+        self._nominal = Kinematics(UR10E_DH)
+        self._flanges = np.array([self._nominal.forward(q) for q in rests])
+
+    def shifts(self, base_from_flange: pin.SE3) -> Vector:
+        """(6, 18): translation and rotation in base axes per m of a and d and per rad of the joints' zeros."""
+        wanted = base_from_flange.homogeneous
+        away = np.abs(self._flanges - wanted).reshape(len(self._flanges), -1).max(axis=1)
+        return self._by_table(self._rests[int(np.argmin(away))])
+
+    def _by_table(self, joints: Vector) -> Vector:
+        at = self._nominal.forward(joints)
+        columns = []
+        for column, row in [(c, r) for c in (0, 1, 3) for r in range(6)]:
+            table = UR10E_DH.copy()
+            table[row, column] += _STEP
+            moved = Kinematics(table).forward(joints)
+            turn = pin.log3(moved[:3, :3] @ at[:3, :3].T)
+            columns.append(np.concatenate([moved[:3, 3] - at[:3, 3], turn]) / _STEP)
+        return np.column_stack(columns)
+
+
+class _Head:
+    """How the cloud, and the pose found in it, move with the scan head's parameters and with the sweeps' poses.
+
+    `rests`: the covariance (6, 6) of base_from_flange of each sweep. `by_rests` (6, m): motions of the surface's pose
+    by one standard deviation of each of their parts.
+    """
+
+    def __init__(
+        self, record: JobRecord, cloud: Cloud, rests: list[Vector], nominal: NominalSurface, surface: pin.SE3
+    ) -> None:
+        assert record.calibration is not None
+        self._calibration = record.calibration.scan
+        self._cloud = cloud
+        self._lines, self._rows = cloud.subsample(POINTS)
+        points = cloud.points[self._lines, self._rows]
+        chosen, feet = nominal.feet(transform(surface.inverse(), points), 0.0005)
+        keep = chosen[feet.inner]
+        self._lines, self._rows = self._lines[keep], self._rows[keep]
+        normals = feet.normals[feet.inner] @ surface.rotation.T
+        arms = points[keep] - surface.translation
+        self._normals = normals
+        by_pose = np.concatenate([normals, np.cross(arms, normals)], axis=1)
+        by_sweeps = np.einsum("ni,nim->nm", normals, flange_motions(cloud, self._lines, self._rows, rests))
+        columns = np.concatenate([by_pose, by_sweeps], axis=1)
+        weighted = columns / cloud.sigma_along(self._lines, self._rows, normals)[:, None] ** 2
+        # What the sweeps' poses are off is found with the pose, and known beforehand to its standard deviation.
+        known = np.diag([0.0] * 6 + [1.0] * by_sweeps.shape[1])
+        self._rigid = np.linalg.solve(weighted.T @ columns + known, weighted.T)[:6]
+        self.by_rests: Vector = self._rigid @ by_sweeps
+
+    def poses(self, steps: Vector) -> Vector:
+        """Motion (6, m) of the surface's pose for steps (21, m) of the parameters, by points along the normals."""
+        moved = self._moved(steps, None, self._calibration.flange_from_camera)
+        return np.asarray(self._rigid @ np.einsum("ni,nim->nm", self._normals, moved))
+
+    def in_camera(self, steps: Vector) -> Vector:
+        """Covariances (n, 3, 3) of single points in the camera's frame at rail zero: parameters, stripe and rail."""
+        moved = self._moved(steps, pin.SE3.Identity(), pin.SE3.Identity())
+        turns = self._cloud.flanges[self._lines, :3, :3] @ self._calibration.flange_from_camera.rotation
+        random = turns.transpose(0, 2, 1) @ self._cloud.covariances(self._lines, self._rows) @ turns
+        return np.asarray(random + moved @ moved.transpose(0, 2, 1))
+
+    def _moved(self, steps: Vector, base_from_flange: pin.SE3 | None, hand: pin.SE3) -> Vector:
+        c = self._calibration
+        state = State(c.camera, c.light_plane, c.rail_direction, hand, pin.SE3.Identity())
+        variants = []
+        for step in steps.T:
+            full = np.zeros(SHARED)
+            full[: len(step)] = step
+            if hand == pin.SE3.Identity():
+                full[15:21] = 0.0
+            moved = state.moved(full)
+            assert moved.plane is not None
+            variants.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
+        geometry = ScanGeometry(c.camera, c.light_plane, c.rail_direction, hand)
+        return calibration_motions(self._cloud, self._lines, self._rows, base_from_flange, geometry, variants)
+
+
+def _calibration(
+    record: JobRecord, config: CellConfig, noise: dict[str, float], kinematics: _Kinematics
+) -> tuple[Vector, Vector]:
+    """Covariance (21, 21) of the scan head's parameters under the declared noise, and their shift (21, 18) by the
+    arm's kinematic error: the flange is not where it is reported, view by view, and the adjustment follows."""
+    observations = record.observations[0]
+    staged = solve_staged(observations, nominal_camera(config.scan_camera), np.array([1.0, 0.0, 0.0]))
+    priors = Priors(
+        arm_translation=max(noise["arm_repeatability"] / np.sqrt(3.0), 1e-6),
+        arm_rotation=max(noise["arm_repeatability_rotation"], 1e-6),
+        rail=config.calibration.rail_sigma,
+    )
+    joint = solve_joint(observations, staged, priors, held_out=False)
+    problem = Adjustment(joint.views, shared_mask(plane=True, rail=True), joint.adjusted.priors)
+    inverse = problem.normal_at(joint.adjusted.state).inverse()
+    weight = 1.0 / np.array([priors.arm_translation**2] * 3 + [priors.arm_rotation**2] * 3)
+    shift = np.zeros((SHARED, 18))
+    for k, view in enumerate(joint.views):
+        if view.same_rest:
+            continue
+        # The arm stands where the table's error puts it; what is reported lies the opposite way from it.
+        shift -= inverse.cross[k][:, :6] * weight @ kinematics.shifts(view.base_from_flange)
+    return inverse.shared[:21, :21], shift[:21]
+
+
+def _carried(base_from_flange: pin.SE3, base_from_surface: pin.SE3) -> Vector:
+    """(6, 6): motion of what the flange carries, about the surface's origin, for a motion of the flange."""
+    return composition_jacobians(base_from_flange, base_from_flange.inverse() * base_from_surface)[0]
+
+
+def _grasp(noise: dict[str, float], base_from_surface: pin.SE3) -> Vector:
+    turn = np.kron(np.eye(2), base_from_surface.rotation)
+    return np.asarray(
+        turn @ np.diag([noise["grasp_translation"] ** 2] * 3 + [noise["grasp_rotation"] ** 2] * 3) @ turn.T
+    )
+
+
+def _lean(
+    noise: dict[str, float], config: CellConfig, scan: pin.SE3, place: pin.SE3, base_from_surface: pin.SE3
+) -> Vector:
+    """(6, 2): the body leans otherwise when the arm has moved on from the sweep; one σ of each of its two springs."""
+    vehicle_from_base = config.arm.vehicle_from_base.se3()
+    reach = place.translation - scan.translation
+    turns = (
+        vehicle_from_base.rotation.T @ np.array([[0.0, -reach[1]], [reach[0], 0.0], [0.0, 0.0]]) * noise["suspension"]
+    )
+    arm = base_from_surface.translation - vehicle_from_base.inverse().translation
+    return np.concatenate([np.cross(turns.T, arm).T, turns])
+
+
+def _square(columns: Vector) -> Vector:
+    return np.asarray(columns @ columns.T)

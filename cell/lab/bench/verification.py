@@ -1,0 +1,256 @@
+"""How often `cell calibrate verify` finds a disturbed calibration, names its part, and raises a false alarm.
+
+Each seed's world is calibrated from synthetic observations and then looked at again: as it was, with one part moved by
+0.2 mm or 0.05°, and with one part moved by what the verification says that it can just find, in the least visible
+direction. The observations are `cell.lab.bench.observed_cell`'s: the simulator's optics, arm and deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from cell.calibration import ScanObservation, TargetObservation
+from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, tangents
+from cell.calibration.store import CellCalibration
+from cell.calibration.verify.detectability import Change, Detectable
+from cell.calibration.verify.hypotheses import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
+from cell.calibration.verify.looks import CheckObservations, verify
+from cell.calibration.verify.views import SCAN_APPROACHES, TARGET_APPROACHES
+from cell.config import load_config
+from cell.geometry.poses import from_matrix
+from cell.lab.bench.observed_cell import ObservedCell, Truth
+from cell.steps.camera_poses import rail_ends, verification_views
+from sim_backends.world.scene import draw, rotation
+
+PROFILES = 40
+CHECKS_OF_A_GOOD_ONE = 4
+KINDS_OF_CHANGE = 12
+"""That the verification states a detectable size of."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A part of the truth that is moved: what it is called, the part to be named, how it moves, and the truth then."""
+
+    name: str
+    part: str
+    kind: str
+    moved: Callable[[Truth], Truth]
+
+
+@dataclass
+class Tally:
+    """Of the checks under one disturbance: how many, how many found, named first, and among the suspects."""
+
+    part: str
+    kind: str
+    checks: int = 0
+    found: int = 0
+    first: int = 0
+    among: int = 0
+
+
+@dataclass
+class Promise:
+    """The checks under a change of one kind as large as the verification says that it finds: sizes in m or rad."""
+
+    change: Change
+    sizes: list[float] = field(default_factory=list)
+    found: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """For reports, in mm or degrees."""
+        factor = 1e3 if self.change.unit == "m" else float(np.degrees(1.0))
+        return {
+            "part": self.change.part,
+            "change": self.change.kind,
+            "mean": round(factor * float(np.mean(self.sizes)), 4),
+            "largest": round(factor * max(self.sizes), 4),
+            "wanted": round(factor * self.change.wanted, 4),
+            "unit": ("mm" if self.change.unit == "m" else "deg") + self.change.where,
+            "checks": len(self.sizes),
+            "found_percent": round(100 * self.found / len(self.sizes), 1),
+        }
+
+
+@dataclass
+class Campaign:
+    """Result: tallies by disturbance, promises by kind of change, good calibrations checked and their false alarms."""
+
+    good: int = 0
+    alarms: int = 0
+    tallies: dict[str, Tally] = field(default_factory=dict)
+    promises: dict[tuple[str, str], Promise] = field(default_factory=dict)
+
+    def summary(self, level: str, seeds: int) -> dict[str, Any]:
+        """For reports. Beside each disturbance stands what the verifications said of the size they find of its kind."""
+        promised = {key: promise.summary() for key, promise in self.promises.items()}
+        return {
+            "level": level,
+            "seeds": seeds,
+            "false_alarm_percent": round(100 * self.alarms / max(1, self.good), 2),
+            "checks_of_good": self.good,
+            "disturbances": [
+                {
+                    "name": name,
+                    "checks": t.checks,
+                    "found_percent": round(100 * t.found / t.checks, 1),
+                    "detectable_mean": promised[t.part, t.kind]["mean"],
+                    "wanted": promised[t.part, t.kind]["wanted"],
+                    "unit": promised[t.part, t.kind]["unit"],
+                    "named_first_percent": round(100 * t.first / max(1, t.found), 1),
+                    "among_suspects_percent": round(100 * t.among / max(1, t.found), 1),
+                }
+                for name, t in self.tallies.items()
+            ],
+            "detectable": list(promised.values()),
+            "found_at_detectable_percent": round(
+                100
+                * sum(p.found for p in self.promises.values())
+                / max(1, sum(len(p.sizes) for p in self.promises.values())),
+                1,
+            ),
+        }
+
+
+def disturbances() -> list[Disturbance]:
+    """Every single parameter of the chain moved by 0.2 mm or 0.05°, or by what does as much to a picture."""
+    made: list[Disturbance] = []
+
+    def add(name: str, part: str, kind: str, moved: Callable[[Truth], Truth]) -> None:
+        made.append(Disturbance(name, part, kind, moved))
+
+    for camera, depth in (("scan", SCAN_DEPTH), ("target", TARGET_DEPTH)):
+        pose, lens = f"flange_from_{camera}", f"{camera}_lens"
+        mount, glass = f"{camera} camera's mount on the flange", f"{camera} camera's lens"
+        for axis in range(3):
+            e = np.eye(3)[axis]
+            add(f"{camera} mount, 0.2 mm along {'xyz'[axis]}", mount, "shift", _posed(pose, SHIFT * e, np.zeros(3)))
+            add(f"{camera} mount, 0.05° about {'xyz'[axis]}", mount, "turn", _posed(pose, np.zeros(3), TURN * e))
+        for k, name in ((2, "cx"), (3, "cy")):
+            add(
+                f"{camera} lens, 0.05° of {name}",
+                glass,
+                "principal point",
+                _lens(lens, TURN * np.eye(9)[k], np.zeros(9)),
+            )
+        add(
+            f"{camera} lens, 0.2 mm of focus",
+            glass,
+            "focal length",
+            _lens(lens, np.zeros(9), SHIFT / depth * (np.arange(9) < 2)),
+        )
+    laser = "laser's light plane"
+    add("light plane, 0.2 mm", laser, "shift", lambda t: replace(t, plane_distance=t.plane_distance + SHIFT))
+    for axis, name in ((1, "about y"), (2, "about z")):
+        turn = rotation(TURN * np.eye(3)[axis])
+        add(f"light plane, 0.05° {name}", laser, "turn", _applied("plane_normal", turn))
+        add(f"rail, 0.05° {name}", "rail", "turn", _applied("rail_direction", turn))
+    add("rail, 0.2 mm per 100 mm of lead", "rail", "lead", _applied("rail_direction", (1 + SHIFT / 0.1) * np.eye(3)))
+    return made
+
+
+def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObservations:
+    """What `cell.calibration.verify.views.collect_verification` brings from this world."""
+    config = cell.config
+    assert calibration.scan.reference is not None
+    scan_view, target_view = verification_views(config, cell.fine, cell.large, calibration.scan, calibration.target)
+    ends = rail_ends(
+        calibration.scan, calibration.scan.reference.base_from_board, scan_view, cell.fine, config.rail.travel
+    )
+    photographs = []
+    rest = cell.move(scan_view.base_from_flange.homogeneous)
+    for k in range(SCAN_APPROACHES):
+        if k:
+            rest = cell.move(scan_view.base_from_flange.homogeneous)
+        reported = from_matrix(rest.reported)
+        photographs.append(
+            [ScanObservation(cell.scan_view(rest, cell.carriage(end)), None, reported, end) for end in ends]
+        )
+    offset = cell.carriage(ends[0]) - ends[0]
+    sweep = [
+        ScanObservation(None, cell.stripe(rest, float(s) + offset), from_matrix(rest.reported), float(s))
+        for s in np.linspace(*ends, PROFILES)
+    ]
+    target = []
+    for _ in range(TARGET_APPROACHES):
+        rest = cell.move(target_view.base_from_flange.homogeneous)
+        target.append(TargetObservation(cell.target_view(rest), from_matrix(rest.reported)))
+    return CheckObservations(photographs, sweep, target)
+
+
+def campaign(
+    seeds: Iterable[int], level: str, chosen: Iterable[Disturbance], progress: Callable[[str], None]
+) -> Campaign:
+    """Calibrate each seed's world, check it as it is and under each disturbance."""
+    result = Campaign()
+    chosen = list(chosen)
+    config = load_config(None)
+    for seed in seeds:
+        progress(f"seed {seed}: calibrating")
+        cell = ObservedCell(draw(seed, level), config, np.random.default_rng([seed, 20]))
+        calibration = CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": str(seed)}, config)
+        truth = cell.truth
+        for _ in range(CHECKS_OF_A_GOOD_ONE):
+            good = verify(calibration.scan, calibration.target, look_again(cell, calibration))
+            result.good += 1
+            result.alarms += not good.good
+        for seen in good.detectable:
+            key = seen.change.part, seen.change.kind
+            progress(f"seed {seed}: {', '.join(key)}")
+            cell.truth = changed(truth, seen)
+            verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
+            promise = result.promises.setdefault(key, Promise(seen.change))
+            promise.sizes.append(seen.size)
+            promise.found += not verdict.good
+        for disturbance in chosen:
+            progress(f"seed {seed}: {disturbance.name}")
+            cell.truth = disturbance.moved(truth)
+            verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
+            tally = result.tallies.setdefault(disturbance.name, Tally(disturbance.part, disturbance.kind))
+            tally.checks += 1
+            if not verdict.good:
+                parts = [suspect.part for suspect in verdict.suspects]
+                tally.found += 1
+                tally.first += parts[0] == disturbance.part
+                tally.among += disturbance.part in parts
+        cell.truth = truth
+    return result
+
+
+def changed(truth: Truth, seen: Detectable) -> Truth:
+    """The truth after a change of just the size that can be seen, which is along the parameters of the calibration."""
+    step, chain = seen.step, seen.change.chain
+    pose, lens = f"flange_from_{chain}", f"{chain}_lens"
+    mount = getattr(truth, pose).copy()
+    mount[:3, 3] += step[HAND][:3]
+    mount[:3, :3] = rotation(step[HAND][3:]) @ mount[:3, :3]
+    normal = truth.plane_normal + np.column_stack(tangents(truth.plane_normal)) @ step[PLANE][:2]
+    return replace(
+        truth,
+        **{pose: mount, lens: getattr(truth, lens) + step[CAMERA]},
+        plane_normal=normal / np.linalg.norm(normal),
+        plane_distance=truth.plane_distance + step[PLANE][2],
+        rail_direction=truth.rail_direction + step[RAIL],
+    )
+
+
+def _posed(name: str, shift: np.ndarray, turn: np.ndarray) -> Callable[[Truth], Truth]:
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = rotation(turn), shift
+    return lambda truth: replace(truth, **{name: getattr(truth, name) @ change})
+
+
+def _lens(name: str, focal_lengths: np.ndarray, share: np.ndarray) -> Callable[[Truth], Truth]:
+    """A lens moved by multiples of its focal length, and by shares of its own values."""
+    return lambda truth: replace(
+        truth, **{name: getattr(truth, name) * (1 + share) + getattr(truth, name)[0] * focal_lengths}
+    )
+
+
+def _applied(name: str, matrix: np.ndarray) -> Callable[[Truth], Truth]:
+    return lambda truth: replace(truth, **{name: matrix @ getattr(truth, name)})

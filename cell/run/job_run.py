@@ -1,0 +1,214 @@
+"""One job as a recorded run: its folder and journal, what watches the cell meanwhile, what an error means for it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cell.calibration.store import CellCalibration, save_calibration
+from cell.config import CellConfig
+from cell.devices.assembly import Devices
+from cell.devices.stopping import require_healthy, stop_cell
+from cell.inversion import NominalSurface
+from cell.job import Job
+from cell.report.figures import told
+from cell.report.html import table
+from cell.report.report import make_report
+from cell.report.truth import Witness
+from cell.run.folder import new_run, write_json
+from cell.run.frames import FrameStore
+from cell.run.logs import run_log
+from cell.run.run import Run
+from cell.run.work import JobWork
+from cell.steps.stored_sweep import StoredSweep
+from cell.steps.whereabouts import Whereabouts
+from drivers.errors import (
+    Aborted,
+    CalibrationStale,
+    CellError,
+    ConfigError,
+    DeviceError,
+    DeviceFault,
+    RefusedError,
+)
+from statemachine.cancel import CancelToken
+from statemachine.journal import Journal, JournalError
+from statemachine.policy import Failure, Outcome, Policy
+from statemachine.runner import Event, Runner
+from statemachine.sequence import Sequence
+
+Observer = Callable[[Event], None]
+
+CONFIRMED_BY_A_PERSON = frozenset(("arm.protective_stop",))
+"""Faults that no program may clear by itself: the maker asks that a person looks at the arm first."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds."""
+
+    outcome: str
+    reason: str
+    folder: Path
+    report: Mapping[str, Any]
+    interrupted: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """0 placed, 130 interrupted, 1 otherwise."""
+        return 0 if self.outcome == "placed" else 130 if self.interrupted else 1
+
+    def __str__(self) -> str:
+        return f"{self.outcome}: {self.reason}"
+
+    def __repr__(self) -> str:
+        return f"<RunOutcome {self.outcome}, run {self.folder.name}>"
+
+    def _repr_html_(self) -> str:
+        measured = ((str(row["name"]), told(row)) for row in self.report.get("measured") or ())
+        return table(f"{self.outcome}: run {self.folder.name}", [("reason", self.reason), *measured])
+
+
+@dataclass(frozen=True, eq=False)
+class JobRun:
+    """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report.
+
+    `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
+    faults or look at the truth. `earlier` is the sweep of a run that this one resumes.
+    """
+
+    run: Run[Any]
+    config: CellConfig
+    devices: Devices
+    job: Job
+    nominal: NominalSurface
+    calibration: CellCalibration
+    info: Mapping[str, Any]
+    inline: tuple[Observer, ...] = ()
+    earlier: StoredSweep | None = None
+
+    def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
+        """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
+        try:
+            folder = new_run(root)
+            self._keep_inputs(folder)
+            journal = Journal(folder, folder.name, self._facts())
+        except (OSError, JournalError) as error:
+            raise CellError(f"no run can be recorded in {root}: {error}") from error
+        self.run.folder = folder
+        try:
+            with run_log(folder):
+                return self._recorded(folder, journal, whereabouts)
+        finally:
+            journal.close()
+
+    def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
+        started = time.time()
+        witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
+        observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
+        with FrameStore(folder / "frames") as frames:
+            work = JobWork(
+                self.config,
+                self.job,
+                self.nominal,
+                self.calibration,
+                self.devices,
+                frames,
+                folder,
+                whereabouts,
+                self.earlier,
+            )
+            runner = Runner(
+                sequence=Sequence(),
+                steps=work.steps(),
+                policy=replace(Policy(), simulated_person=self.config.cell.confirm == "simulated"),
+                journal=journal,
+                clock=self.devices.clock,
+                classify=classify,
+                safe_stop=lambda reason: stop_cell(self.devices),
+                observer=each_of(observers),
+                recover=self._recover,
+                health=lambda: require_healthy(self.devices),
+                control=self.run.control,
+            )
+            result = runner.run()
+        if result.outcome is not Outcome.PLACED:
+            result = replace(result, reason=work.part.told(result.reason))
+        facts = {**self._facts(), "part": work.part.state.value}
+        report = make_report(
+            folder, self.config, self.job, self.nominal, work.repeatability, result, facts, started, witness, frames,
+        )  # fmt: skip
+        interrupted = self.run.control.signal is not None
+        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "kind": "job",
+            "pid": os.getpid(),
+            "cell": self.config.cell.name,
+            "job": self.job.job.name,
+            **self.info,
+            "speed": self.config.cell.time_scale,
+            "configuration_hash": self.config.calibration_hash(),
+            "calibration_hash": self.calibration.hash(),
+            "calibration_date": self.calibration.date,
+        }
+
+    def _keep_inputs(self, folder: Path) -> None:
+        write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
+        write_json(folder / "job.json", self.job.model_dump(mode="json"))
+        save_calibration(self.calibration, folder / "calibration.json")
+
+    def _recover(self, error: BaseException, token: CancelToken, confirmed: bool) -> None:
+        """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
+        self.devices.gate.enter(token)
+        token.check()
+        if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
+            arm = self.devices.arm
+            self.devices.gate.begin(lambda: arm.recover(confirmed=confirmed), arm.stop)
+        elif isinstance(error, DeviceError) and error.device == "vehicle":
+            self.devices.vehicle.recover()
+
+
+def each_of(observers: tuple[Observer, ...]) -> Observer:
+    """One observer that tells all; one that fails is told nothing more and keeps no other from listening."""
+    listening = list(observers)
+
+    def tell(event: Event) -> None:
+        for observer in list(listening):
+            try:
+                observer(event)
+            except Exception as error:
+                listening.remove(observer)
+                log.warning("an observer of the run failed and is told nothing more: %s", error)
+
+    return tell
+
+
+def classify(error: BaseException) -> Failure:
+    """What a step's exception means for the run; what failed besides, as it was ended, is told after it."""
+    failure = _classify(error)
+    if notes := getattr(error, "__notes__", ()):
+        return replace(failure, reason="; ".join([failure.reason, *notes]))
+    return failure
+
+
+def _classify(error: BaseException) -> Failure:
+    match error:
+        case RefusedError() | CalibrationStale() | ConfigError():
+            return Failure(Outcome.REFUSED, str(error), type(error).__name__)
+        case Aborted():
+            return Failure(Outcome.ABORTED, str(error), "aborted")
+        case DeviceFault():
+            person = error.code in CONFIRMED_BY_A_PERSON
+            return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable, person)
+        case CellError():
+            return Failure(Outcome.FAULTED, str(error), type(error).__name__)
+    return Failure(Outcome.FAULTED, f"unexpected {type(error).__name__}: {error}", "internal")

@@ -1,0 +1,164 @@
+"""Work outside a job as a recorded run: calibration, verification, homing, jogs.
+
+It has a folder, a journal and a report like a job's run, listens to the same requests, and whatever ends it early stops
+the cell first.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cell.devices.assembly import Devices
+from cell.devices.stopping import require_healthy, stop_not_confirmed
+from cell.run.folder import REPORT, new_run, when, write_json
+from cell.run.logs import run_log
+from cell.run.run import Run
+from cell.version import release
+from drivers.errors import Aborted, CellError, Interrupted, RefusedError
+from statemachine.journal import Journal, JournalError
+from statemachine.step import Event
+from statemachine.watch import Call
+
+POLL_S = 0.05
+GRACE_S = 5.0
+"""Wall seconds that stopped work has to end."""
+HEALTH_POLLS = 2
+
+Made = TypeVar("Made")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Hands:
+    """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused."""
+
+    check: Callable[[], None]
+    safe_point: Callable[[], None]
+    progress: Callable[[float, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedWork:
+    """Work of one kind on the cell's devices, recorded below `root`; `info` goes into the journal and the report.
+
+    `health(devices)` is called about ten times a second, and raises what must end the work whatever it does.
+    """
+
+    run: Run[Any]
+    kind: str
+    devices: Devices
+    root: Path
+    info: Mapping[str, Any]
+    health: Callable[[Devices], None] = require_healthy
+
+    def perform(self, work: Callable[[Hands], Made]) -> Made:
+        """Do `work` and record how it ended.
+
+        Raises `Aborted` when the run was ended (`Interrupted` by a signal), `DeviceFault` when the stop was not
+        confirmed, else what `work` raised; the cell is stopped first.
+        """
+        started = time.time()
+        try:
+            folder = new_run(self.root)
+            facts = {"kind": self.kind, "pid": os.getpid(), **self.info}
+            journal = Journal(folder, folder.name, facts)
+        except (OSError, JournalError) as error:
+            raise CellError(f"no run can be recorded in {self.root}: {error}") from error
+        outer, self.run.folder = self.run.folder, folder
+        outcome, reason = "done", f"{self.kind} done"
+        ended: BaseException | None = None
+        try:
+            with run_log(folder):
+                return self._watched(work, journal)
+        except BaseException as error:
+            ended, outcome, reason = error, _outcome(error), str(error)
+            raise
+        finally:
+            if self.run.kind == self.kind:
+                self.run.tell(Event("run_ended", self.kind, {"outcome": outcome, "reason": reason}))
+            report = {
+                "run": folder.name, "version": release(), "outcome": outcome, "reason": reason,
+                "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),
+                **facts,
+            }  # fmt: skip
+            for action in (
+                lambda: journal.run_ended(outcome, reason), journal.close, lambda: write_json(folder / REPORT, report),
+            ):  # fmt: skip
+                _last(action, ended)
+            self.run.folder = outer or folder
+
+    def _watched(self, work: Callable[[Hands], Made], journal: Journal) -> Made:
+        control = self.run.control
+        hands = Hands(control.token.check, lambda: control.safe_point(control.token, self._say), self._progress)
+        made: list[Made] = []
+
+        def begin() -> None:
+            self.devices.gate.enter(control.token)
+            control.token.check()
+            made.append(work(hands))
+
+        key = journal.step_started(self.kind, 1)
+        begun = time.monotonic()
+        call = Call(self.kind, begin)
+        ailing: Exception | None = None
+        polls = 0
+        while not call.done.wait(POLL_S) and control.token.reason is None and ailing is None:
+            polls += 1
+            try:
+                control.obey(journal.take_requests())
+                if polls % HEALTH_POLLS == 0:
+                    self.health(self.devices)
+            # Whatever keeps it from being watched ends the work; it must not go on unseen.
+            except Exception as found:
+                ailing = found
+        ended = control.token.reason
+        problems: list[str] = []
+        error = ailing or call.error
+        if ended is not None or error is not None:
+            control.token.cancel(str(error))
+            problems = self.devices.stop()
+            if not call.done.wait(GRACE_S):
+                problems.append(f"the {self.kind} was still busy {GRACE_S:g} s after the stop")
+        said = ended or (None if error is None else str(error))
+        _last(lambda: journal.step_ended(key, time.monotonic() - begun, error=said), error)
+        unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
+        if ended is not None:
+            text = f"{self.kind} {ended}" if control.signal is not None else f"{self.kind} ended: {ended}"
+            kind = Interrupted if control.signal is not None else Aborted
+            raise kind(f"{text}; the cell was stopped{unconfirmed}")
+        if error is not None and problems:
+            raise stop_not_confirmed(f"{self.kind}: {error}{unconfirmed}") from error
+        if error is not None:
+            raise error
+        return made[0]
+
+    def _progress(self, fraction: float, text: str) -> None:
+        self.run.control.token.check()
+        self.run.tell(Event("progress", self.kind, {"fraction": fraction, "text": text}))
+
+    def _say(self, held: bool) -> None:
+        text = "held before its next motion" if held else "goes on"
+        self.run.tell(Event("paused" if held else "going_on", self.kind, {"text": text}))
+
+
+def _last(action: Callable[[], object], ended: BaseException | None) -> None:
+    """Do `action` at the end; should it fail, that is noted on what the work `ended` with, and replaces nothing."""
+    try:
+        action()
+    except (JournalError, OSError, CellError) as error:
+        log.warning("the end could not be recorded: %s", error)
+        if ended is not None:
+            ended.add_note(f"and the end could not be recorded: {error}")
+
+
+def _outcome(error: BaseException) -> str:
+    if isinstance(error, Aborted):
+        return "aborted"
+    return "refused" if isinstance(error, RefusedError) else "faulted"

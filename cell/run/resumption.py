@@ -1,0 +1,79 @@
+"""Which run can be resumed, and with what: its job as it was, and its sweep if that may still hold."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cell.calibration.store import CellCalibration
+from cell.config import CellConfig
+from cell.job import Job, job_path, load_job
+from cell.steps.stored_sweep import FILE, StoredSweep
+from drivers.errors import ConfigError, RefusedError
+from statemachine.journal import JournalError, read
+
+
+@dataclass(frozen=True)
+class UnfinishedRun:
+    """A run that did not come to its end: its folder, its job, and what its journal says of it."""
+
+    folder: Path
+    job: str
+    info: dict[str, Any]
+
+    @classmethod
+    def find(cls, folder: Path) -> UnfinishedRun:
+        """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now."""
+        try:
+            record = read(folder)
+        except JournalError as error:
+            raise ConfigError(f"{folder} cannot be resumed: {error}") from error
+        run = record.run
+        if run.outcome in ("placed", "refused"):
+            raise ConfigError(
+                f"run {folder.name} has ended {run.outcome} ({run.reason}); only a run that was aborted, faulted or "
+                "cut short can be resumed. Run its job again"
+            )
+        if any(event.kind == "note" and event.data.get("part") == "released" for event in record.events):
+            raise ConfigError(
+                f"run {folder.name} had put its part down already, only the retreat failed: there is nothing to "
+                "resume. Look at the part, fold the arm with `cell home`, then run the job with the next part"
+            )
+        if "job_file" not in run.info:
+            raise ConfigError(f"run {folder.name} does not say which file its job was; run the job again")
+        job, told = run.info["job_file"], run.info["job_hash"]
+        if job_hash(job) != told:
+            raise ConfigError(f"{job} or its mesh was changed since run {folder.name}; run the job again")
+        return cls(folder, job, run.info)
+
+    def sweep(self, job: Job, config: CellConfig, calibration: CellCalibration) -> tuple[StoredSweep | None, str]:
+        """The run's sweep, or None, and why it is or is not used; whether the station moved is seen later."""
+        if not (self.folder / FILE).exists():
+            return None, f"run {self.folder.name} had not finished its sweep"
+        if self.info["simulated"]:
+            return None, "the simulated world of that run has ended"
+        now = {"configuration_hash": config.calibration_hash(), "calibration_hash": calibration.hash()}
+        for name, value in now.items():
+            if self.info[name] != value:
+                return None, f"the {name.removesuffix('_hash')} was changed since run {self.folder.name}"
+        try:
+            stored = StoredSweep.load(self.folder, calibration.scan.geometry(), job.scan)
+        except RefusedError as error:
+            return None, str(error)
+        return stored, f"the sweep of run {self.folder.name} is used if the board has not moved"
+
+
+def job_source(name: str | Path) -> dict[str, object]:
+    """For journal and report: the job's file and its hash, and the file and the hash of its mesh alone."""
+    path = str(job_path(name).resolve())
+    _, mesh = load_job(path)
+    shape = {"file": str(mesh.resolve()), "sha256": hashlib.sha256(mesh.read_bytes()).hexdigest()}
+    return {"job_file": path, "job_hash": job_hash(path), "mesh": shape}
+
+
+def job_hash(name: str | Path) -> str:
+    """Hash of a job's file and of its mesh; `ConfigError` when there is no such job any more."""
+    _, mesh = load_job(name)
+    return hashlib.sha256(job_path(name).read_bytes() + mesh.read_bytes()).hexdigest()[:16]

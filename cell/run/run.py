@@ -1,0 +1,148 @@
+"""A run as its starter holds it: pause it, let it go on, confirm, abort, listen, wait for its result.
+
+Jobs, calibrations, verifications, homing and jogs are all runs. There is one at a time in a cell.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from cell.run.events import Detached, Subscription
+from drivers.errors import DeadlineError
+from statemachine.control import RunControl
+from statemachine.step import Event, Observer
+from statemachine.watch import Call, SignalInterrupt, SignalWatch
+
+Result = TypeVar("Result")
+
+POLL_S = 0.05
+KEPT_EVENTS = 1000
+
+log = logging.getLogger(__name__)
+
+
+class Run(Generic[Result]):
+    """A run that was begun. Every method may be called from any thread.
+
+    `kind` is job, calibration, verification, homing or jog. `folder` is where the run is recorded, None until then.
+    """
+
+    def __init__(self, kind: str, work: Callable[[Run[Result]], Result], observer: Observer | None = None) -> None:
+        """Begin `work(run)` in a thread of its own. `observer` is told every event, in a thread of its own."""
+        self.kind = kind
+        self.folder: Path | None = None
+        self.control = RunControl()
+        self._telling = threading.Lock()
+        self._over = False
+        self._subscriptions: list[Subscription] = []
+        self._past: deque[Event] = deque(maxlen=KEPT_EVENTS)
+        self._observer = None if observer is None else Detached(observer)
+        self._work = work
+        self._call = Call(f"run: {kind}", self._perform)
+
+    def pause(self) -> None:
+        """Hold the run at its next safe point: before its next free motion or its next step."""
+        self.control.pause()
+
+    def go_on(self) -> None:
+        """Let a paused run go on."""
+        self.control.go_on()
+
+    def abort(self, reason: str = "aborted by the program that began it") -> None:
+        """End the run: what moves is stopped at once. `result()` then says that it was aborted."""
+        self.control.abort(reason)
+
+    def confirm(self, by: str = "the program that began the run", number: int | None = None) -> bool:
+        """Say that a person has looked and the run may go on; False when it waits for nobody's word.
+
+        With the `number` of a `ConfirmNeeded` the word counts for that question only.
+        """
+        return self.control.confirm(by, number)
+
+    def events(self) -> Subscription:
+        """Iterate over the run's events (`events.py`) from its beginning to its end; who is slow misses progress."""
+        subscription = Subscription()
+        with self._telling:
+            for event in self._past:
+                subscription.put(event)
+            self._subscriptions.append(subscription)
+            if self._over:
+                subscription.close()
+        return subscription
+
+    @property
+    def done(self) -> bool:
+        """Whether the run has ended."""
+        return self._call.done.is_set()
+
+    def result(self, timeout: float | None = None) -> Result:
+        """Wait for the end, at most `timeout` wall seconds (`DeadlineError`; the run goes on), and what it made.
+
+        Ctrl-C, SIGTERM and SIGHUP end the run meanwhile, if this is the main thread. Raises what the run raised.
+        """
+        until = math.inf if timeout is None else time.monotonic() + timeout
+        with SignalWatch() as signals:
+            while not self._call.done.wait(max(0.0, min(POLL_S, until - time.monotonic()))):
+                if signals.reason is not None:
+                    self.control.abort(signals.reason, signals.number)
+                if time.monotonic() > until:
+                    raise DeadlineError(self.kind, f"has not ended within {timeout:g} s; it goes on")
+        # One that came as the run ended must not let the program go on to the next.
+        if signals.number is not None and self.control.signal is None:
+            raise SignalInterrupt(signals.number)
+        if self._call.error is not None:
+            raise self._call.error
+        result: Result = self._call.result  # type: ignore[assignment]
+        return result
+
+    def ended(self, timeout: float) -> None:
+        """Wait for the end, whatever it is; `DeadlineError` when it does not come within `timeout` wall seconds."""
+        if not self._call.done.wait(timeout):
+            raise DeadlineError(self.kind, f"has not ended within {timeout:g} s")
+
+    def tell(self, event: Event) -> None:
+        """The run's work says what happens; nobody who listens can hold it up."""
+        if event.kind != "progress":
+            log.info("%s %s %s", event.step or self.kind, event.kind, json.dumps(dict(event.data), default=_plain))
+        with self._telling:
+            if event.kind != "progress":
+                self._past.append(event)
+            for subscription in self._subscriptions:
+                subscription.put(event)
+        if self._observer is not None:
+            self._observer(event)
+
+    def progress(self, fraction: float, text: str) -> None:
+        """Tell how far the run's work is, 0 to 1."""
+        self.tell(Event("progress", self.kind, {"fraction": fraction, "text": text}))
+
+    def _perform(self) -> Result:
+        try:
+            return self._work(self)
+        except BaseException as error:
+            log.error("the %s ended: %s", self.kind, error)
+            raise
+        finally:
+            with self._telling:
+                self._over = True
+                for subscription in self._subscriptions:
+                    subscription.close()
+            if self._observer is not None:
+                self._observer.close()
+                if self._observer.failure is not None:
+                    log.warning("an observer of the run failed and was told nothing more: %s", self._observer.failure)
+
+
+def _plain(value: object) -> object:
+    """Numbers of numpy as plain ones, all else in words."""
+    return value.item() if isinstance(value, np.generic) else str(value)

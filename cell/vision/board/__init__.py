@@ -1,0 +1,1 @@
+"""Calibration boards in pictures: found, identified, measured, or refused."""

@@ -1,0 +1,205 @@
+"""A calibration board in a picture: its points, and its pose in front of a calibrated camera.
+
+The one way in for all kinds of boards; each refusal says why. `board_spec.py` names boards, `dot_board.py` and
+`chess.py` find them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pinocchio as pin
+
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.circles import lens_shift, seen_centres
+from cell.geometry.poses import difference, from_parts, perturbed, transform
+from cell.vision.board.charuco import find_charuco
+from cell.vision.board.chess import find_chessboard
+from cell.vision.board.dot_board import find_dots
+from cell.vision.board.outliers import without_outliers
+from cell.vision.board.spec import DOTS, BoardSpec
+from cell.vision.board.view import BoardView
+from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
+
+STEPS = 30
+SETTLED = 1e-7
+# The second pose that a flat board allows must fit worse by this much in χ².
+CLEAR_CHI2 = 16.0
+# Deviations from which a point counts less, and the median of the squared length of two Gaussian variables.
+OUTLYING = 3.0
+MEDIAN_SQUARE = 1.386
+ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """Pose of a board in the camera frame.
+
+    `covariance` (6, 6) of (translation, rotation) in camera axes, m and rad, from each point's σ, larger where the
+    residuals say more; `rms_px` of all residual components; `obliquity` in rad between the board's normal and the line
+    of sight to its middle; `second_rms_px` that of the other pose that the flat board allows, NaN when there is none.
+    """
+
+    camera_from_board: pin.SE3
+    covariance: Array
+    rms_px: float
+    obliquity: float
+    second_rms_px: float
+
+
+def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None) -> BoardView:
+    """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
+
+    `size` is the expected (width, height). Raises PictureRefused with the reason: black, saturated, wrong size, no
+    board, ambiguous order, mirrored.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
+    check_picture(image, size)
+    if spec.kind in DOTS:
+        return without_outliers(find_dots(image, spec))
+    found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
+    return without_outliers(found)
+
+
+def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
+    """Pose of the board of a view: robust least squares on the pixels, each point with its own σ; dots as circles.
+
+    Raises PictureRefused when two poses explain the picture about equally well, or none does.
+    """
+    if view.size != (camera.width, camera.height):
+        raise PictureRefused(
+            Reason.WRONG_SIZE,
+            f"the picture is {view.size[0]}×{view.size[1]} px, the camera's calibration {camera.width}×{camera.height}",
+        )
+    fits = sorted((_robust(view, camera, start) for start in _starts(view, camera)), key=lambda fit: fit.loss(1.0))
+    if not fits:
+        raise PictureRefused(Reason.AMBIGUOUS, "the board's points allow no pose; are they on one line?")
+    best = fits[0]
+    pose, scale = best.pose, best.scale
+    covariance: Array = np.asarray(scale**2 * np.linalg.inv(best.normal), dtype=np.float64)
+    second = np.nan
+    if len(fits) > 1:
+        apart = difference(fits[1].pose, pose)
+        distinct = np.linalg.norm(apart[3:]) > 3 * np.sqrt(np.trace(covariance[3:, 3:]))
+        if distinct and (fits[1].loss(scale) - best.loss(scale)) < CLEAR_CHI2:
+            raise PictureRefused(
+                Reason.AMBIGUOUS,
+                f"two poses {np.degrees(np.linalg.norm(apart[3:])):.1f}° apart explain the picture of {view.spec.name} "
+                "equally well; go nearer or look at it from another side",
+            )
+        if distinct:
+            second = fits[1].rms_px
+    normal_out = pose.rotation[:, 2]
+    middle = transform(pose, view.object_points.mean(axis=0))
+    cosine = float(normal_out @ middle / np.linalg.norm(middle))
+    if cosine <= 0:
+        raise PictureRefused(Reason.MIRRORED, f"{view.spec.name} is seen from behind: the picture is mirrored")
+    return BoardPose(pose, covariance, best.rms_px, float(np.arccos(min(1.0, cosine))), second)
+
+
+def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_radius: float) -> Array:
+    """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
+    centres = transform(camera_from_board, points)
+    if dot_radius <= 0:
+        return camera.project(centres)
+    normal = camera_from_board.rotation[:, 2]
+    pixels = camera.project(seen_centres(centres, normal, dot_radius))
+    return np.asarray(pixels + lens_shift(camera, centres, normal, dot_radius), dtype=np.float64)
+
+
+def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
+    """The one or two poses that a flat board allows in closed form."""
+    ideal = camera.normalised(view.pixels)
+    if not np.isfinite(ideal).all():
+        return []
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        view.object_points, ideal.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    return [
+        from_parts(np.asarray(t, dtype=np.float64).ravel(), np.asarray(cv2.Rodrigues(r)[0], dtype=np.float64))
+        for r, t in zip(turns, shifts, strict=True)
+        if np.isfinite(t).all()
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A pose, the residuals (n, 2) in px and in σ, the weights (n,) and the normal matrix (6, 6) in units of σ."""
+
+    pose: pin.SE3
+    residuals: Array
+    whitened: Array
+    weights: Array
+    normal: Array
+
+    @property
+    def rms_px(self) -> float:
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def scale(self) -> float:
+        """By how much the points depart more from the pose than their σ say; at least 1.
+
+        Less is not believed: an error that all points share shows in no residual.
+        """
+        squares = float(self.weights @ np.square(self.whitened).sum(axis=1))
+        freedom = max(1.0, 2 * float(self.weights.sum()) - 6)
+        return float(np.sqrt(max(1.0, squares / freedom)))
+
+    def loss(self, scale: float) -> float:
+        """χ² with points beyond `OUTLYING` deviations of `scale` counted by their logarithm."""
+        lengths = np.linalg.norm(self.whitened, axis=1) / scale
+        far = np.maximum(lengths / OUTLYING, 1.0)
+        return float(np.sum(np.minimum(lengths, OUTLYING) ** 2 + 2 * OUTLYING**2 * np.log(far)))
+
+
+def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
+    """The pose nearest to `start`; points that the others contradict, as in a glint or a shadow's edge, count less."""
+    fit = _refined(view, camera, start, np.ones(len(view.ids)))
+    for _ in range(ROUNDS):
+        squares = np.square(fit.whitened).sum(axis=1)
+        limit = OUTLYING**2 * max(1.0, float(np.median(squares)) / MEDIAN_SQUARE)
+        weights = np.minimum(1.0, limit / np.maximum(squares, 1e-12))
+        if np.abs(weights - fit.weights).max() < 0.01:
+            break
+        fit = _refined(view, camera, fit.pose, weights)
+    return fit
+
+
+def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _Fit:
+    """Levenberg's method on the pose, the points weighted by `weights` (n,) over their variances."""
+    points = view.object_points
+    factor = np.sqrt(weights) / view.sigma
+
+    def residual_of(candidate: pin.SE3) -> tuple[Array, float]:
+        residual = view.pixels - predict(camera, candidate, points, view.dot_radius)
+        total = float(np.sum((factor[:, None] * residual) ** 2))
+        return residual, total if np.isfinite(total) else np.inf
+
+    damping = 1e-6
+    residual, squares = residual_of(pose)
+    normal = np.eye(6)
+    for _ in range(STEPS):
+        arm = points @ pose.rotation.T
+        _, by_point, _ = camera.project_with_jacobians(arm + pose.translation)
+        jacobian = np.concatenate([by_point, np.cross(arm[:, None, :], by_point)], axis=2)
+        jacobian = (factor[:, None, None] * jacobian).reshape(-1, 6)
+        normal = jacobian.T @ jacobian
+        right = jacobian.T @ (factor[:, None] * residual).ravel()
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+        candidate = perturbed(pose, step)
+        new_residual, new_squares = residual_of(candidate)
+        if new_squares <= squares:
+            gain = squares - new_squares
+            pose, residual, squares = candidate, new_residual, new_squares
+            damping = max(1e-9, 0.1 * damping)
+            if gain <= SETTLED * squares:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return _Fit(pose, residual, residual / view.sigma[:, None], weights, normal)

@@ -1,0 +1,179 @@
+"""Chessboards in a picture: crossings, their lattice, its outline and colours, then every corner that must be there.
+
+Corners come in one order: x along the columns, y down the rows, z into the board, the first square black.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cell.geometry.camera import Array
+from cell.vision.board.corner_fit import fit_corners
+from cell.vision.board.corners import Corners, corner_lattices, find_corners
+from cell.vision.board.ends import check_chess_ends
+from cell.vision.board.identify import Places, by_outline
+from cell.vision.board.plane_map import PlaneMap
+from cell.vision.board.spec import BoardSpec
+from cell.vision.board.view import BoardView
+from cell.vision.pictures import Image, PictureRefused, Reason, only_one
+
+LEAST_CORNERS = 6
+LEAST_SHARE = 0.5
+LEAST_SIGMA_PX = 0.0025
+LEAST_COLOURS = 0.85
+# The picture is searched at half its size first, where noise and blur are less.
+SCALES = (0.5, 1.0, 0.25)
+# A laser line is thinner than this and longer than this share of the picture.
+STREAK_PX = 31
+STREAK_SHARE = 0.15
+
+
+def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
+    """The inner corners of a chessboard in an 8-bit image (h, w). Raises PictureRefused."""
+    least = max(LEAST_CORNERS, int(0.3 * len(spec.lattice())))
+    lit = laser_streaks(image)
+    refusals: list[PictureRefused] = []
+    for scale in SCALES:
+        if scale * min(image.shape) < 100:
+            continue
+        corners = find_corners(image, scale)
+        if lit.any():
+            clear = ~_near(lit, corners.places, 2)
+            corners = Corners(corners.places[clear], corners.dark[clear])
+        views = []
+        for index, places in corner_lattices(corners, least):
+            try:
+                views.append(_view(image, lit, spec, corners, index, places))
+            except PictureRefused as refused:
+                refusals.append(refused)
+        if views:
+            return only_one(views, spec.name)
+    if refusals:
+        raise max(refusals, key=lambda r: r.reason is Reason.AMBIGUOUS)
+    raise PictureRefused(
+        Reason.NO_BOARD, f"no {spec.name} in the picture: show all of its squares with their white margin, in focus"
+    )
+
+
+def _view(
+    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places
+) -> BoardView:
+    index, places = _extended(corners, index, places, spec.name)
+    pixels = corners.places[index]
+    orders = by_outline(spec, places, LEAST_SHARE)
+    order = _by_colour(spec, orders, pixels, corners.dark[index])
+    known = (order >= 0).all(axis=1)
+    plane = PlaneMap.fit(order[known], pixels[known], _tolerance(order[known], pixels[known]), spec.name)
+    lattice = spec.lattice()
+    flat = lattice.astype(np.float64)
+    starts = plane.pixels(flat)
+    # The cell between the corners (0, 0) and (1, 1) has the colour of the first square.
+    dark_first = _colours(order[known], plane, corners.dark[index][known]) > 0
+    even = order[known].sum(axis=1) % 2 == 0
+    first_is_dark = bool((dark_first == even).mean() > 0.5)
+    dark = np.asarray((lattice.sum(axis=1) % 2 == 0) == first_is_dark, dtype=np.bool_)
+    measured, sigma, _ = fit_corners(image, starts, plane.steps(flat), dark)
+    good = np.isfinite(sigma)
+    if lit.any():
+        good &= ~_near(lit, starts, 5)
+    if good.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(lattice)):
+        raise PictureRefused(
+            Reason.NO_BOARD, f"only {good.sum()} of the {len(lattice)} corners of {spec.name} could be measured"
+        )
+    check_chess_ends(image, spec, PlaneMap.fit(flat[good], measured[good], 3.0, spec.name))
+    ids = np.flatnonzero(good)
+    size = (image.shape[1], image.shape[0])
+    return BoardView(spec, size, ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX), spec.symmetric)
+
+
+def _extended(corners: Corners, index: NDArray[np.intp], places: Places, name: str) -> tuple[NDArray[np.intp], Places]:
+    """The lattice with the corners beyond a gap, such as a cable, that fit it."""
+    tree = cKDTree(corners.places)
+    for _ in range(3):
+        pixels = corners.places[index]
+        plane = PlaneMap.fit(places, pixels, _tolerance(places, pixels), name)
+        low, high = places.min(axis=0) - 2, places.max(axis=0) + 2
+        grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+        held = {tuple(p) for p in places}
+        open_places = np.array([p for p in grid if tuple(p) not in held]).reshape(-1, 2)
+        flat = open_places.astype(np.float64)
+        guess, steps = plane.pixels(flat), plane.steps(flat)
+        distance, who = tree.query(guess)
+        near = np.asarray(distance) < 0.2 * np.linalg.norm(steps, axis=1).min(axis=1)
+        near &= ~np.isin(who, index)
+        colours = _colours(places, plane, corners.dark[index])
+        even = float(np.sign(np.median(colours * np.where(places.sum(axis=1) % 2 == 0, 1, -1)) or 1.0))
+        own = _colours(open_places, plane, corners.dark[who])
+        near &= own * np.where(open_places.sum(axis=1) % 2 == 0, 1, -1) * even > 0
+        if not near.any():
+            break
+        index = np.concatenate([index, np.asarray(who)[near]])
+        places = np.concatenate([places, open_places[near]])
+        index, first = np.unique(index, return_index=True)
+        places = places[first]
+    return index, places
+
+
+def _tolerance(places: Places, pixels: Array) -> float:
+    """A quarter of a pitch in px: a lens bends a board by less than that between its corners."""
+    fit = np.linalg.lstsq(np.column_stack([places, np.ones(len(places))]).astype(np.float64), pixels, rcond=None)[0]
+    return max(2.0, 0.25 * float(np.sqrt(abs(np.linalg.det(fit[:2])))))
+
+
+def _colours(places: Places, plane: PlaneMap, dark: Array) -> Array:
+    """Positive (n,) where the square between +x and +y is dark; `dark` (n,) are directions of dark sectors."""
+    steps = plane.steps(places.astype(np.float64))
+    direction = np.column_stack([np.cos(dark), np.sin(dark)])
+    local = np.linalg.solve(steps, direction[:, :, None])[:, :, 0]
+    return np.asarray(local[:, 0] * local[:, 1], dtype=np.float64)
+
+
+def _by_colour(spec: BoardSpec, orders: list[Places], pixels: Array, dark: Array) -> Places:
+    """The order in which the first square is black; of a symmetric board that which begins at the upper left."""
+    fitting = []
+    for order in orders:
+        known = (order >= 0).all(axis=1)
+        plane = PlaneMap.fit(order[known], pixels[known], _tolerance(order[known], pixels[known]), spec.name)
+        dark_first = _colours(order[known], plane, dark[known]) > 0
+        share = float((dark_first == (order[known].sum(axis=1) % 2 == 0)).mean())
+        fitting.append((share, float(plane.pixels(np.zeros((1, 2))).sum()), order))
+    matching = [f for f in fitting if f[0] > LEAST_COLOURS]
+    if spec.symmetric and not matching:
+        matching = [f for f in fitting if f[0] < 1 - LEAST_COLOURS]
+    if not matching or len(matching) > (2 if spec.symmetric else 1):
+        raise PictureRefused(
+            Reason.AMBIGUOUS,
+            f"the corners found fit {spec.name} in {len(matching)} ways, so their order is not certain; show the whole "
+            "board",
+        )
+    return min(matching, key=lambda f: f[1])[2]
+
+
+def laser_streaks(image: Image) -> Image:
+    """Mask (h, w) of long thin saturated streaks: a laser line, not the white of an over-exposed board or marker."""
+    white = (image >= 250).astype(np.uint8)
+    mask = np.zeros_like(white)
+    if not white.any():
+        return mask
+    wide = cv2.morphologyEx(white, cv2.MORPH_OPEN, np.ones((STREAK_PX, STREAK_PX), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.subtract(white, wide), connectivity=8)
+    length = np.hypot(stats[:, 2], stats[:, 3])
+    long = (length >= STREAK_SHARE * max(image.shape)) & (stats[:, 4] <= STREAK_PX * length)
+    for label in np.flatnonzero(long[1:]) + 1:
+        x, y, w, h, _ = stats[label]
+        inside = labels[y : y + h, x : x + w] == label
+        across = np.linalg.eigvalsh(np.cov(np.argwhere(inside).T.astype(np.float64)))[0]
+        if across < (STREAK_PX / 3) ** 2:
+            mask[y : y + h, x : x + w][inside] = 1
+    return np.asarray(cv2.dilate(mask, np.ones((9, 9), np.uint8)), dtype=np.uint8)
+
+
+def _near(lit: Image, corners: Array, reach: int) -> NDArray[np.bool_]:
+    """Corners (n,) whose surroundings of ± reach px contain laser light."""
+    wide = cv2.dilate(lit, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    x = np.round(corners[:, 0]).astype(int).clip(0, lit.shape[1] - 1)
+    y = np.round(corners[:, 1]).astype(int).clip(0, lit.shape[0] - 1)
+    return np.asarray(wide[y, x] > 0, dtype=np.bool_)

@@ -1,0 +1,231 @@
+"""Finds dots in a picture and measures their centres from their edges, to some hundredths of a pixel.
+
+Blobs come from a local threshold at several scales; a dot's edge is then looked for along rays from its middle, so that
+a laser line across a dot spoils some rays and not the centre. Theory sheet, part 4.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.camera import Array
+from cell.vision.board.lattice import Blobs
+from cell.vision.pictures import Image
+
+Outline = NDArray[np.int32]
+
+RAYS = 32
+SAMPLES = 33
+REACH = (0.15, 1.75)
+LEAST_AREA_PX = 9.0
+ROUNDS = 4
+UNIT = np.column_stack([f(np.arange(RAYS) * 2 * np.pi / RAYS) for f in (np.cos, np.sin)])
+# Share of the step from dot to board by which light that falls off evenly may depart from a plane.
+MOST_UNEVEN = 0.06
+MOST_SLOPE = 0.3
+WHITE_DN = 253
+# Of the edge, in radii: less is not told from none.
+LEAST_SCATTER = 1e-3
+
+
+def find_blobs(image: Image, window: int, offset: float) -> Blobs:
+    """Dark elliptic blobs: darker by `offset` DN than the mean of a `window` × `window` px neighbourhood."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0)
+    mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REPLICATE)
+    dark = (smooth.astype(np.int16) < mean.astype(np.int16) - int(offset)).astype(np.uint8)
+    # Grains of noise are opened away: what is not three pixels wide is too small for a dot.
+    dark = np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))))
+    contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    # A contour with a parent is a hole, such as the middle of a ring.
+    outer = [c for c, links in zip(contours, hierarchy[0] if contours else (), strict=True) if links[3] < 0]
+    outlines = [c for c in outer if len(c) >= 8]
+    if not outlines:
+        return Blobs(np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return _ellipses([np.asarray(c, dtype=np.int32) for c in outlines], (image.shape[1], image.shape[0]))
+
+
+def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
+    """Those of the outlines (m, 1, 2), all at once, that are whole and elliptic."""
+    lengths = np.array([len(c) for c in outlines])
+    begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    points = np.concatenate(outlines)[:, 0, :].astype(np.float64)
+    low, high = np.minimum.reduceat(points, begins), np.maximum.reduceat(points, begins)
+    whole = (low > 0).all(axis=1) & (high < np.array(size) - 1).all(axis=1)
+    whole &= (high - low).max(axis=1) < 0.25 * max(size)
+    origin = 0.5 * (low + high)
+    x, y = (points - np.repeat(origin, lengths, axis=0)).T
+    following = np.arange(len(points)) + 1
+    following[begins + lengths - 1] = begins
+    xn, yn = x[following], y[following]
+    # Moments of the polygons by Green's theorem.
+    cross = x * yn - xn * y
+    terms = np.stack(
+        [
+            cross / 2,
+            cross * (x + xn) / 6,
+            cross * (y + yn) / 6,
+            cross * (x * x + x * xn + xn * xn) / 12,
+            cross * (x * (2 * y + yn) + xn * (y + 2 * yn)) / 24,
+            cross * (y * y + y * yn + yn * yn) / 12,
+        ]
+    )
+    area, sx, sy, xx, xy, yy = np.add.reduceat(terms, begins, axis=1)
+    sign = np.where(area < 0, -1.0, 1.0)
+    area, sx, sy, xx, xy, yy = (sign * m for m in (area, sx, sy, xx, xy, yy))
+    # A contour runs through pixel middles: it encloses half a pixel less all around.
+    whole &= (area >= 4) & (area + 0.5 * lengths >= LEAST_AREA_PX)
+    area, sx, sy, xx, xy, yy, origin = (m[whole] for m in (area, sx, sy, xx, xy, yy, origin))
+    middle = np.column_stack([sx, sy]) / area[:, None]
+    second = np.empty((len(area), 2, 2))
+    second[:, 0, 0], second[:, 1, 1] = xx / area - middle[:, 0] ** 2, yy / area - middle[:, 1] ** 2
+    second[:, 0, 1] = second[:, 1, 0] = xy / area - middle[:, 0] * middle[:, 1]
+    values, vectors = np.linalg.eigh(4 * second)
+    # The area of an ellipse of these second moments: the ratio is 1 for ellipses and less for other shapes.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        roundness = area / (np.pi * np.sqrt(values[:, 0] * values[:, 1]))
+    good = (values[:, 0] > 0) & (values[:, 0] >= 0.03 * values[:, 1]) & (roundness > 0.87) & (roundness < 1.1)
+    radii = np.sqrt(values[good]) + 0.5
+    shapes = np.einsum("nij,nj,nkj->nik", vectors[good], radii, vectors[good])
+    return Blobs((middle + origin)[good], shapes)
+
+
+def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array, Array]:
+    """Dots re-measured from their edges, one standard deviation (n,) of each centre in px, and ring scores (n, 2).
+
+    A dot whose edge is not found all around gets the deviation NaN. `rounds` of refinement: two to tell dots apart,
+    more to measure them.
+    """
+    picture = image.astype(np.float32)
+    centres, shapes = start.centres.copy(), start.shapes.copy()
+    rho = np.linspace(*REACH, SAMPLES)
+    twice = UNIT[:, :1] ** 2 - UNIT[:, 1:] ** 2
+    design = np.column_stack([np.ones(RAYS), UNIT, twice, 2 * UNIT[:, :1] * UNIT[:, 1:]])
+    sigma = np.full(len(centres), np.nan)
+    profiles = np.empty((len(centres), RAYS, SAMPLES))
+    for _ in range(rounds):
+        profiles = _sample(picture, centres, shapes, rho)
+        edge, good = _edges(profiles, rho)
+        coefficients, sigma, kept = _harmonics(edge, good, design)
+        moved = np.clip(coefficients, -0.5, 0.5)
+        moved[:, 0] = np.clip(coefficients[:, 0], 0.5, 1.6)
+        # A circle shifted by (a1, b1) and stretched by the second harmonic, in the dot's own normalised coordinates.
+        stretch = np.empty((len(centres), 2, 2))
+        stretch[:, 0, 0], stretch[:, 1, 1] = moved[:, 0] + moved[:, 3], moved[:, 0] - moved[:, 3]
+        stretch[:, 0, 1] = stretch[:, 1, 0] = moved[:, 4]
+        stretch = np.where(kept[:, None, None], stretch, np.eye(2))
+        centres = centres + np.where(kept[:, None], np.einsum("nij,nj->ni", shapes, moved[:, 1:3]), 0.0)
+        shapes = shapes @ stretch
+        sigma = np.where(kept, sigma * np.sqrt(np.abs(np.linalg.det(shapes))), np.nan)
+    # A dot that wandered off its blob measures something else.
+    wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
+    sigma[wandered > 0.7] = np.nan
+    return Blobs(centres, shapes), sigma, _ring_scores(profiles, rho)
+
+
+def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, rho: Array) -> Array:
+    """Grey values (n, rays, samples) along rays in the dots' normalised coordinates."""
+    directions = np.einsum("nij,kj->nki", shapes, UNIT)
+    places = centres[:, None, None, :] + directions[:, :, None, :] * rho[None, None, :, None]
+    flat = places.reshape(len(centres) * RAYS, len(rho), 2).astype(np.float32)
+    sampled = cv2.remap(picture, flat[:, :, 0], flat[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(len(centres), RAYS, len(rho)).astype(np.float64)
+
+
+def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where each ray (n, rays) leaves the dark, at half of the step, and whether it clearly does."""
+    inside = (rho > 0.55) & (rho < 0.8)
+    outside = (rho > 1.2) & (rho < 1.6)
+    bright = profiles[:, :, outside].mean(axis=2)
+    # Neighbouring rays see the same board; a laser line or a neighbour dot does not move their median.
+    ring = np.median(np.stack([np.roll(bright, k, axis=1) for k in range(-3, 4)]), axis=0)
+    dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
+    slope, even = _light(profiles[:, :, inside].mean(axis=2), rho[inside].mean(), ring, rho[outside].mean())
+    dark, bright = dark * (1 + slope), np.where(even, ring.mean(axis=1, keepdims=True) * (1 + slope), ring)
+    step = bright - dark
+    level = dark + 0.5 * step
+    start = int(np.searchsorted(rho, 0.5))
+    below = profiles[:, :, start:-1] < level[:, :, None]
+    above = profiles[:, :, start + 1 :] >= level[:, :, None]
+    crossing = below & above
+    first = crossing.argmax(axis=2) + start
+    rows, rays = np.indices(first.shape)
+    low, high = profiles[rows, rays, first], profiles[rows, rays, first + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = rho[first] + (level - low) / (high - low) * (rho[1] - rho[0])
+    good = crossing.any(axis=2) & (crossing.sum(axis=2) <= 2) & (step > 0.4 * np.median(step, axis=1)[:, None])
+    return np.where(good, edge, 1.0), good & (step > 4.0)
+
+
+def _light(dot: Array, within: float, ring: Array, beyond: float) -> tuple[Array, NDArray[np.bool_]]:
+    """By how much more light than its middle a dot's edge gets, a share (n, rays), and whether light falls off evenly.
+
+    `dot` and `ring` (n, rays) are the levels at `within` and `beyond` radii. The ring has the light of its own place,
+    not that of the edge: taken as it is, it moves every dot of a board the same way, which no residual shows.
+    """
+    mean = ring.mean(axis=1, keepdims=True)
+    side = 2 / RAYS * (ring @ UNIT) @ UNIT.T
+    uneven = np.sqrt(np.mean((ring - mean - side) ** 2, axis=1, keepdims=True))
+    even = uneven < MOST_UNEVEN * (mean - dot.mean(axis=1, keepdims=True))
+    # White that saturates tells nothing of the light; the dot, which reflects a little of it, does.
+    saturated = ring.max(axis=1, keepdims=True) >= WHITE_DN
+    level = np.maximum(dot.mean(axis=1, keepdims=True), 1.0)
+    slope = np.where(
+        saturated, 2 / RAYS * (dot @ UNIT) @ UNIT.T / (within * level), side / (beyond * np.maximum(mean, 1.0))
+    )
+    return np.where(even, np.clip(slope, -MOST_SLOPE, MOST_SLOPE), 0.0), even
+
+
+def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Robust Fourier coefficients (n, 5) of the edge, the deviation (n,) of the centre, and which dots are whole."""
+    weight = good.astype(np.float64)
+    coefficients = np.zeros((len(edge), design.shape[1]))
+    scatter, residual, z = np.ones(len(edge)), edge, edge
+    for _ in range(4):
+        normal = np.einsum("nk,ki,kj->nij", weight, design, design) + 1e-9 * np.eye(design.shape[1])
+        right = np.einsum("nk,ki,nk->ni", weight, design, edge)
+        coefficients = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        residual = edge - coefficients @ design.T
+        scatter = 1.4826 * np.median(np.where(good, np.abs(residual), np.inf), axis=1)
+        scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), LEAST_SCATTER, None)
+        z = residual / (4.0 * scatter[:, None])
+        weight = np.where(good & (np.abs(z) < 1), (1 - z * z) ** 2, 0.0)
+    used = (weight > 0.2).sum(axis=1)
+    # The rays that count must surround the dot: no gap of a third of the circle.
+    gap = _widest_gaps(weight > 0.2)
+    kept = (used >= RAYS // 2) & (gap <= RAYS // 3) & (scatter < 0.15)
+    # The variance of an M-estimator: the mean square of what each ray pulls over the square of how stiffly it holds.
+    within = weight > 0
+    pull = np.where(within, weight * residual, 0.0)
+    hold = np.where(within, (1 - z * z) * (1 - 5 * z * z), 0.0).sum(axis=1)
+    freedom = np.maximum(within.sum(axis=1) - design.shape[1], 1) / np.maximum(within.sum(axis=1), 1)
+    variance = 2 * np.square(pull).sum(axis=1) / np.maximum(hold, 1.0) ** 2 / freedom
+    return coefficients, np.sqrt(variance), kept
+
+
+def _widest_gaps(used: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Longest run of unused rays (n,) around the circle, for rays (n, rays)."""
+    twice = np.concatenate([used, used], axis=1)
+    run = np.zeros(len(used), dtype=np.intp)
+    longest = np.zeros(len(used), dtype=np.intp)
+    for column in twice.T:
+        run = np.where(column, 0, run + 1)
+        longest = np.maximum(longest, run)
+    return longest
+
+
+def _ring_scores(profiles: Array, rho: Array) -> Array:
+    """Two signs of a ring (n, 2): brightness of the middle between dot (0) and board (1), and missing darkness.
+
+    The second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it.
+    """
+    middle = np.median(profiles[:, :, rho < 0.35].reshape(len(profiles), -1), axis=1)
+    annulus = profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2)
+    dark = np.median(annulus, axis=1)
+    bright = np.median(profiles[:, :, (rho > 1.25) & (rho < 1.6)].reshape(len(profiles), -1), axis=1)
+    near = rho < 1.5
+    mean = np.median(profiles[:, :, near], axis=1)
+    darkness = ((bright[:, None] - mean) * rho[near]).sum(axis=1) / np.maximum(bright, 1.0)
+    missing = 1 - darkness / max(float(np.median(darkness)), 1e-9)
+    return np.column_stack([(middle - dark) / np.maximum(bright - dark, 1.0), missing])

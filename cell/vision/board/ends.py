@@ -1,0 +1,169 @@
+"""Whether the board in the picture ends where the named board does: a larger or smaller one must not pass for it.
+
+Each side is looked at one pitch beyond the outermost points. A board without marks must be seen to end on every side.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.camera import Array
+from cell.vision.board.plane_map import PlaneMap
+from cell.vision.board.spec import BoardSpec
+from cell.vision.pictures import Image, PictureRefused, Reason
+
+# Share of the places along a side that have to show its end, and how many further points contradict it.
+LEAST_ENDS = 0.3
+MOST_BEYOND = 2
+# What is brighter than this share of the step from black to white beside it is the sheet, not a cover.
+AS_WHITE = 0.85
+
+
+def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], radius: float) -> None:
+    """Refuse unless the dots `found` (ids) reach the board's edges and no dot follows; `radius` in pitches.
+
+    A marked board's order comes from its rings: for it, only what contradicts is refused.
+    """
+    smooth = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
+    lattice = spec.lattice()
+    marked = spec.kind == "marked_dots"
+    around = 1.65 * radius * np.column_stack([f(np.arange(8) * np.pi / 4) for f in (np.cos, np.sin)])
+    level = grey(smooth, plane.pixels(lattice[found]))
+    for name, beyond in _sides(spec):
+        ends = further = seen = 0
+        for place in beyond:
+            near = lattice[found][np.argsort(np.abs(lattice[found] - place).sum(axis=1))[:1]].astype(np.float64)
+            if np.abs(near[0] - place).max() > 2:
+                continue
+            outward = (place - near[0]) / np.linalg.norm(place - near[0])
+            # The near side of the dot that would follow is seen even where the picture or a narrow sheet ends.
+            spots = np.vstack([near, 0.5 * (near + place), place, place - 0.75 * radius * outward])
+            dark, between, middle, near_side = grey(smooth, plane.pixels(spots))
+            rim = grey(smooth, plane.pixels(place + around))
+            step = between - dark
+            if not step > max(4.0, 0.12 * typical(between - level)):
+                continue
+            seen += 1
+            darker = rim - middle > 0.4 * step
+            if darker.all():
+                further += 1
+            elif near_side - dark > 0.6 * step or (np.isfinite(rim).all() and darker.sum() < 6):
+                ends += 1
+        if further >= MOST_BEYOND:
+            raise PictureRefused(
+                Reason.NO_BOARD,
+                f"the board in the picture goes on beyond the {name} of {spec.name}: {further} more dots there; "
+                "is it the board that the set-up names?",
+            )
+        if not marked and ends < max(1.0, LEAST_ENDS * seen):
+            raise PictureRefused(
+                Reason.AMBIGUOUS,
+                f"the end of the board beyond the {name} of {spec.name} is not seen; show the whole board",
+            )
+    if marked:
+        check_hidden_sides(image, spec, plane, found, 0.5)
+
+
+def typical(values: Array) -> float:
+    """Median of the values that are numbers; 0 when none is."""
+    numbers = values[np.isfinite(values)]
+    return float(np.median(numbers)) if len(numbers) else 0.0
+
+
+def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], beyond: float) -> None:
+    """Refuse a smaller board: a whole side without a point, though the bright sheet is seen before it.
+
+    `beyond` is where, in pitches beyond the last points found, only the sheet's margin can be bright all along.
+    """
+    smooth = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
+    cols, rows = spec.grid
+    own = spec.lattice()[found]
+    # Both colours are met around any point: of a ChArUco board between corner and marker.
+    around = np.array([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5], [0.1, 0.1], [-0.1, 0.1]])
+    levels = grey(smooth, plane.pixels((own[:, None, :] + around).reshape(-1, 2))).reshape(len(own), -1)
+    black, white = np.nanmin(levels, axis=1), np.nanmax(levels, axis=1)
+    for name, axis, sign, last in (
+        ("first row", 1, -1, 0),
+        ("last row", 1, 1, rows - 1),
+        ("first column", 0, -1, 0),
+        ("last column", 0, 1, cols - 1),
+    ):
+        reached = int((sign * own[:, axis]).max()) * sign
+        if reached == last:
+            continue
+        at_line = own[:, axis] == reached
+        line = own[at_line].astype(np.float64)
+        outward = np.zeros(2)
+        outward[axis] = sign
+        there = grey(smooth, plane.pixels(np.vstack([line + beyond * outward, line + outward])))
+        margin, next_line = there[: len(line)], there[len(line) :]
+        seen = np.isfinite(margin) & np.isfinite(next_line)
+        bright = (margin > black[at_line] + AS_WHITE * (white - black)[at_line])[seen]
+        if seen.sum() >= 2 and bright.mean() > 0.6:
+            raise PictureRefused(
+                Reason.NO_BOARD,
+                f"the board in the picture ends before the {name} of {spec.name}, which is not hidden; is it the board "
+                "that the set-up names?",
+            )
+
+
+def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
+    """Refuse unless the pattern of squares stops one square beyond the outermost corners, on every side."""
+    smooth = np.asarray(cv2.GaussianBlur(image, (5, 5), 0), dtype=np.uint8)
+    cols, rows = spec.grid
+    for name, start, along, out, count in (
+        ("first row", (0, 0), (1, 0), (0, -1), cols),
+        ("last row", (0, rows - 1), (1, 0), (0, 1), cols),
+        ("first column", (0, 0), (0, 1), (-1, 0), rows),
+        ("last column", (cols - 1, 0), (0, 1), (1, 0), rows),
+    ):
+        k = np.arange(count + 1)[:, None] - 0.5
+        line = np.array(start) + k * np.array(along)
+        inner, outer = (grey(smooth, plane.pixels(line + share * np.array(out))) for share in (0.5, 1.3))
+        difference, further = np.diff(inner), np.diff(outer)
+        typical = float(np.nanmedian(np.abs(difference)))
+        seen = np.abs(difference) > max(3.0, 0.4 * typical)
+        seen[1:] &= np.sign(difference[1:]) != np.sign(difference[:-1])
+        share = -further / np.where(difference == 0, 1.0, difference)
+        goes_on = int((seen & (share > 0.5)).sum())
+        ends = int((seen & (np.abs(share) < 0.3)).sum())
+        if goes_on > max(1, ends):
+            raise PictureRefused(
+                Reason.NO_BOARD,
+                f"the squares go on beyond the {name} of {spec.name}; is it the board that the set-up names?",
+            )
+        if ends < max(1.0, LEAST_ENDS * seen.sum()):
+            raise PictureRefused(
+                Reason.AMBIGUOUS,
+                f"the end of the board beyond the {name} of {spec.name} is not seen; show the whole board with its "
+                "margin",
+            )
+
+
+def grey(image: Image, pixels: Array) -> Array:
+    """Grey values (n,) at pixels (n, 2), NaN outside of the picture."""
+    height, width = image.shape
+    at = pixels.astype(np.float32).reshape(-1, 1, 2)
+    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = (pixels > 0).all(axis=1) & (pixels < (width - 1, height - 1)).all(axis=1)
+    return np.asarray(np.where(inside, values.ravel().astype(np.float64), np.nan), dtype=np.float64)
+
+
+def _sides(spec: BoardSpec) -> list[tuple[str, Array]]:
+    """For each side of a board of dots: its name and the places that would come next."""
+    cols, rows = spec.grid
+    i, j = np.arange(cols), np.arange(rows)
+
+    def place(a: NDArray[np.intp] | int, b: NDArray[np.intp] | int) -> Array:
+        x, y = np.broadcast_arrays(a, b)
+        across = 2 * x + y % 2 if spec.kind == "asymmetric_dots" else x
+        return np.column_stack([across, y]).astype(np.float64)
+
+    return [
+        ("first row", place(i, -1)),
+        ("last row", place(i, rows)),
+        ("first column", place(-1, j)),
+        ("last column", place(cols, j)),
+    ]
