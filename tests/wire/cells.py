@@ -58,6 +58,7 @@ def served(folder: Path, *arguments: str) -> Iterator[dict[str, Any]]:
             sim.send_signal(signal.SIGINT)
             assert sim.wait(10) == 0
 
+
 BRAKE_FRAME_S = 0.25
 """Longest way of a frame to the simulated vehicle on a busy machine, wall seconds."""
 
