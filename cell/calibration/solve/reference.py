@@ -20,8 +20,8 @@ class Reference:
 
     The covariance is in the order of `cell.calibration.solve.blocks` (camera, light plane, rail, hand-eye, board),
     zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m), `arm_rotation`
-    (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as configured, or as found
-    where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe.
+    (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as configured, or
+    as found where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe.
     """
 
     base_from_board: pin.SE3
