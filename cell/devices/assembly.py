@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -21,6 +19,7 @@ from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
 from drivers.rail.tmcl import TmclRail
 from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
 from drivers.vehicle.agilex import AgilexVehicle
+from statemachine.waiting import waiting_on
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
@@ -43,20 +42,19 @@ class Devices:
         return iter((self.laser, self.claw, self.rail, self.vehicle, self.scan_camera, self.target_camera, self.arm))
 
     def stop(self) -> list[str]:
-        """Laser off, vehicle stopped and braked, rail and arm stopped; all at once, none waits for another.
+        """Laser off, vehicle stopped and braked, rail and arm stopped; none waits for another to confirm it.
 
         Whoever works with the devices now cannot begin anything new with them. Returns what could not be confirmed, a
         line each; an empty list means that everything answered.
         """
         self.gate.shut()
-        return _all_at_once(
-            {
-                "laser off": self.laser.stop,
-                "vehicle stopped and braked": self._halt_vehicle,
-                "rail stopped": self.rail.stop,
-                "arm stopped": self.arm.stop,
-            }
-        )
+        actions: dict[str, Callable[[], None]] = {
+            "laser off": self.laser.stop,
+            "vehicle stopped and braked": self._halt_vehicle,
+            "rail stopped": self.rail.stop,
+            "arm stopped": self.arm.stop,
+        }
+        return waiting_on(self.clock).each(actions, SAFE_STOP_TIMEOUT_S)
 
     def _halt_vehicle(self) -> None:
         self.vehicle.brake()
@@ -178,27 +176,3 @@ def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[Laser,
     """Laser and claw, on the arm's digital outputs."""
     laser = ArmSwitchedLaser("laser", arm, config.laser.output)
     return laser, ArmSwitchedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
-
-
-def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
-    problems: list[str] = []
-
-    def run(what: str, action: Callable[[], None]) -> None:
-        # Whatever ends the thread: what it was to confirm is not confirmed.
-        try:
-            action()
-        except BaseException as error:
-            problems.append(f"{what}: not confirmed, {error}")
-
-    threads = {
-        what: threading.Thread(target=run, args=(what, action), name=f"safe stop: {what}", daemon=True)
-        for what, action in actions.items()
-    }
-    for thread in threads.values():
-        thread.start()
-    deadline = time.monotonic() + SAFE_STOP_TIMEOUT_S
-    for what, thread in threads.items():
-        thread.join(max(0.0, deadline - time.monotonic()))
-        if thread.is_alive():
-            problems.append(f"{what}: not confirmed within {SAFE_STOP_TIMEOUT_S:.0f} s")
-    return problems
