@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cell.cli.options import (
+    CellClock,
     ConfigOption,
     Confirm,
     JobOption,
@@ -71,6 +72,9 @@ def dry_run(
     speed: Annotated[
         float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
     ] = None,
+    clock: Annotated[
+        CellClock, typer.Option(help='"virtual": without wires and without waiting; the same seed, the same bytes.')
+    ] = CellClock.wall,
     inject: Annotated[
         list[str] | None,
         typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
@@ -87,7 +91,7 @@ def dry_run(
     from cell.config import find_config, load_config
     from cell.devices.injection import Injection
     from cell.job import load_job
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.supervisor import Cell
 
     loaded, mesh = load_job(job)
     require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
@@ -98,9 +102,10 @@ def dry_run(
         sim="all",
         seed=seed,
         level=level.value,
-        speed=speed or SIM_SPEED,
+        speed=speed,
         surface=Path(loaded.surface.mesh).stem,
         confirm=None if confirm is None else confirm.value,
+        clock=clock.value,
     ) as cell:
         code = _perform(lambda display: cell.run(job, display, inject or ()), json, noise)
     raise typer.Exit(code)
@@ -120,17 +125,18 @@ def resume(
     from cell.job import load_job
     from cell.run.folder import find_run
     from cell.run.resumption import UnfinishedRun
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.supervisor import Cell
 
     before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
-    simulated = before.info["simulated"]
+    simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
     with Cell.open(
         config,
         sim="all" if simulated else None,
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
-        speed=before.info["speed"] if simulated else SIM_SPEED,
+        speed=before.info["speed"] if simulated and clock == "wall" else None,
         surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
+        clock=clock,
     ) as cell:
         code = _perform(lambda display: cell.resume(before.folder, display, at_start=at_start), json, noise)
     raise typer.Exit(code)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from cell.devices.assembly import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
-from cell.run.folder import REPORT, new_run, when, write_json
+from cell.run.folder import REPORT, new_run, timeless, when, write_json
 from cell.run.logs import run_log
 from cell.run.run import Run
 from cell.version import release
@@ -64,7 +64,7 @@ class RecordedWork:
         Raises `Aborted` when the run was ended (`Interrupted` by a signal), `DeviceFault` when the stop was not
         confirmed, else what `work` raised; the cell is stopped first.
         """
-        started = time.time()
+        started, begun = time.time(), self.devices.clock.now()
         try:
             folder = new_run(self.root)
             facts = {"kind": self.kind, "pid": os.getpid(), **self.info}
@@ -86,10 +86,11 @@ class RecordedWork:
             report = {
                 "run": folder.name, "version": release(), "outcome": outcome, "reason": reason,
                 "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),
-                **facts,
+                "cell_s": round(self.devices.clock.now() - begun, 3), **facts,
             }  # fmt: skip
             for action in (
-                lambda: journal.run_ended(outcome, reason), journal.close, lambda: write_json(folder / REPORT, report),
+                lambda: journal.run_ended(outcome, reason), journal.close,
+                lambda: write_json(folder / REPORT, timeless(report)),
             ):  # fmt: skip
                 _last(action, ended)
             self.run.folder = outer or folder
