@@ -6,7 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +52,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds."""
+    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds.
+
+    `results` are what the steps that were done have made, by their names.
+    """
 
     outcome: str
     reason: str
     folder: Path
     report: Mapping[str, Any]
     interrupted: bool = False
+    results: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -149,7 +153,7 @@ class JobRun:
             folder, self.config, self.job, self.nominal, work.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
         interrupted = self.run.control.signal is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
+        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted, result.results)
 
     def _facts(self) -> dict[str, Any]:
         return {
