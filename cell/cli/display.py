@@ -94,6 +94,13 @@ def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False)
     _print_noise(console, report.get("assumed_noise") or {})
 
 
+def print_late(report: Mapping[str, Any]) -> None:
+    """Say that the program was asked to end when the run had come to its end already. Writes to standard error."""
+    part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console.print(f"interrupted after {part}", style="bold magenta", markup=False)
+
+
 def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
     """A line for each of the rows of `cell.runs.run_row`, its reason cut to the width of the screen."""
     console = Console(highlight=False)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -21,6 +22,7 @@ from cell.cli.options import (
 
 if TYPE_CHECKING:
     from cell.run.job_run import Observer, RunOutcome
+    from cell.supervisor import Cell
 
 RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
 NoiseOption = Annotated[
@@ -58,9 +60,7 @@ def run(
     """
     from cell.supervisor import Cell
 
-    with Cell.open(config) as cell:
-        code = _perform(lambda display: cell.run(job, display, at_start=at_start), json, noise)
-    raise typer.Exit(code)
+    _perform(lambda: Cell.open(config), lambda cell, display: cell.run(job, display, at_start=at_start), json, noise)
 
 
 def dry_run(
@@ -93,7 +93,8 @@ def dry_run(
     require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
     for text in inject or ():
         Injection.parse(text)
-    with Cell.open(
+    opened = partial(
+        Cell.open,
         config,
         sim="all",
         seed=seed,
@@ -101,9 +102,8 @@ def dry_run(
         speed=speed or SIM_SPEED,
         surface=Path(loaded.surface.mesh).stem,
         confirm=None if confirm is None else confirm.value,
-    ) as cell:
-        code = _perform(lambda display: cell.run(job, display, inject or ()), json, noise)
-    raise typer.Exit(code)
+    )
+    _perform(opened, lambda cell, display: cell.run(job, display, inject or ()), json, noise)
 
 
 def resume(
@@ -124,28 +124,43 @@ def resume(
 
     before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
     simulated = before.info["simulated"]
-    with Cell.open(
+    opened = partial(
+        Cell.open,
         config,
         sim="all" if simulated else None,
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
         speed=before.info["speed"] if simulated else SIM_SPEED,
         surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
-    ) as cell:
-        code = _perform(lambda display: cell.resume(before.folder, display, at_start=at_start), json, noise)
+    )
+    _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)
+
+
+def _perform(
+    opened: Callable[[], Cell], work: Callable[[Cell, Observer], RunOutcome], json: bool, noise: bool
+) -> NoReturn:
+    """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
+    from cell.cli import EXIT_INTERRUPTED
+    from cell.cli.display import ProgressDisplay, print_late, print_report
+    from statemachine.watch import SignalInterrupt
+
+    outcome = None
+    try:
+        with opened() as cell:
+            with ProgressDisplay() as display:
+                outcome = work(cell, display)
+            if json:
+                print_json(outcome.report)
+            else:
+                print_report(outcome.report, str(outcome.folder), noise=noise)
+        code = outcome.exit_code
+    except SignalInterrupt:
+        if outcome is None:
+            raise
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED and outcome.outcome != "aborted":
+        print_late(outcome.report)
     raise typer.Exit(code)
-
-
-def _perform(work: Callable[[Observer], RunOutcome], json: bool, noise: bool) -> int:
-    from cell.cli.display import ProgressDisplay, print_report
-
-    with ProgressDisplay() as display:
-        outcome = work(display)
-    if json:
-        print_json(outcome.report)
-    else:
-        print_report(outcome.report, str(outcome.folder), noise=noise)
-    return outcome.exit_code
 
 
 def abort(

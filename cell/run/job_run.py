@@ -6,7 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from drivers.errors import (
     RefusedError,
 )
 from statemachine.cancel import CancelToken
+from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy
 from statemachine.runner import Event, Runner
@@ -52,18 +53,26 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds."""
+    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds.
+
+    One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same.
+    """
 
     outcome: str
     reason: str
     folder: Path
     report: Mapping[str, Any]
-    interrupted: bool = False
+    control: RunControl = field(default_factory=RunControl, repr=False, compare=False)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has asked the program to end since the run began."""
+        return self.control.signal is not None
 
     @property
     def exit_code(self) -> int:
-        """0 placed, 130 interrupted, 1 otherwise."""
-        return 0 if self.outcome == "placed" else 130 if self.interrupted else 1
+        """130 interrupted, else 0 placed, 1 otherwise."""
+        return 130 if self.interrupted else 0 if self.outcome == "placed" else 1
 
     def __str__(self) -> str:
         return f"{self.outcome}: {self.reason}"
@@ -145,8 +154,7 @@ class JobRun:
         report = make_report(
             folder, self.config, self.job, self.nominal, work.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
-        interrupted = self.run.control.signal is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
+        return RunOutcome(report["outcome"], report["reason"], folder, report, self.run.control)
 
     def _facts(self) -> dict[str, Any]:
         return {
