@@ -34,7 +34,7 @@ CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, at REAL NOT NULL, kind TEXT NOT NULL, step TEXT,
     data TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS requests (
-    id INTEGER PRIMARY KEY, at REAL NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL);
+    id INTEGER PRIMARY KEY, at REAL NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL, number INTEGER);
 """
 
 
@@ -80,10 +80,11 @@ class EventRow:
 
 @dataclass(frozen=True)
 class Request:
-    """Something that another process asked for."""
+    """Something that another process asked for; `number` is that of the question that a "confirm" answers."""
 
     kind: str
     reason: str
+    number: int | None = None
 
 
 class Journal:
@@ -143,13 +144,13 @@ class Journal:
         """
         try:
             rows = self._asked.execute(
-                "SELECT id, kind, reason FROM requests WHERE id > ? ORDER BY id", (self._taken,)
+                "SELECT id, kind, reason, number FROM requests WHERE id > ? ORDER BY id", (self._taken,)
             ).fetchall()
         except sqlite3.Error as error:
             raise JournalError(f"the journal {self.path} cannot be read: {error}") from error
         if rows:
             self._taken = rows[-1][0]
-        return [Request(kind, reason) for _, kind, reason in rows]
+        return [Request(*row) for _, *row in rows]
 
     def close(self) -> None:
         """Close the file; the record is complete without it as well."""
@@ -227,13 +228,21 @@ def read(folder: Path) -> Record:
     return _in_existing(folder, rows)
 
 
-def request(folder: Path, kind: str, reason: str) -> None:
-    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second."""
+def request(folder: Path, kind: str, reason: str, number: int | None = None) -> None:
+    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second.
+
+    A "confirm" has the `number` of the question that it answers: it counts for no other.
+    """
     if kind not in REQUESTS:
         raise ValueError(f"request '{kind}' is unknown; a run takes {', '.join(REQUESTS)}")
 
+    if kind == "confirm" and number is None:
+        raise ValueError("a confirmation needs the number of its question")
+
     def write(base: sqlite3.Connection) -> None:
-        base.execute("INSERT INTO requests (at, kind, reason) VALUES (?, ?, ?)", (time.time(), kind, reason))
+        base.execute(
+            "INSERT INTO requests (at, kind, reason, number) VALUES (?, ?, ?, ?)", (time.time(), kind, reason, number)
+        )
 
     _in_existing(folder, write)
 

@@ -517,7 +517,7 @@ def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(t
     def observe(event):
         if event.kind == "confirm_needed":
             bench.log.append("asked")
-            request(tmp_path, "confirm", "Ann")
+            request(tmp_path, "confirm", "Ann", event.data["number"])
 
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
@@ -656,3 +656,18 @@ def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):
     bench.run()
     bench.runner.control.abort("interrupted from the keyboard", signal.SIGINT)
     assert bench.runner.control.signal == signal.SIGINT
+
+
+def test_a_word_of_another_process_counts_for_the_question_that_it_names_and_no_other(tmp_path):
+    journal, control = Journal(tmp_path, "r1"), RunControl()
+    first = control.ask("protective stop in the sweep")
+    with pytest.raises(ValueError, match="number of its question"):
+        request(tmp_path, "confirm", "Ann")
+    request(tmp_path, "confirm", "Ann", first)
+    control.asked_no_more()
+    second = control.ask("protective stop while placing")
+    control.obey(journal.take_requests())
+    assert control.answer() is None, "what was said about the first comes after the second was asked"
+    request(tmp_path, "confirm", "Bob", second)
+    control.obey(journal.take_requests())
+    assert control.answer() == "Bob"

@@ -53,8 +53,11 @@ class ProgressDisplay:
         if event.kind in SAID and "text" in event.data:
             self.console.print(str(event.data["text"]), markup=False)
         elif event.kind == "confirm_needed":
-            self.console.print(f"waiting for a person: {event.data['reason']}", style="bold yellow", markup=False)
-            self.console.print("when that is done, in another shell here: cell confirm (or cell abort)", markup=False)
+            number = event.data["number"]
+            said = f"waiting for a person, question {number}: {event.data['reason']}"
+            self.console.print(said, style="bold yellow", markup=False)
+            answer = f"cell confirm --question {number} (or cell abort)"
+            self.console.print(f"when that is done, in another shell here: {answer}", markup=False)
         elif event.kind == "confirmed":
             self.console.print(f"confirmed by {event.data['by']}", markup=False)
         elif step is None:

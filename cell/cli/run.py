@@ -192,28 +192,42 @@ def go_on(name: RunArgument = None, config: ConfigOption = None) -> None:
 def confirm(
     name: RunArgument = None,
     config: ConfigOption = None,
+    question: Annotated[
+        int | None,
+        typer.Option(help="The number that was shown with the question; without it, the one that waits now."),
+    ] = None,
     by: Annotated[str | None, typer.Option(help="Who has looked; without it, the user's name.")] = None,
 ) -> None:
-    """Say that you have looked at the cell and that the waiting run may clear its fault and go on."""
-    import getpass
+    """Say that you have looked at the cell and that the waiting run may clear its fault and go on.
 
+    The word counts for one question only. Without its number, a terminal is asked whether it is the one that was meant.
+    """
+    import getpass
+    import sys
+
+    from cell.cli import EXIT_FAILED
     from cell.run.folder import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
-    if (what := awaited_word(folder)) is None:
+    if (waits := awaited_word(folder)) is None:
         raise ConfigError(f"{folder.name} waits for nobody's word; there is nothing to confirm")
-    typer.echo(f"confirmed: {what}")
-    _ask(str(folder), config, "confirm", by or getpass.getuser(), "{} goes on")
+    if question not in (None, waits.number):
+        raise ConfigError(f"{folder.name} does not wait for question {question} but for {waits}")
+    typer.echo(str(waits))
+    if question is None and sys.stdin.isatty() and not typer.confirm("Have you looked, and may the run go on?"):
+        raise typer.Exit(EXIT_FAILED)
+    answer = f"told {{}} that question {waits.number} is confirmed"
+    _ask(str(folder), config, "confirm", by or getpass.getuser(), answer, waits.number)
 
 
-def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str) -> None:
+def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str, number: int | None = None) -> None:
     from drivers.errors import ConfigError
     from statemachine.journal import JournalError, request
 
     folder = _going(name, config)
     try:
-        request(folder, kind, reason)
+        request(folder, kind, reason, number)
     except JournalError as error:
         raise ConfigError(str(error)) from error
     typer.echo(answer.format(folder.name))
