@@ -57,7 +57,7 @@ class Site:
     def turn(self, angle: float) -> None:
         """As `cell jog vehicle` does."""
         self.vehicle.enable()
-        turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, _never)
+        turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, self.whereabouts.count)
         self.vehicle.brake()
 
 
@@ -107,7 +107,10 @@ def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
     site = Site()
     site.whereabouts.say_at_start()
     site.turn(math.radians(20))
+    site.turn(math.radians(-40))
+    site.turn(math.radians(40))
     site.whereabouts.enter(JOB)
+    assert site.whereabouts.turned == pytest.approx(math.radians(100), abs=0.05)
     assert site.whereabouts.pose().yaw == pytest.approx(site.truth().yaw, abs=0.03)
     site.run()
     assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02

@@ -100,13 +100,23 @@ class Whereabouts:
             self._lose(state.interruption)
         if self._anchor is None or self._anchor.pose is None:
             raise RefusedError(f"where the vehicle stands is not known: {self._unknown}")
+        return self._anchor.pose * self._anchor.reading.inverse() * self._count(state)
+
+    def count(self) -> None:
+        """Count what it has gone since the last look; for those who drive it by other means than `pose`, all the time.
+
+        A way there and back is none between two looks.
+        """
+        self._count(self._vehicle.state())
+
+    def _count(self, state: VehicleState) -> Planar:
         now = _reading(state)
         way, turn = math.hypot(now.x - self._last.x, now.y - self._last.y), abs(wrap(now.yaw - self._last.yaw))
         self.way += way
         if way < TIGHT * turn:
             self.turned += turn
         self._last = now
-        return self._anchor.pose * self._anchor.reading.inverse() * now
+        return now
 
     def _hold(self, pose: Planar | None) -> None:
         state = self._vehicle.state()
