@@ -179,8 +179,7 @@ class JobRun:
         self.devices.gate.enter(token)
         token.check()
         if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-            arm = self.devices.arm
-            self.devices.gate.begin(lambda: arm.recover(confirmed=confirmed), arm.stop)
+            self.devices.arm.recover(confirmed=confirmed)
         elif isinstance(error, DeviceError) and error.device == "vehicle":
             self.devices.vehicle.recover()
 
