@@ -49,7 +49,7 @@ from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
-from statemachine.watch import EndSignals, SignalWatch
+from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
@@ -135,7 +135,12 @@ class Cell:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except SignalInterrupt:
+            # The first reason to end is the one that is told.
+            if error is None:
+                raise
 
     @property
     def runs_folder(self) -> Path:
@@ -176,9 +181,10 @@ class Cell:
     def close(self) -> None:
         """End the run that is going on, stop and disconnect everything, let go of the cell.
 
-        Idempotent, callable from any thread, shielded from interrupts.
+        Idempotent, callable from any thread, shielded from interrupts: one that comes meanwhile is raised at the end,
+        as `SignalInterrupt`.
         """
-        with SignalWatch():
+        with SignalWatch() as signals:
             with self._beginning:
                 if self._closed:
                     return
@@ -198,6 +204,8 @@ class Cell:
         self._signals.__exit__(None, None, None)
         for problem in problems:
             log.warning("closing the cell: %s", problem)
+        if signals.number is not None:
+            raise SignalInterrupt(signals.number)
 
     def begin(
         self,

@@ -60,9 +60,9 @@ class Runner:
     """Runs one job. `run()` is called once; what a person or another program asks comes through `control`.
 
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
-    stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
-    a step is cut short, and exactly once more at the end of every run. `recover(error, token, confirmed)` clears a
-    recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
+    stopped. It must be idempotent and leave a cell that can go on, since it is called when a step fails or is cut
+    short, before every repetition, and exactly once more at the end of every run. `recover(error, token, confirmed)`
+    clears a recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
     `health()` is called about ten times a second while a step works, and raises what must end it whatever it does.
     """
 
@@ -255,10 +255,14 @@ class Runner:
         self._error = None
         call = Call(step.name, lambda: self.steps[step.name](context))
         end = self._watch(call, deadline, step.name, context.token, ailing=True)
+        context.token.cancel(f"{step.name} has ended")
         if end is None and call.error is not None:
             self._error = call.error
+            # At rest before anything is read or written: a disk may stall.
+            stopped = f"{step.name} failed"
+            trouble = self._halt(stopped)
             end = self._ask() or self._judge(call.error)
-        context.token.cancel(f"{step.name} has ended")
+            self._tell(Event("safe_stop", None, {"reason": stopped, "trouble": trouble}))
         duration = self.clock.now() - started
         before = self._records[step.name]
         wall = before.wall_s + time.monotonic() - begun

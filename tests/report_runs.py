@@ -172,6 +172,7 @@ def reported(
         "part": work.part.state.value,
         "cell": config.cell.name,
         "job": job.job.name,
+        "job_kind": job.job.kind,
         "simulated": simulated,
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,

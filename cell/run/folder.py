@@ -11,6 +11,7 @@ import secrets
 import socket
 import struct
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -98,18 +99,31 @@ def _lives(pid: object, since: float) -> bool:
     return words[0] != "Z" and begun < since + 1.0
 
 
-def awaited_word(folder: Path) -> str | None:
-    """What a person has to confirm before the run in `folder` goes on; None when it waits for nobody."""
+@dataclass(frozen=True)
+class Question:
+    """What a person has to confirm before a run goes on; each question of a run has a number of its own."""
+
+    number: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"question {self.number}: {self.reason}"
+
+
+def awaited_word(folder: Path) -> Question | None:
+    """What a person has to confirm now before the run in `folder` goes on; None when it waits for nobody."""
     try:
         return _awaited(read(folder))
     except JournalError as error:
         raise ConfigError(str(error)) from error
 
 
-def _awaited(record: Record) -> str | None:
+def _awaited(record: Record) -> Question | None:
     kinds = ("confirm_needed", "confirmed", "state")
     last = next((event for event in reversed(record.events) if event.kind in kinds), None)
-    return str(last.data["reason"]) if last is not None and last.kind == "confirm_needed" else None
+    if last is None or last.kind != "confirm_needed":
+        return None
+    return Question(int(last.data.get("number", 0)), str(last.data["reason"]))
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -154,7 +168,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
         raise CellError(f"{folder} holds a journal that is none of ours: {error}") from error
     run = record.run
     waits = _awaited(record)
-    going = "the run is still going on, or its process died" if waits is None else f"waits for a person: {waits}"
+    going = "the run is still going on, or its process died" if waits is None else f"waits for a person, {waits}"
     steps: dict[str, dict[str, Any]] = {}
     for row in record.steps:
         before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
