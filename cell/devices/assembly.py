@@ -9,20 +9,25 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from cell.config import CameraConfig, CellConfig
-from cell.devices.gate import Gate, GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
+from cell.devices.gate import Gate
+from cell.devices.gated import GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
 from cell.geometry.poses import to_ur
 from cell.motion.kinematics import ArmKinematics
 from drivers.arm.limits import ArmLimits
+from drivers.arm.ur import UrArm
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
+from drivers.rail.tmcl import TmclRail
+from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
+from drivers.vehicle.agilex import AgilexVehicle
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
 class Devices:
-    """The connected devices of one cell and the clock that they share."""
+    """The devices of one cell, behind their gate (see `behind_gate`), and the clock that they share."""
 
     clock: Clock
     gate: Gate
@@ -68,7 +73,7 @@ class Devices:
 
 
 def connect(config: CellConfig) -> Devices:
-    """Connect every device; when one fails, those already connected are closed and the error goes on."""
+    """Connect every device, behind a gate; when one fails, those connected are closed and the error goes on."""
     clock = Clock(config.cell.time_scale)
     with ExitStack() as opened:
         arm = connect_arm(config, clock)
@@ -83,19 +88,41 @@ def connect(config: CellConfig) -> Devices:
         opened.callback(target_camera.close)
         laser, claw = connect_switches(config, arm, clock)
         opened.pop_all()
+    return behind_gate(clock, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
+
+
+def behind_gate(
+    clock: Clock,
+    arm: Arm,
+    rail: Rail,
+    vehicle: Vehicle,
+    scan_camera: Camera,
+    target_camera: Camera,
+    laser: Laser,
+    claw: Claw,
+) -> Devices:
+    """These devices, of whatever make, with everything that moves, shines or grips behind one gate."""
     gate = Gate()
-    for device in (arm, rail, vehicle, laser, claw):
-        device.gate = gate
-    return Devices(clock, gate, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
+    return Devices(
+        clock,
+        gate,
+        GatedArm(arm, gate),
+        GatedRail(rail, gate),
+        GatedVehicle(vehicle, gate),
+        scan_camera,
+        target_camera,
+        GatedLaser(laser, gate),
+        GatedClaw(claw, gate),
+    )
 
 
-def connect_arm(config: CellConfig, clock: Clock, control: bool = True) -> GatedArm:
+def connect_arm(config: CellConfig, clock: Clock, control: bool = True) -> UrArm:
     """The arm; its own process switches the laser's output off when this one dies.
 
     Without `control` it is only looked at: a program that runs on it runs on.
     """
     kinematics = ArmKinematics()
-    return GatedArm(
+    return UrArm(
         "arm",
         config.arm.address,
         clock=clock,
@@ -111,9 +138,9 @@ def connect_arm(config: CellConfig, clock: Clock, control: bool = True) -> Gated
     )
 
 
-def connect_rail(config: CellConfig, clock: Clock) -> GatedRail:
+def connect_rail(config: CellConfig, clock: Clock) -> TmclRail:
     """The rail."""
-    return GatedRail(
+    return TmclRail(
         "rail",
         config.rail.url,
         lead=config.rail.lead,
@@ -128,9 +155,9 @@ def connect_rail(config: CellConfig, clock: Clock) -> GatedRail:
     )
 
 
-def connect_vehicle(config: CellConfig, clock: Clock) -> GatedVehicle:
+def connect_vehicle(config: CellConfig, clock: Clock) -> AgilexVehicle:
     """The vehicle."""
-    return GatedVehicle(
+    return AgilexVehicle(
         "vehicle",
         config.vehicle.interface,
         config.vehicle.channel,
@@ -147,10 +174,10 @@ def connect_camera(name: str, config: CameraConfig, clock: Clock) -> StreamCamer
     return StreamCamera(name, config.address, shape=(config.height, config.width), clock=clock)
 
 
-def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[GatedLaser, GatedClaw]:
+def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[Laser, Claw]:
     """Laser and claw, on the arm's digital outputs."""
-    laser = GatedLaser("laser", arm, config.laser.output)
-    return laser, GatedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
+    laser = ArmSwitchedLaser("laser", arm, config.laser.output)
+    return laser, ArmSwitchedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
 
 
 def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:

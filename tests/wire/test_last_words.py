@@ -19,14 +19,12 @@ import sys
 from pathlib import Path
 from cell.devices import assembly
 from cell.config import load_config
-from cell.devices.gate import Gate
 from drivers.clock import Clock
 config = load_config(Path("sim.toml"))
 clock = Clock(config.cell.time_scale)
 """
 DRIVE = """
 vehicle = assembly.connect_vehicle(config, clock)
-vehicle.gate = Gate()
 vehicle.enable()
 while True:
     vehicle.drive(0.3, 0.0)
@@ -34,14 +32,12 @@ while True:
 """
 MOVE = """
 rail = assembly.connect_rail(config, clock)
-rail.gate = Gate()
 rail.home().wait(60.0)
 rail.move_to(0.09, 0.01)
 clock.sleep(1e6)
 """
 SEARCH = """
 rail = assembly.connect_rail(config, clock)
-rail.gate = Gate()
 rail.home()
 clock.sleep(1e6)
 """

@@ -17,6 +17,7 @@ from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import AT_REST
 from drivers.clock import Clock
+from drivers.clock_map import Latch
 from drivers.errors import Aborted, CellError, DeadlineError, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
 from sim_backends.models.arm import ArmModel, Safety
@@ -29,6 +30,8 @@ _SERVO_LAG_S = 0.03
 _SERVO_BRAKING, _BRAKING = 10.0, 4.0
 _ARRIVED, _FIRST_POINT = 2e-3, 0.02
 _PATIENCE_S = 3.0
+_LATCH_S = 0.0005
+"""A round trip."""
 _FORCE_SAMPLES, _FORCE_SAMPLE_S = 10, 0.006
 _SAFETY = {
     Safety.NORMAL: ArmSafety.NORMAL,
@@ -49,6 +52,8 @@ class LockstepArm:
         self.rests: list[Vector] = []
         """Joint angles (6,), rad, at the end of each motion so far."""
         self._motion: ArmMove | None = None
+        self.late = 0.0
+        """By how many seconds each state comes later than the controller measured it."""
         self._recorded: list[ArmState] | None = None
         self._limits = ArmLimits(
             joint_speeds=(config.arm.max_joint_speed,) * 6,
@@ -69,7 +74,7 @@ class LockstepArm:
         model = self.model
         speeds = model.drive.qd.copy()
         return ArmState(
-            stamp=self._clock.now(),
+            stamp=self._clock.now() + self.late,
             joints=model.drive.q.copy(),
             joint_speeds=speeds,
             flange=to_ur(from_matrix(model.reported_flange())),
@@ -89,6 +94,12 @@ class LockstepArm:
             yield self._recorded
         finally:
             self._recorded = None
+
+    def latch_clock(self) -> Latch:
+        """The world's clock, told as late as the states are."""
+        asked = self._clock.now()
+        self._clock.sleep(_LATCH_S + self.late)
+        return Latch(asked, asked + 0.5 * _LATCH_S, self._clock.now())
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera.clock_map import ClockMap, Latch
 from drivers.clock import Clock
+from drivers.clock_map import ClockMap, Latch
 from drivers.errors import LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics
 from sim_backends.models.camera import CameraModel
