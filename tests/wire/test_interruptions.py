@@ -80,7 +80,6 @@ def test_an_arm_whose_states_all_come_late_does_not_sweep(place: Path) -> None:
     report = dry_run(place, "arm.late_states@laser_sweep:0%", job="arm")
     assert report["outcome"] == "faulted"
     assert report["reason"].startswith("arm: replies come so late that times are not known")
-    assert retries(report, "laser_sweep") >= 1
     assert report["end_state"]["part"]["held"]
 
 
