@@ -1,4 +1,4 @@
-"""`cell jog`, `cell home` and `cell diag`: one device at a time."""
+"""`cell jog`, `cell home` and `cell diag`: one device at a time; `cell devices`: which makes are installed."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from cell.cli.options import (
     SimOption,
     SpeedOption,
     print_json,
+    wide_console,
 )
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def register(app: typer.Typer) -> None:
     app.command(context_settings={"ignore_unknown_options": True})(jog)
     app.command()(home)
     app.command()(diag)
+    app.command()(devices)
 
 
 def jog(
@@ -82,6 +84,25 @@ def diag(
         _print_table(rows)
     if not all(row.ok for row in rows):
         raise typer.Exit(1)
+
+
+def devices(json: JsonOption = False) -> None:
+    """List the makes of devices that `driver = "…"` can name, where each comes from, and what is wrong with it."""
+    from cell.devices.makes import installed
+
+    rows = installed()
+    if json:
+        print_json([row.as_dict() for row in rows])
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table()
+    for name in ("kind", "driver", "source", "state"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(row.kind, row.make, row.source, Text(row.state, style="" if row.ok else "red"))
+    wide_console().print(table)
 
 
 def _print_table(rows: list[Diagnosis]) -> None:

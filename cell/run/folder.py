@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.journal import JournalError, Record, read
 
@@ -225,13 +225,9 @@ class CellLock:
 
     def __init__(self, config: CellConfig) -> None:
         self._name = config.cell.name
-        self._addresses = {
-            "arm": config.arm.address,
-            "rail": _real(config.rail.url),
-            "vehicle": f"{config.vehicle.interface}:{_real(config.vehicle.channel)}",
-            "scan_camera": config.scan_camera.address,
-            "target_camera": config.target_camera.address,
-        }
+        # What hangs on the arm is held with the arm.
+        own = [name for name in DEVICES if not config.make(name).on_arm]
+        self._addresses = {name: config.device(name).held for name in own}
         self._held: list[socket.socket] = []
 
     def __enter__(self) -> CellLock:
@@ -259,11 +255,6 @@ class CellLock:
     ) -> None:
         while self._held:
             self._held.pop().close()
-
-
-def _real(address: str) -> str:
-    """A device file by the name of what it is, whichever link to it the configuration names."""
-    return os.path.realpath(address) if address.startswith("/") else address
 
 
 def _holder(name: str) -> str:

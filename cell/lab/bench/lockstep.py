@@ -10,7 +10,9 @@ import threading
 from typing import Protocol
 
 from cell.config import CellConfig
+from cell.device_config import of_make
 from cell.devices.assembly import Devices
+from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, TmclRailConfig
 from cell.devices.gate import Gate
 from cell.lab.bench.lockstep_arm import LockstepArm
 from cell.lab.bench.lockstep_camera import LockstepCamera
@@ -73,7 +75,8 @@ class LockstepCell:
         self.clock = LockstepClock(self)
         wire = stream(seed, "lockstep.wire")
         arm = LockstepArm("arm", self.world.arm, self.clock, config)
-        rail = LockstepRail("rail", self.world.rail, self.clock, config.rail, wire)
+        rail = LockstepRail("rail", self.world.rail, self.clock, of_make(config.rail, TmclRailConfig), wire)
+        light, claw = of_make(config.laser, ArmOutputLaserConfig), of_make(config.claw, ArmOutputClawConfig)
         vehicle = LockstepVehicle("vehicle", self.world.vehicle, self.clock, config.vehicle)
         self.devices = Devices(
             clock=self.clock,
@@ -83,8 +86,8 @@ class LockstepCell:
             vehicle=vehicle,
             scan_camera=LockstepCamera("scan_camera", "scan", self.world, self.clock, wire),
             target_camera=LockstepCamera("target_camera", "target", self.world, self.clock, wire),
-            laser=ArmSwitchedLaser("laser", arm, config.laser.output),
-            claw=ArmSwitchedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=self.clock),
+            laser=ArmSwitchedLaser("laser", arm, light.output),
+            claw=ArmSwitchedClaw("claw", arm, claw.output, claw.feedback, clock=self.clock),
         )
         self._ticking: tuple[Ticking, ...] = (arm, vehicle)
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from cell.config import RailConfig
+from cell.devices.built_in import TmclRailConfig
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, RailState, Vector
@@ -26,7 +26,7 @@ class LockstepRail:
     """The rail `model` as a controller in microsteps shows it; see `drivers.interfaces.Rail` for the promises."""
 
     def __init__(
-        self, name: str, model: RailModel, clock: Clock, config: RailConfig, wire: np.random.Generator
+        self, name: str, model: RailModel, clock: Clock, config: TmclRailConfig, wire: np.random.Generator
     ) -> None:
         """`wire` draws when within a round trip the module answers."""
         self.name = name
