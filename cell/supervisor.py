@@ -43,10 +43,12 @@ from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.run import Run
+from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
+from statemachine.script import NO_SCRIPT, Script
 from statemachine.watch import EndSignals, SignalWatch
 
 SIM_SPEED = 3.0
@@ -256,9 +258,11 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> RunOutcome:
         """`start` a job and wait for its end. Raises only for what is wrong before anything moves."""
-        return self.start(job, observer, inject, at_start=at_start).result()
+        return self.start(job, observer, inject, at_start=at_start, until=until, script=script).result()
 
     def start(
         self,
@@ -267,6 +271,8 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         """Begin a job and hold it: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
 
@@ -275,8 +281,12 @@ class Cell:
 
         A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
+
+        With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
+        `script` looks at results between the steps and decides about refusals.
         """
-        injections = [Injection.parse(text) for text in inject]
+        loaded, _ = load_job(job)
+        injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
         if injections and self.simulated is None:
             raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
         info: dict[str, Any] = {}
@@ -284,7 +294,7 @@ class Cell:
         if injections:
             info["injected"] = [str(injection) for injection in injections]
             inline = (Injector(self.config.cell.truth, injections),)
-        return self._start(job, observer, info, None, inline, at_start=at_start)
+        return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
         self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
@@ -307,11 +317,15 @@ class Cell:
         inline: tuple[Observer, ...] = (),
         *,
         at_start: bool,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         self._require_free()
         stops = self._stops
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config, mesh)
+        kind = find_kind(loaded.job.kind).until(until)
+        kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
         stored: CellCalibration | None = None
         try:
@@ -335,7 +349,9 @@ class Cell:
             if before is not None:
                 earlier, why = before.sweep(loaded, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
-            job_run = JobRun(run, self.config, self.devices, loaded, nominal, calibration, info, inline, earlier)
+            job_run = JobRun(
+                run, self.config, self.devices, loaded, nominal, calibration, info, kind, script, inline, earlier
+            )
             try:
                 return job_run.perform(self.runs_folder, self.whereabouts)
             finally:

@@ -17,18 +17,20 @@ from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.lockstep_arm import LockstepArm
 from cell.lab.bench.whole_job import NoFrames
 from cell.run.resumption import UnfinishedRun
-from cell.run.work import JobWork
+from cell.steps import drive_to_target
+from cell.steps.kinds import PLACE
 from cell.steps.moves import HOME, Mover
-from cell.steps.place import PartProgress, PartState, PlaceResult, place
+from cell.steps.part import PartProgress, PartState
+from cell.steps.place import PlaceResult, place
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from cell.vision import parse_board
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from sim_backends.world.nominal import inverse
 from statemachine.journal import Journal
-from statemachine.policy import OnFailure, Policy
+from statemachine.policy import OnFailure
 from statemachine.runner import StepContext
-from statemachine.sequence import State
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -155,7 +157,7 @@ def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
 def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
     site = Site()
     site.cell.devices.claw.release()
-    work = JobWork(
+    here = Workplace(
         CONFIG,
         JOB,
         NOMINAL,
@@ -166,9 +168,9 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
         Whereabouts(site.cell.devices.vehicle),
     )
     before = site.arm.state().joints
-    context = StepContext(Policy().of(State.DRIVE_TO_TARGET), 1, 1e9, {}, site.cell.clock, lambda event: None)
+    context = StepContext(drive_to_target.STEP.policy, 1, 1e9, {}, site.cell.clock, lambda event: None)
     with pytest.raises(RefusedError, match="the claw holds no part"):
-        work.drive_to_target(context)
+        drive_to_target.STEP.work(here, context)
     assert np.array_equal(site.arm.state().joints, before)
 
 
@@ -195,7 +197,7 @@ def test_a_release_that_is_not_confirmed_leaves_the_part_unknown() -> None:
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
-    step = Policy().of(State.PLACE)
+    step = PLACE.policy().of("place")
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
 

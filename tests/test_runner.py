@@ -14,9 +14,19 @@ from statemachine.control import RunControl
 from statemachine.journal import Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.runner import Runner
-from statemachine.sequence import STEPS, Sequence, State
+from statemachine.sequence import Sequence
 
-NAMES = [step.value for step in STEPS]
+NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]
+POLICY = Policy(
+    (
+        Step("drive_to_target", 180.0, 1, ("DeadlineError",)),
+        Step("board_photo", 60.0, 2, ("DeadlineError",)),
+        Step("laser_sweep", 120.0, 2, ("DeadlineError",)),
+        Step("reconstruct", 60.0, on_wall=True),
+        Step("invert_pose", 60.0, on_wall=True),
+        Step("place", 180.0, on_failure=OnFailure.STOP),
+    )
+)
 
 
 class Bench:
@@ -29,9 +39,9 @@ class Bench:
         self.events = []
         work = {name: self._step(name, steps.get(name)) for name in NAMES}
         self.runner = Runner(
-            sequence=Sequence(),
+            sequence=Sequence(tuple(NAMES)),
             steps=work,
-            policy=Policy(grace_s=1.0, stop_deadline_s=1.0),
+            policy=replace(POLICY, grace_s=1.0, stop_deadline_s=1.0),
             journal=Journal(folder, "r1"),
             clock=Clock(),
             classify=self.classify,
@@ -71,7 +81,7 @@ class Bench:
         assert self.log[-1].startswith("stop: end of the run"), "the last thing is always the safe stop"
         assert sum(line.startswith("stop: end of the run") for line in self.log) == 1
         assert self.record.run.outcome == result.outcome.value
-        assert self.runner.sequence.state.value == result.outcome.value
+        assert self.runner.sequence.state == result.outcome.value
         return result
 
 
@@ -246,7 +256,7 @@ def test_a_step_that_does_not_end_even_after_the_stop_is_left_behind_and_not_rep
     release = threading.Event()
     bench = Bench(tmp_path, laser_sweep=lambda context: release.wait(20))
     bench.policy("laser_sweep", 0.05, 3, ("StepOverrun",))
-    bench.runner.policy = Policy(bench.runner.policy.steps, grace_s=0.1)
+    bench.runner.policy = replace(bench.runner.policy, grace_s=0.1)
     result = bench.run()
     release.set()
     assert result.outcome is Outcome.FAULTED
@@ -391,7 +401,7 @@ def test_a_runner_without_work_for_a_step_is_refused(tmp_path):
     bench = Bench(tmp_path)
     with pytest.raises(ValueError, match="no work was given for place"):
         Runner(
-            Sequence(), {name: print for name in NAMES if name != State.PLACE.value}, Policy(),
+            Sequence(tuple(NAMES)), {name: print for name in NAMES if name != "place"}, POLICY,
             bench.runner.journal, Clock(), bench.classify, bench.safe_stop,
         )  # fmt: skip
 

@@ -27,6 +27,7 @@ NoiseOption = Annotated[
     bool, typer.Option("--noise", help="Also show the noise that is assumed, and how several sweeps agree.")
 ]
 
+UntilOption = Annotated[str | None, typer.Option(help="End the run, done, after the step of this name.")]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -49,6 +50,7 @@ def run(
     job: JobOption = "pot",
     config: ConfigOption = None,
     at_start: AtStartOption = False,
+    until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -59,7 +61,7 @@ def run(
     from cell.supervisor import Cell
 
     with Cell.open(config) as cell:
-        code = _perform(lambda display: cell.run(job, display, at_start=at_start), json, noise)
+        code = _perform(lambda display: cell.run(job, display, at_start=at_start, until=until), json, noise)
     raise typer.Exit(code)
 
 
@@ -79,6 +81,7 @@ def dry_run(
         Confirm | None,
         typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
     ] = None,
+    until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -87,12 +90,14 @@ def dry_run(
     from cell.config import find_config, load_config
     from cell.devices.injection import Injection
     from cell.job import load_job
+    from cell.steps.kinds import find_kind
     from cell.supervisor import SIM_SPEED, Cell
 
     loaded, mesh = load_job(job)
     require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
+    find_kind(loaded.job.kind).until(until)
     for text in inject or ():
-        Injection.parse(text)
+        Injection.parse(text, find_kind(loaded.job.kind).names)
     with Cell.open(
         config,
         sim="all",
@@ -102,7 +107,7 @@ def dry_run(
         surface=Path(loaded.surface.mesh).stem,
         confirm=None if confirm is None else confirm.value,
     ) as cell:
-        code = _perform(lambda display: cell.run(job, display, inject or ()), json, noise)
+        code = _perform(lambda display: cell.run(job, display, inject or (), until=until), json, noise)
     raise typer.Exit(code)
 
 

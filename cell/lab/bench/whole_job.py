@@ -23,16 +23,15 @@ from cell.lab.bench.lockstep_arm import LockstepArm
 from cell.lab.bench.lockstep_camera import LockstepCamera, Shot
 from cell.run.frames import FrameStore
 from cell.run.job_run import classify
-from cell.run.work import JobWork
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.kinds import PLACE
 from cell.steps.moves import Mover
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 from sim_backends.world.truth import truth
-from statemachine.policy import Policy
 from statemachine.runner import StepContext
-from statemachine.sequence import State
 
 Progress = Callable[[float, str], None]
 
@@ -133,13 +132,13 @@ def _steps(
     assert record.calibration is not None
     whereabouts = Whereabouts(cell.devices.vehicle)
     whereabouts.say_at_start()
-    work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder, whereabouts)
-    record.kinematic = work.kinematic
-    policy = Policy()
-    for k, (name, step) in enumerate(work.steps().items()):
+    here = Workplace(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder, whereabouts)
+    record.kinematic = here.kinematic
+    policy = PLACE.policy()
+    for k, (name, step) in enumerate(PLACE.work(here).items()):
         record.stage = name
         tell(0.6 + 0.4 * k / 6, name)
-        context = StepContext(policy.of(State(name)), 1, math.inf, dict(record.results), cell.clock, _ignore)
+        context = StepContext(policy.of(name), 1, math.inf, dict(record.results), cell.clock, _ignore)
         with _Timed(record, name):
             record.results[name] = step(context)
         if name == "laser_sweep":
