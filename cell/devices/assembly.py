@@ -90,10 +90,14 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
     around = Surroundings(clock, look, arm)
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.
-        laser = (config.laser.output,) if isinstance(config.laser, ArmOutputLaserConfig) else ()
         kinematics = ArmKinematics()
-        around = Surroundings(clock, look, None, laser, lambda joints: to_ur(kinematics.fk(joints)))
+        around = Surroundings(clock, look, None, safe_off_outputs(config), lambda joints: to_ur(kinematics.fk(joints)))
     return config.make(name).connect(name, config.device(name), around)
+
+
+def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
+    """The arm's outputs that have to go off when nobody watches them any more: the laser's, if it hangs on one."""
+    return (config.laser.output,) if isinstance(config.laser, ArmOutputLaserConfig) else ()
 
 
 def behind_gate(
