@@ -42,12 +42,12 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
+    from cell.devices.jogging import NEEDED, parse_jog
     from cell.devices.jogging import jog as perform
-    from cell.devices.jogging import parse_jog
     from cell.supervisor import Cell
 
     wish = parse_jog(device, motion)
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=NEEDED[wish.device]) as cell:
         result = perform(cell, wish)
     if json:
         print_json(result)
@@ -56,17 +56,29 @@ def jog(
 
 
 def home(
-    config: ConfigOption = None, sim: SimOption = None, seed: SeedOption = 1, level: LevelOption = Level.nominal
+    device: Annotated[str | None, typer.Argument(help="rail or arm alone; without it both.")] = None,
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
-    from cell.supervisor import Cell
+    from cell.config import DEVICES
+    from cell.supervisor import HOMED, Cell
+    from drivers.errors import ConfigError
 
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
-        cell.home()
-    typer.echo("rail homed, arm folded")
+    if device not in (None, *HOMED):
+        raise ConfigError(f"cannot home {device!r}; write `cell home`, or {' or '.join(HOMED)} behind it")
+    needed = tuple(DEVICES) if device is None else HOMED[device]
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=needed) as cell:
+        cell.home(device)
+    typer.echo({"rail": "rail homed", "arm": "arm folded"}.get(device or "", "rail homed, arm folded"))
 
 
 def diag(
+    device: Annotated[
+        list[str] | None, typer.Option("--device", "-d", help="Only this device; may be given more than once.")
+    ] = None,
     config: ConfigOption = None,
     sim: SimOption = None,
     seed: SeedOption = 1,
@@ -74,10 +86,13 @@ def diag(
     speed: SpeedOption = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Ask every device how it is: connection, identity, round trips, errors, state. Exit code 1 if any fails."""
+    """Ask the devices how they are: connection, identity, round trips, errors, state. Exit code 1 if any fails.
+
+    Looks only: nothing on a device is set, started or ended.
+    """
     from cell.devices.diagnosis import diagnose
 
-    rows = diagnose(config, sim=sim, seed=seed, level=level.value, speed=speed)
+    rows = diagnose(config, device or (), sim=sim, seed=seed, level=level.value, speed=speed)
     if json:
         print_json({row.device: row.as_dict() for row in rows})
     else:

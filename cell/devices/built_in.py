@@ -144,6 +144,7 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
         acceleration=config.acceleration,
         address=config.address,
         motor=config.motor,
+        control=not around.look,
         clock=around.clock,
     )
 

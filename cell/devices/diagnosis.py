@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import CellConfig, config_to_open
+from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
 from cell.devices.simulated import SimulatedCell, with_endpoints
 from cell.run.folder import CellLock
@@ -58,37 +58,47 @@ class Diagnosis:
         return asdict(self)
 
 
-def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
-    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or held cell."""
+def diagnose(
+    path: Path | None, only: Collection[str] = (), *, sim: str | None, seed: int, level: str, speed: float
+) -> list[Diagnosis]:
+    """Look at each device in turn, or at `only` those: nothing on them is set, started or ended.
+
+    Raises only for a wrong configuration, an unknown device, or devices that another process holds.
+    """
+    if unknown := [name for name in only if name not in DEVICES]:
+        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
     if sim not in (None, "all"):
         raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
     _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
-        return _diagnose(config)
+        return _diagnose(config, only)
     simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
     try:
-        return _diagnose(with_endpoints(config, simulated.endpoints))
+        return _diagnose(with_endpoints(config, simulated.endpoints), only)
     finally:
         simulated.close()
 
 
-def _diagnose(config: CellConfig) -> list[Diagnosis]:
+def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     clock = Clock(config.cell.time_scale)
+    wanted = [name for name in STATES if not only or name in only]
+    needed = assembly.connected_for(config, wanted)
     rows: list[Diagnosis] = []
-    with CellLock(config), ExitStack() as opened:
+    with CellLock(config, needed), ExitStack() as opened:
         arm: Arm | None = None
-        for name, state in STATES.items():
+        for name in (name for name in STATES if name in needed):
             record = config.device(name)
             if config.make(name).on_arm and arm is None:
                 rows.append(Diagnosis(name, False, record.place, state="the arm that it hangs on is not connected"))
                 continue
             connect = partial(assembly.connect_one, config, name, clock, arm=arm, look=True)
-            row, device = _open_and_ask(name, record.place, connect, state)
-            rows.append(row)
+            row, device = _open_and_ask(name, record.place, connect, STATES[name])
             if name == "arm":
                 arm = device
             if device is not None and not config.make(name).on_arm:
                 opened.callback(device.close)
+            if name in wanted:
+                rows.append(row)
     return rows
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from cell.config import CellConfig
 from cell.device_config import of_make
-from cell.devices.assembly import Devices, behind_gate, connect_one, safe_off_outputs
+from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
+from cell.devices.devices import Devices
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.camera.clock_map import ClockMap, Latch

@@ -11,6 +11,7 @@ import secrets
 import socket
 import struct
 import time
+from collections.abc import Collection
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -217,16 +218,17 @@ def write_json(path: Path, data: Any) -> None:
 
 
 class CellLock:
-    """Held by the process that has the cell's devices open; the kernel drops it when that process ends.
+    """Held by the process that has devices of the cell open; the kernel drops it when that process ends.
 
     Each device's address is held by itself, whoever the users are, so that neither two cells nor two configurations
     share a device. A name in the kernel's abstract socket space has no owner, no rights and nothing to clean up.
     """
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> None:
+        """`only` these devices are held."""
         self._name = config.cell.name
         # What hangs on the arm is held with the arm.
-        own = [name for name in DEVICES if not config.make(name).on_arm]
+        own = [name for name in DEVICES if name in only and not config.make(name).on_arm]
         self._addresses = {name: config.device(name).held for name in own}
         self._held: list[socket.socket] = []
 
