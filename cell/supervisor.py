@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -31,8 +32,9 @@ from cell.calibration.store import (
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.check.fit import require_fit
-from cell.config import CellConfig, Confirm, beside, config_to_open
-from cell.devices.assembly import Devices, connect
+from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import connect, connected_for
+from cell.devices.devices import Devices
 from cell.devices.injection import Injection, Injector
 from cell.devices.simulated import SimulatedCell, with_endpoints
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
@@ -53,6 +55,10 @@ from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
+
+HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
+"""The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
+while the vehicle is braked."""
 
 CLOSE_WAIT_S = 20.0
 """Wall seconds that a run has to end when the cell is closed."""
@@ -77,8 +83,7 @@ class Cell:
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
-        self.whereabouts = Whereabouts(devices.vehicle)
-        if simulated is not None:
+        if simulated is not None and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
         self._beginning = threading.Lock()
@@ -98,8 +103,12 @@ class Cell:
         speed: float = SIM_SPEED,
         surface: str = "pot",
         confirm: Confirm | None = None,
+        only: Collection[str] = tuple(DEVICES),
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+
+        With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
+        may be switched off, and what is asked of them is a `NotConnectedError`.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -120,8 +129,9 @@ class Cell:
                 loaded = with_endpoints(loaded, simulated.endpoints)
             else:
                 simulated = None
-            lock = opened.enter_context(CellLock(loaded))
-            devices = connect(loaded)
+            needed = connected_for(loaded, only)
+            lock = opened.enter_context(CellLock(loaded, needed))
+            devices = connect(loaded, needed)
             opened.callback(devices.close)
             cell = cls(loaded, folder, lock, devices, simulated)
             opened.pop_all()
@@ -141,6 +151,11 @@ class Cell:
             # The first reason to end is the one that is told.
             if error is None:
                 raise
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """What is known of where the vehicle stands."""
+        return Whereabouts(self.devices.vehicle)
 
     @property
     def runs_folder(self) -> Path:
@@ -443,11 +458,16 @@ class Cell:
 
         return self.begin("verification", verification, observer).result()
 
-    def home(self) -> None:
-        """Home the rail and fold the arm above the deck."""
+    def home(self, device: str | None = None) -> None:
+        """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        if device not in (None, *HOMED):
+            raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
         def work(hands: Hands) -> None:
-            self.devices.rail.home().wait(60.0)
-            self.mover(None, hands.safe_point).to_joints(HOME)
+            if device != "arm":
+                self.devices.rail.home().wait(60.0)
+            if device != "rail":
+                self.devices.vehicle.brake()
+                self.mover(None, hands.safe_point).to_joints(HOME)
 
         self.perform("homing", work)

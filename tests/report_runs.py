@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from cell.config import CellConfig, load_config
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
 from cell.report.truth import Witness
@@ -61,7 +61,7 @@ class Ended:
 
 
 def work_of(
-    cell: LockstepCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
+    cell: VirtualCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
 ) -> Workplace:
     """The workplace of a job on a cell whose vehicle stands at its start."""
     assert record.calibration is not None
@@ -74,7 +74,7 @@ def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root:
     """A run on a cell just started that did the steps before `step` as in `record` and then this one, by itself."""
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
@@ -114,7 +114,7 @@ def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (
     assert record.calibration is not None and record.at_end is not None
     folder = new_run(root)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
     if not simulated:
@@ -136,7 +136,7 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
     job, nominal = pot()
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         frames.keep("stripe", record.results["laser_sweep"].middle)
@@ -266,7 +266,7 @@ def crippled(record: JobRecord, root: Path) -> Ended:
     assert record.calibration is not None
     folder = new_run(root)
     (folder / "picture.png").mkdir()
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         (folder / "frames").rmdir()

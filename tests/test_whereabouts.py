@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_matrix
 from cell.job import Job, load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.steps.approach import Planar, RelativeOdometry, turn_to, wrap
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.photograph import BoardFix
@@ -29,7 +29,7 @@ class Site:
     """A simulated cell whose vehicle drives; the board's sight is told by the world's truth."""
 
     def __init__(self, seed: int = 2, level: str = "nominal") -> None:
-        self.cell = LockstepCell(CONFIG, seed, level)
+        self.cell = VirtualCell(CONFIG, seed, level)
         self.vehicle = self.cell.devices.vehicle
         self.whereabouts = Whereabouts(self.vehicle)
         self.notes: list[str] = []

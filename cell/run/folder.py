@@ -11,12 +11,13 @@ import secrets
 import socket
 import struct
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.journal import JournalError, Record, read
 
@@ -231,21 +232,18 @@ def write_json(path: Path, data: Any) -> None:
 
 
 class CellLock:
-    """Held by the process that has the cell's devices open; the kernel drops it when that process ends.
+    """Held by the process that has devices of the cell open; the kernel drops it when that process ends.
 
     Each device's address is held by itself, whoever the users are, so that neither two cells nor two configurations
     share a device. A name in the kernel's abstract socket space has no owner, no rights and nothing to clean up.
     """
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> None:
+        """`only` these devices are held."""
         self._name = config.cell.name
-        self._addresses = {
-            "arm": config.arm.address,
-            "rail": _real(config.rail.url),
-            "vehicle": f"{config.vehicle.interface}:{_real(config.vehicle.channel)}",
-            "scan_camera": config.scan_camera.address,
-            "target_camera": config.target_camera.address,
-        }
+        # What hangs on the arm is held with the arm.
+        own = [name for name in DEVICES if name in only and not config.make(name).on_arm]
+        self._addresses = {name: config.device(name).held for name in own}
         self._held: list[socket.socket] = []
 
     def __enter__(self) -> CellLock:
@@ -273,11 +271,6 @@ class CellLock:
     ) -> None:
         while self._held:
             self._held.pop().close()
-
-
-def _real(address: str) -> str:
-    """A device file by the name of what it is, whichever link to it the configuration names."""
-    return os.path.realpath(address) if address.startswith("/") else address
 
 
 def _holder(name: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
 from cell.job import Job

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.steps.camera_poses import ScanPlan
