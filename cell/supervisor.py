@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -32,8 +32,9 @@ from cell.calibration.store import (
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.check.fit import require_fit
-from cell.config import CellConfig, Confirm, beside, config_to_open
-from cell.devices.assembly import Devices, connect
+from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import connect, connected_for
+from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.devices.injection import Injection, Injector
 from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
@@ -46,14 +47,20 @@ from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.run import Run
+from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
-from statemachine.watch import EndSignals, SignalWatch
+from statemachine.script import NO_SCRIPT, Script
+from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
+
+HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
+"""The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
+while the vehicle is braked."""
 
 CLOSE_WAIT_S = 20.0
 """Wall seconds that a run has to end when the cell is closed."""
@@ -83,8 +90,7 @@ class Cell:
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
-        self.whereabouts = Whereabouts(devices.vehicle)
-        if simulated is not None:
+        if simulated is not None and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
         self._beginning = threading.Lock()
@@ -104,9 +110,13 @@ class Cell:
         speed: float | None = None,
         surface: str = "pot",
         confirm: Confirm | None = None,
+        only: Collection[str] = tuple(DEVICES),
         clock: str = "wall",
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+
+        With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
+        may be switched off, and what is asked of them is a `NotConnectedError`.
 
         A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall
         (`SIM_SPEED`). With `clock="virtual"` its models are in this process behind the devices' interfaces, without
@@ -141,8 +151,9 @@ class Cell:
                     simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
                     opened.callback(simulated.close)
                     loaded = with_endpoints(loaded, simulated.endpoints)
-                lock = opened.enter_context(CellLock(loaded))
-                devices = connect(loaded)
+                needed = connected_for(loaded, only)
+                lock = opened.enter_context(CellLock(loaded, needed))
+                devices = connect(loaded, needed)
                 opened.callback(devices.close)
                 cell = cls(loaded, folder, lock, devices, simulated)
             opened.pop_all()
@@ -156,7 +167,17 @@ class Cell:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except SignalInterrupt:
+            # The first reason to end is the one that is told.
+            if error is None:
+                raise
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """What is known of where the vehicle stands."""
+        return Whereabouts(self.devices.vehicle)
 
     @property
     def runs_folder(self) -> Path:
@@ -197,9 +218,10 @@ class Cell:
     def close(self) -> None:
         """End the run that is going on, stop and disconnect everything, let go of the cell.
 
-        Idempotent, callable from any thread, shielded from interrupts.
+        Idempotent, callable from any thread, shielded from interrupts: one that comes meanwhile is raised at the end,
+        as `SignalInterrupt`.
         """
-        with SignalWatch():
+        with SignalWatch() as signals:
             with self._beginning:
                 if self._closed:
                     return
@@ -219,6 +241,8 @@ class Cell:
         self._signals.__exit__(None, None, None)
         for problem in problems:
             log.warning("closing the cell: %s", problem)
+        if signals.number is not None:
+            raise SignalInterrupt(signals.number)
 
     def begin(
         self,
@@ -285,9 +309,11 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> RunOutcome:
         """`start` a job and wait for its end. Raises only for what is wrong before anything moves."""
-        return self.start(job, observer, inject, at_start=at_start).result()
+        return self.start(job, observer, inject, at_start=at_start, until=until, script=script).result()
 
     def start(
         self,
@@ -296,6 +322,8 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         """Begin a job and hold it: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
 
@@ -304,8 +332,12 @@ class Cell:
 
         A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
+
+        With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
+        `script` looks at results between the steps and decides about refusals.
         """
-        injections = [Injection.parse(text) for text in inject]
+        loaded, _ = load_job(job)
+        injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
         info: dict[str, Any] = {}
         inline: tuple[Observer, ...] = ()
         if injections:
@@ -315,7 +347,7 @@ class Cell:
                 self.simulated.require_fault(injection.fault)
             info["injected"] = [str(injection) for injection in injections]
             inline = (Injector(self.simulated.fault, injections),)
-        return self._start(job, observer, info, None, inline, at_start=at_start)
+        return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
         self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
@@ -338,11 +370,15 @@ class Cell:
         inline: tuple[Observer, ...] = (),
         *,
         at_start: bool,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         self._require_free()
         stops = self._stops
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config, mesh)
+        kind = find_kind(loaded.job.kind).until(until)
+        kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
         stored: CellCalibration | None = None
         try:
@@ -367,7 +403,18 @@ class Cell:
                 earlier, why = before.sweep(loaded, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
             job_run = JobRun(
-                run, self.config, self.devices, loaded, nominal, calibration, info, inline, earlier, self._truth()
+                run,
+                self.config,
+                self.devices,
+                loaded,
+                nominal,
+                calibration,
+                info,
+                kind,
+                script,
+                inline,
+                earlier,
+                self._truth(),
             )
             try:
                 return job_run.perform(self.runs_folder, self.whereabouts)
@@ -452,11 +499,16 @@ class Cell:
 
         return self.begin("verification", verification, observer).result()
 
-    def home(self) -> None:
-        """Home the rail and fold the arm above the deck."""
+    def home(self, device: str | None = None) -> None:
+        """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        if device not in (None, *HOMED):
+            raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
         def work(hands: Hands) -> None:
-            self.devices.rail.home().wait(60.0)
-            self.mover(None, hands.safe_point).to_joints(HOME)
+            if device != "arm":
+                self.devices.rail.home().wait(60.0)
+            if device != "rail":
+                self.devices.vehicle.brake()
+                self.mover(None, hands.safe_point).to_joints(HOME)
 
         self.perform("homing", work)

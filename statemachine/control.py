@@ -25,6 +25,10 @@ class Asked(Protocol):
     def reason(self) -> str:
         """In the words of whoever asked."""
 
+    @property
+    def number(self) -> int | None:
+        """Of the question that a confirmation answers."""
+
 
 class RunControl:
     """The reins of one run; every method may be called from any thread."""
@@ -89,7 +93,7 @@ class RunControl:
                 case "go-on":
                     self.go_on()
                 case "confirm":
-                    self.confirm(request.reason)
+                    self.confirm(request.reason, request.number)
 
     # --- asked by the run ---
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.policy import Outcome, Step
 from statemachine.watch import Clock
+
+Made = TypeVar("Made")
 
 
 class StepOverrun(RuntimeError):
@@ -30,7 +32,7 @@ class Event:
     """What an observer is told, with the time in seconds since the epoch.
 
     `kind` is state, step_started, step_done, step_failed, progress, safe_stop, note, fault, confirm_needed, confirmed,
-    paused, going_on or run_ended.
+    decided, paused, going_on or run_ended.
     """
 
     kind: str
@@ -70,6 +72,13 @@ class StepContext:
         self._control = control or RunControl()
         self._look = look
         self.token = CancelToken(self._control.token)
+
+    def made(self, kind: type[Made]) -> Made:
+        """The newest result of the earlier steps that is of this type; LookupError when none of them made one."""
+        for result in reversed(list(self.results.values())):
+            if isinstance(result, kind):
+                return result
+        raise LookupError(f"{self.step.name} needs a {kind.__name__}, which none of {', '.join(self.results)} made")
 
     def remaining(self) -> float:
         """Seconds of the cell's clock until the deadline, at least 0."""

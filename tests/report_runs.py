@@ -27,15 +27,15 @@ from cell.run.folder import new_run
 from cell.run.frames import FrameStore
 from cell.run.job_run import classify
 from cell.run.resumption import job_source
-from cell.run.work import JobWork
+from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import CellError
-from statemachine.policy import Failure, Outcome, Policy
+from statemachine.policy import Failure, Outcome
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
-from statemachine.sequence import STEPS, State
 
 CONFIG = load_config(None)
-NAMES = [step.value for step in STEPS]
+NAMES = list(PLACE.names)
 LOST = FaultRecord(
     1_790_000_000.0, "laser_sweep", 1, "camera.frames_lost", "scan_camera: 61 frames were lost", "tried again"
 )
@@ -63,12 +63,12 @@ class Ended:
 
 def work_of(
     cell: VirtualCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
-) -> JobWork:
-    """The steps of a job on a cell whose vehicle stands at its start."""
+) -> Workplace:
+    """The workplace of a job on a cell whose vehicle stands at its start."""
     assert record.calibration is not None
     whereabouts = Whereabouts(cell.devices.vehicle)
     whereabouts.say_at_start()
-    return JobWork(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
+    return Workplace(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
 
 
 def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root: Path) -> Ended:
@@ -79,9 +79,9 @@ def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root:
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
-        context = StepContext(Policy().of(State(step)), 1, math.inf, before, cell.clock, lambda event: None)
+        context = StepContext(PLACE.policy().of(step), 1, math.inf, before, cell.clock, lambda event: None)
         try:
-            made = work.steps()[step](context)
+            made = PLACE.work(work)[step](context)
         except CellError as error:
             failed, failure = error, classify(error)
         else:
@@ -153,7 +153,7 @@ def reported(
     config: CellConfig,
     job: Job,
     nominal: NominalSurface,
-    work: JobWork,
+    work: Workplace,
     result: RunResult,
     frames: FrameStore,
     witness: Witness | None,
@@ -167,6 +167,7 @@ def reported(
         "part": work.part.state.value,
         "cell": config.cell.name,
         "job": job.job.name,
+        "job_kind": job.job.kind,
         "simulated": simulated,
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
@@ -174,8 +175,8 @@ def reported(
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),
-        "calibration_hash": work._calibration.hash(),
-        "calibration_date": work._calibration.date,
+        "calibration_hash": work.calibration.hash(),
+        "calibration_date": work.calibration.date,
     }
     started = time.time() - 31.0
     report = make_report(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.steps.moves import HOME
 from drivers.errors import Aborted

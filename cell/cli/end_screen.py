@@ -44,6 +44,8 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
         return "cell diag: the state of every device"
     match outcome:
+        case "done":
+            return f"cell report {name}: what was measured; nothing was placed"
         case "placed":
             return f"cell report {name} --noise: what was assumed; cell export: the cloud"
         case "refused" if report.get("code") == "CalibrationStale":

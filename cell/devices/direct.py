@@ -7,10 +7,13 @@ be proven there as well. Everything above the devices' interfaces is the product
 from __future__ import annotations
 
 from cell.config import CellConfig
-from cell.devices.assembly import Devices, behind_gate, connect_switches
+from cell.device_config import of_make
+from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
+from cell.devices.built_in import TmclRailConfig
+from cell.devices.devices import Devices
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
-from drivers.camera.clock_map import ClockMap, Latch
+from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
@@ -30,7 +33,7 @@ class VirtualCell(DirectCell):
         except ValueError as error:
             raise ConfigError(str(error)) from error
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
-        laser, claw = connect_switches(config, self.arm, self.clock)
+        laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
         self.devices: Devices = behind_gate(
             self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
         )
@@ -48,7 +51,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
-    arm, rail, vehicle = config.arm, config.rail, config.vehicle
+    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
     return Setup(
         ArmSetup(
             ArmLimits(
@@ -57,7 +60,7 @@ def setup_of(config: CellConfig) -> Setup:
                 linear_speed=arm.max_tool_speed,
             ),
             fault,
-            (config.laser.output,),
+            safe_off_outputs(config),
         ),
         RailSetup(
             rail.lead,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 from statemachine.runner import Event
-from statemachine.sequence import STEPS
 
 _FORM = re.compile(r"(?P<fault>[a-z_.]+)@(?P<step>[a-z_]+)(:(?P<percent>\d+(\.\d+)?)\s*%)?")
 
@@ -23,15 +22,17 @@ class Injection:
     fraction: float
 
     @classmethod
-    def parse(cls, text: str) -> Injection:
-        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known."""
+    def parse(cls, text: str, steps: Sequence[str]) -> Injection:
+        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known.
+
+        `steps` are the names of the job's steps.
+        """
         match = _FORM.fullmatch(text.strip())
         if match is None:
             raise ConfigError(f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"')
         fault, step, percent = match["fault"], match["step"], float(match["percent"] or 0.0)
         if fault not in FAULT_NAMES:
             raise ConfigError(f'"{text}": the simulated cell has no fault "{fault}"; known: {", ".join(FAULT_NAMES)}')
-        steps = [state.value for state in STEPS]
         if step not in steps:
             raise ConfigError(f'"{text}": there is no step "{step}"; the steps are {", ".join(steps)}')
         if percent > 100.0:

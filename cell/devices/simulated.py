@@ -15,7 +15,7 @@ import tempfile
 import time
 from typing import Any, Protocol
 
-from cell.config import CellConfig, default_toml
+from cell.config import DEVICES, CellConfig, default_toml
 from cell.devices.truth_link import ask_truth, cause_fault
 from drivers.errors import ConfigError, DeviceFault
 
@@ -130,21 +130,21 @@ class SimulatedCell:
 
 
 def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
-    """The configuration with every device's address replaced by a simulated one."""
-    return config.model_copy(
-        update={
-            "cell": config.cell.model_copy(
-                update={"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
-            ),
-            "arm": config.arm.model_copy(update={"address": endpoints["arm"]["address"]}),
-            "rail": config.rail.model_copy(update={"url": endpoints["rail"]["url"]}),
-            "vehicle": config.vehicle.model_copy(
-                update={"interface": endpoints["vehicle"]["interface"], "channel": endpoints["vehicle"]["channel"]}
-            ),
-            "scan_camera": config.scan_camera.model_copy(update={"address": endpoints["scan_camera"]["address"]}),
-            "target_camera": config.target_camera.model_copy(update={"address": endpoints["target_camera"]["address"]}),
-        }
-    )
+    """The configuration with every device's address replaced by that of its simulated peer.
+
+    Raises `ConfigError` when a device is of a make that has none.
+    """
+    section = {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+    changed: dict[str, Any] = {"cell": config.cell.model_copy(update=section)}
+    for name in DEVICES:
+        make = config.make(name)
+        if make.simulated is None:
+            raise ConfigError(
+                f'{name}.driver = "{make.name}": nothing simulates this make; for a simulated cell name one that is '
+                "simulated (the built-in ones are)"
+            )
+        changed[name] = make.simulated(config.device(name), endpoints.get(name, {}))
+    return config.model_copy(update=changed)
 
 
 def endpoint_toml(endpoints: dict[str, Any]) -> str:

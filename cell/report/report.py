@@ -22,8 +22,8 @@ from cell.report.evidence import last_frames, measured, refusal
 from cell.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
 from cell.run.folder import REPORT, timeless, when, write_json
 from cell.run.frames import FrameStore
-from cell.steps.laser_sweep import SweepRecord
 from cell.steps.reconstruct import Reconstruction
+from cell.steps.sweep_record import SweepRecord
 from cell.version import release
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
 from cell.run.folder import REPORT, new_run, timeless, when, write_json
 from cell.run.logs import run_log

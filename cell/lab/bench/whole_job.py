@@ -22,14 +22,14 @@ from cell.run.frames import FrameStore
 from cell.run.job_run import JobRun, classify
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.run.work import JobWork
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.kinds import PLACE
 from cell.steps.moves import Mover
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 from sim_backends.direct.camera import Shot
-from statemachine.sequence import STEPS
 from statemachine.step import Event
 
 Progress = Callable[[float, str], None]
@@ -122,7 +122,7 @@ class _WholeJob:
         assert record.calibration is not None
         whereabouts = Whereabouts(devices.vehicle)
         whereabouts.say_at_start()
-        record.kinematic = JobWork(
+        record.kinematic = Workplace(
             self.config, self.job, self.nominal, record.calibration, devices, NoFrames(), folder, whereabouts
         ).kinematic
         job_run = JobRun(
@@ -133,7 +133,8 @@ class _WholeJob:
             self.nominal,
             record.calibration,
             self.cell.facts,
-            (self._follow,),
+            PLACE,
+            inline=(self._follow,),
             truth=self.cell.truth,
         )
         with _Timed(record, "job"):
@@ -160,7 +161,7 @@ class _WholeJob:
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""
-        names = [step.value for step in STEPS]
+        names = PLACE.names
         if event.kind == "step_started" and event.step in names:
             self.record.stage = str(event.step)
             self.tell(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))
