@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -31,11 +32,14 @@ from cell.calibration.store import (
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.check.fit import require_fit
-from cell.config import CellConfig, Confirm, beside, config_to_open
-from cell.devices.assembly import Devices, connect
+from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import connect, connected_for
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
 from cell.devices.injection import Injection, Injector
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.run.folder import CellLock, find_run
@@ -54,6 +58,10 @@ from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
 
+HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
+"""The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
+while the vehicle is braked."""
+
 CLOSE_WAIT_S = 20.0
 """Wall seconds that a run has to end when the cell is closed."""
 
@@ -70,15 +78,19 @@ class Cell:
     """
 
     def __init__(
-        self, config: CellConfig, folder: Path, lock: CellLock, devices: Devices, simulated: SimulatedCell | None
+        self,
+        config: CellConfig,
+        folder: Path,
+        lock: AbstractContextManager[object],
+        devices: Devices,
+        simulated: Simulation | None,
     ) -> None:
         self.config = config
         self.folder = folder
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
-        self.whereabouts = Whereabouts(devices.vehicle)
-        if simulated is not None:
+        if simulated is not None and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
         self._beginning = threading.Lock()
@@ -95,11 +107,20 @@ class Cell:
         sim: str | None = None,
         seed: int = 1,
         level: str = "nominal",
-        speed: float = SIM_SPEED,
+        speed: float | None = None,
         surface: str = "pot",
         confirm: Confirm | None = None,
+        only: Collection[str] = tuple(DEVICES),
+        clock: str = "wall",
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+
+        With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
+        may be switched off, and what is asked of them is a `NotConnectedError`.
+
+        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall
+        (`SIM_SPEED`). With `clock="virtual"` its models are in this process behind the devices' interfaces, without
+        wires and without waiting: the same seed then takes the same course, to the byte.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -111,19 +132,30 @@ class Cell:
             raise ConfigError(
                 f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices'
             )
+        if clock not in ("wall", "virtual"):
+            raise ConfigError(
+                f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait'
+            )
+        if clock == "virtual" and (sim is None or speed is not None):
+            wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
+            raise ConfigError(f'clock="virtual": {wrong}; leave that out')
         path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
         folder = beside(path)
         with EndSignals(), ExitStack() as opened:
-            if sim == "all":
-                simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface=surface)
-                opened.callback(simulated.close)
-                loaded = with_endpoints(loaded, simulated.endpoints)
+            if clock == "virtual":
+                virtual = VirtualCell(loaded, seed, level, surface)
+                cell = cls(loaded, folder, nullcontext(), virtual.devices, virtual)
             else:
                 simulated = None
-            lock = opened.enter_context(CellLock(loaded))
-            devices = connect(loaded)
-            opened.callback(devices.close)
-            cell = cls(loaded, folder, lock, devices, simulated)
+                if sim == "all":
+                    simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
+                    opened.callback(simulated.close)
+                    loaded = with_endpoints(loaded, simulated.endpoints)
+                needed = connected_for(loaded, only)
+                lock = opened.enter_context(CellLock(loaded, needed))
+                devices = connect(loaded, needed)
+                opened.callback(devices.close)
+                cell = cls(loaded, folder, lock, devices, simulated)
             opened.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.
         cell._signals.__enter__()
@@ -141,6 +173,11 @@ class Cell:
             # The first reason to end is the one that is told.
             if error is None:
                 raise
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """What is known of where the vehicle stands."""
+        return Whereabouts(self.devices.vehicle)
 
     @property
     def runs_folder(self) -> Path:
@@ -254,8 +291,14 @@ class Cell:
     def _world(self) -> dict[str, Any]:
         """Whether this cell is simulated, and which world."""
         if self.simulated is None:
-            return {"simulated": False, "seed": None, "level": None}
-        return {"simulated": True, **{key: self.simulated.endpoints[key] for key in ("seed", "level")}}
+            return {"simulated": False, "seed": None, "level": None, "clock": "wall"}
+        return self.simulated.facts
+
+    def _truth(self) -> Callable[[], dict[str, Any]] | None:
+        """How the report asks a simulated world for its truth; None where there is none."""
+        if self.simulated is not None:
+            return self.simulated.truth
+        return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     # --- jobs ---
 
@@ -295,13 +338,15 @@ class Cell:
         """
         loaded, _ = load_job(job)
         injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
-        if injections and self.simulated is None:
-            raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
         info: dict[str, Any] = {}
         inline: tuple[Observer, ...] = ()
         if injections:
+            if self.simulated is None:
+                raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
+            for injection in injections:
+                self.simulated.require_fault(injection.fault)
             info["injected"] = [str(injection) for injection in injections]
-            inline = (Injector(self.config.cell.truth, injections),)
+            inline = (Injector(self.simulated.fault, injections),)
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
@@ -358,7 +403,18 @@ class Cell:
                 earlier, why = before.sweep(loaded, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
             job_run = JobRun(
-                run, self.config, self.devices, loaded, nominal, calibration, info, kind, script, inline, earlier
+                run,
+                self.config,
+                self.devices,
+                loaded,
+                nominal,
+                calibration,
+                info,
+                kind,
+                script,
+                inline,
+                earlier,
+                self._truth(),
             )
             try:
                 return job_run.perform(self.runs_folder, self.whereabouts)
@@ -443,11 +499,16 @@ class Cell:
 
         return self.begin("verification", verification, observer).result()
 
-    def home(self) -> None:
-        """Home the rail and fold the arm above the deck."""
+    def home(self, device: str | None = None) -> None:
+        """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        if device not in (None, *HOMED):
+            raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
         def work(hands: Hands) -> None:
-            self.devices.rail.home().wait(60.0)
-            self.mover(None, hands.safe_point).to_joints(HOME)
+            if device != "arm":
+                self.devices.rail.home().wait(60.0)
+            if device != "rail":
+                self.devices.vehicle.brake()
+                self.mover(None, hands.safe_point).to_joints(HOME)
 
         self.perform("homing", work)

@@ -26,7 +26,7 @@ REQUESTS = ("abort", "pause", "go-on", "confirm")
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS runs (
-    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL);
+    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL, pid INTEGER);
 CREATE TABLE IF NOT EXISTS steps (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, name TEXT NOT NULL, attempt INTEGER NOT NULL,
     started REAL NOT NULL, ended REAL, state TEXT NOT NULL, duration_s REAL, result TEXT, error TEXT);
@@ -44,7 +44,10 @@ class JournalError(RuntimeError):
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed."""
+    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed.
+
+    `pid` is the process that does it, None where an older journal does not tell.
+    """
 
     id: str
     started: float
@@ -52,6 +55,7 @@ class RunRow:
     outcome: str | None
     reason: str | None
     info: dict[str, Any]
+    pid: int | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,10 @@ class Journal:
     """Writes the record of one run into `folder`/journal.sqlite; safe to use from several threads."""
 
     def __init__(self, folder: Path, run: str, info: Mapping[str, object] | None = None) -> None:
-        """Begin the run `run`; `info` is JSON-ready (seed, level, job, hashes …). `JournalError` if it cannot."""
+        """Begin the run `run`; `info` is JSON-ready (seed, level, job, hashes …), its "pid" the process that does it.
+
+        `JournalError` if it cannot.
+        """
         self.run = run
         self.path = folder / FILE_NAME
         self._lock = threading.Lock()
@@ -105,7 +112,11 @@ class Journal:
             self._taken = int(self._asked.execute("SELECT coalesce(max(id), 0) FROM requests").fetchone()[0])
         except sqlite3.Error as error:
             raise JournalError(f"the journal {self.path} cannot be opened: {error}. Is the folder writable?") from error
-        self._write("INSERT INTO runs (id, started, info) VALUES (?, ?, ?)", run, time.time(), _dump(info or {}))
+        about = dict(info or {})
+        pid = about.pop("pid", None)
+        self._write(
+            "INSERT INTO runs (id, started, info, pid) VALUES (?, ?, ?, ?)", run, time.time(), _dump(about), pid
+        )
 
     def step_started(self, name: str, attempt: int) -> int:
         """Record that an attempt (counted from 1) at a step begins; returns the key for `step_ended`."""
@@ -194,10 +205,11 @@ def read(folder: Path) -> Record:
     """Read the journal in a run's folder, also while it is being written; `JournalError` if there is none."""
 
     def rows(base: sqlite3.Connection) -> Record:
+        columns = "id, started, ended, outcome, reason, info, " + ("pid" if _tells_pid(base) else "NULL")
         runs = tuple(
-            RunRow(key, started, ended, outcome, reason, json.loads(info))
-            for key, started, ended, outcome, reason, info in base.execute(
-                "SELECT id, started, ended, outcome, reason, info FROM runs ORDER BY rowid"
+            RunRow(key, started, ended, outcome, reason, json.loads(info), pid)
+            for key, started, ended, outcome, reason, info, pid in base.execute(
+                f"SELECT {columns} FROM runs ORDER BY rowid"
             )
         )
         if not runs:
@@ -226,6 +238,10 @@ def read(folder: Path) -> Record:
         )
 
     return _in_existing(folder, rows)
+
+
+def _tells_pid(base: sqlite3.Connection) -> bool:
+    return "pid" in (row[1] for row in base.execute("PRAGMA table_info(runs)"))
 
 
 def request(folder: Path, kind: str, reason: str, number: int | None = None) -> None:

@@ -11,13 +11,15 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cell.config import CellConfig, load_config
+from cell.devices.direct import VirtualCell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
 from cell.report.truth import Witness
@@ -29,7 +31,6 @@ from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import CellError
-from sim_backends.peers.truth import TruthPeer
 from statemachine.policy import Failure, Outcome
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
 
@@ -61,7 +62,7 @@ class Ended:
 
 
 def work_of(
-    cell: LockstepCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
+    cell: VirtualCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
 ) -> Workplace:
     """The workplace of a job on a cell whose vehicle stands at its start."""
     assert record.calibration is not None
@@ -74,7 +75,7 @@ def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root:
     """A run on a cell just started that did the steps before `step` as in `record` and then this one, by itself."""
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
@@ -114,21 +115,15 @@ def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (
     assert record.calibration is not None and record.at_end is not None
     folder = new_run(root)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
     if not simulated:
         return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
     at_end = record.at_end
-    peer = TruthPeer(lambda: at_end, lambda name: None, lambda: None)
-    peer.start()
-    try:
-        config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": peer.address})})
-        witness = Witness(peer.address)
-        witness.at_sweep = record.at_sweep
-        return reported(folder, config, job, nominal, work, result, frames, witness)
-    finally:
-        peer.stop()
+    witness = Witness(lambda: at_end)
+    witness.at_sweep = record.at_sweep
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
 
 
 def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tuple[FaultRecord, ...] = ()) -> Ended:
@@ -136,7 +131,7 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
     job, nominal = pot()
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         frames.keep("stripe", record.results["laser_sweep"].middle)
@@ -176,6 +171,7 @@ def reported(
         "simulated": simulated,
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
+        "clock": "wall",
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),
@@ -266,11 +262,11 @@ def crippled(record: JobRecord, root: Path) -> Ended:
     assert record.calibration is not None
     folder = new_run(root)
     (folder / "picture.png").mkdir()
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         (folder / "frames").rmdir()
         frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
-    config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": "127.0.0.1:1"})})
-    return reported(folder, config, job, nominal, work, result, frames, Witness("127.0.0.1:1"))
+    witness = Witness(partial(ask_truth, "127.0.0.1:1"))
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)

@@ -103,9 +103,25 @@ def test_nested_contexts_leave_the_programs_own_handlers_as_they_were() -> None:
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)] == before
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_each_signal_to_end_is_raised_outside_of_a_run(number: int) -> None:
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
+    try:
+        with EndSignals(keyboard=True):
+            assert signal.getsignal(number) is not usual
+            with pytest.raises(SignalInterrupt) as caught:
+                signal.raise_signal(number)
+            assert caught.value.number == number
+    finally:
+        signal.signal(number, before)
+
+
 def ask_to_end() -> None:
     """A SIGTERM as soon as somebody waits for it."""
+    until = time.monotonic() + 5.0
     while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        assert time.monotonic() < until
         time.sleep(0.001)
     os.kill(os.getpid(), signal.SIGTERM)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
-from cell.devices.assembly import Devices, behind_gate
-from cell.lab.bench.lockstep import LockstepCell
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
 from cell.steps.moves import HOME
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken
@@ -17,8 +17,7 @@ CONFIG = load_config(None)
 
 @pytest.fixture(scope="module")
 def devices() -> Devices:
-    d = LockstepCell(CONFIG, seed=4, level="ideal").devices
-    return behind_gate(d.clock, d.arm, d.rail, d.vehicle, d.scan_camera, d.target_camera, d.laser, d.claw)
+    return VirtualCell(CONFIG, seed=4, level="ideal").devices
 
 
 def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) -> None:

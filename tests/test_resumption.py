@@ -1,93 +1,99 @@
-"""What an earlier run left is trusted only while its job, its calibration and its board are what they were."""
+"""A run is resumed with its own job, and its sweep is trusted only as long as nothing that it stands on has changed."""
 
 from __future__ import annotations
 
 import shutil
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from test_rail_sweep import CONFIG, sweep
+from test_stored_calibration import made
 
-from cell.config import load_config
 from cell.geometry.poses import from_parts
 from cell.job import load_job
 from cell.run.resumption import UnfinishedRun, job_hash
+from cell.steps.laser_sweep import SweepRecord
 from cell.steps.photograph import BoardFix
 from cell.steps.stored_sweep import FILE, StoredSweep
-from cell.steps.sweep_record import SweepRecord
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.journal import Journal
-from tests.test_stored_calibration import made
 
-SIGMA = np.diag([1e-5**2] * 3 + [5e-5**2] * 3)
-SEEN = pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2]))
-
-
-def fix(moved: pin.SE3) -> BoardFix:
-    return BoardFix(SEEN * moved, SIGMA, 0.05, 0.1, ())
+CALIBRATION = made()
+SIGMA_M, SIGMA_RAD = 1e-4, 2e-4
+SEEN = np.diag([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
+BOARD = from_parts(np.array([0.9, 0.1, 0.3]))
 
 
-def stored(folder: Path) -> StoredSweep:
-    return StoredSweep(folder, SweepRecord(()), SEEN, SIGMA)
+def fix(base_from_board: pin.SE3) -> BoardFix:
+    return BoardFix(base_from_board, SEEN, 0.1, 0.3, ())
 
 
-def test_a_sweep_holds_where_the_board_stands_as_it_stood(tmp_path: Path) -> None:
-    assert stored(tmp_path).confirmed_by(fix(from_parts((1e-5, -1e-5, 0.0)))).swaths == ()
+@pytest.fixture(scope="module")
+def stored() -> StoredSweep:
+    return StoredSweep(Path("run"), SweepRecord((sweep(),)), BOARD, SEEN)
 
 
-@pytest.mark.parametrize("shift", [(3e-4, 0.0, 0.0), (0.0, 0.0, -3e-4)])
-def test_a_board_that_has_moved_takes_its_sweep_with_it(tmp_path: Path, shift: tuple[float, float, float]) -> None:
-    with pytest.raises(CalibrationStale, match=r"the board has moved by 0\.30 mm"):
-        stored(tmp_path).confirmed_by(fix(from_parts(shift)))
+@pytest.mark.parametrize("away", [0.0, 2.0])
+def test_a_sweep_holds_while_the_board_is_seen_where_it_was(stored: StoredSweep, away: float) -> None:
+    """`away` in standard deviations of the difference of two photographs."""
+    confirmed = stored.confirmed_by(fix(BOARD * from_parts((away * np.sqrt(2) * SIGMA_M, 0.0, 0.0))))
+    (before,), (after,) = stored.sweep.swaths, confirmed.swaths
+    # What two photographs leave open is not known better than that.
+    assert np.trace((after.covariance - before.covariance)[:3, :3]) > 2 * 3 * SIGMA_M**2 * 0.999
 
 
-def test_a_board_that_was_turned_takes_its_sweep_with_it(tmp_path: Path) -> None:
-    turned = pin.SE3(pin.exp3(np.array([0.0, 0.0, 2e-3])), np.zeros(3))
-    with pytest.raises(CalibrationStale, match="the board has moved"):
-        stored(tmp_path).confirmed_by(fix(turned))
+@pytest.mark.parametrize("way", [(7.0, 0, 0, 0, 0, 0), (0, 0, -7.0, 0, 0, 0), (0, 0, 0, 0, 7.0, 0)])
+def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way: tuple[float, ...]) -> None:
+    step = np.sqrt(2) * np.array(way) * np.array([SIGMA_M] * 3 + [SIGMA_RAD] * 3)
+    moved = pin.SE3(pin.exp3(step[3:]), step[:3])
+    with pytest.raises(CalibrationStale, match="the board has moved by"):
+        stored.confirmed_by(fix(BOARD * moved))
 
 
-def job_file(folder: Path) -> Path:
-    """The shipped job as files of one's own."""
-    job, mesh = load_job("pot")
-    shutil.copy(mesh, folder / job.surface.mesh)
-    return Path(shutil.copy(mesh.parent / "pot.toml", folder / "mine.toml"))
+def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
+    """A run with its own copy of a job that was killed after its sweep."""
+    jobs = Path(str(files("cell") / "jobs"))
+    for name in ("pot.toml", "pot.stl"):
+        shutil.copyfile(jobs / name, folder / name)
+    run = folder / "run"
+    run.mkdir()
+    job = folder / "pot.toml"
+    info = {
+        "job_file": str(job), "job_hash": job_hash(job), "simulated": False,
+        "configuration_hash": CONFIG.calibration_hash(), "calibration_hash": CALIBRATION.hash(), **other,
+    }  # fmt: skip
+    Journal(run, "run", info).close()
+    (run / FILE).write_bytes(b"")
+    return UnfinishedRun.find(run), job
 
 
-def cut_short(folder: Path, job: Path, **info: object) -> None:
-    """The journal of a run of this job whose process died."""
-    Journal(folder, folder.name, {"job_file": str(job), "job_hash": job_hash(job), "simulated": False, **info}).close()
-
-
-def test_a_run_that_was_cut_short_is_found_with_its_job(tmp_path: Path) -> None:
-    job = job_file(tmp_path)
-    cut_short(tmp_path, job)
-    assert UnfinishedRun.find(tmp_path).job == str(job)
-
-
-def test_a_job_or_a_mesh_that_was_changed_is_not_resumed(tmp_path: Path) -> None:
-    job = job_file(tmp_path)
-    cut_short(tmp_path, job)
-    text = job.read_text()
-    job.write_text(text.replace('speed = "15 mm/s"', 'speed = "16 mm/s"') + "\n")
+@pytest.mark.parametrize("name", ["pot.toml", "pot.stl"])
+def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path: Path, name: str) -> None:
+    run, _ = cut_short(tmp_path)
+    assert run.job == str(tmp_path / "pot.toml")
+    with (tmp_path / name).open("ab") as file:
+        file.write(b"\n# changed\n")
     with pytest.raises(ConfigError, match="was changed since run"):
-        UnfinishedRun.find(tmp_path)
-    job.write_text(text)
-    UnfinishedRun.find(tmp_path)
-    mesh = tmp_path / load_job(job)[0].surface.mesh
-    mesh.write_bytes(mesh.read_bytes() + b"\0")
-    with pytest.raises(ConfigError, match="was changed since run"):
-        UnfinishedRun.find(tmp_path)
+        UnfinishedRun.find(run.folder)
 
 
-@pytest.mark.parametrize("other", ["calibration", "configuration"])
-def test_a_sweep_under_another_calibration_or_configuration_is_not_used(tmp_path: Path, other: str) -> None:
-    calibration, config = made(), load_config(None)
-    hashes = {"calibration_hash": calibration.hash(), "configuration_hash": config.calibration_hash()}
-    job = job_file(tmp_path)
-    cut_short(tmp_path, job, **{**hashes, f"{other}_hash": "0123456789abcdef"})
-    (tmp_path / FILE).touch()
-    sweep, why = UnfinishedRun.find(tmp_path).sweep(load_job(job)[0], config, calibration)
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({}, "cannot be read as a sweep"),
+        ({"calibration_hash": "another"}, "the calibration was changed"),
+        ({"configuration_hash": "another"}, "the configuration was changed"),
+        ({"simulated": True}, "simulated world"),
+    ],
+)
+def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
+    tmp_path: Path, other: dict[str, Any], said: str
+) -> None:
+    run, job = cut_short(tmp_path, **other)
+    sweep, why = run.sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None
-    assert why.startswith(f"the {other} was changed since run")
+    assert said in why

@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import threading
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -324,6 +325,42 @@ def test_a_paused_run_can_be_aborted(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.pause())
     bench.runner.observer = observe
     assert bench.run().outcome is Outcome.ABORTED
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_end_stops_the_moving_step(tmp_path, number):
+    def work(context):
+        os.kill(os.getpid(), number)
+        assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    with outlived(number):
+        result = bench.run()
+    assert result.outcome is Outcome.ABORTED
+    assert result.signal == number
+    assert "reconstruct" not in bench.log
+
+
+@contextmanager
+def outlived(number):
+    """A signal that the runner does not take fails the test in here, and does not end pytest."""
+    before = signal.signal(number, lambda number, frame: None)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
+    def health():
+        if bench.log[-1] == "laser_sweep":
+            raise ValueError("the vehicle reports a fault")
+
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
+    bench.runner.health = health
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.REFUSED, "the vehicle reports a fault")
+    assert "reconstruct" not in bench.log
 
 
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):

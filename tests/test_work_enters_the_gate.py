@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import NoFrames
 from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
@@ -24,7 +24,7 @@ from statemachine.step import StepContext
 def test_every_step_enters_the_gate_with_the_token_that_ends_it(tmp_path: Path) -> None:
     config = load_config(None)
     job, mesh = load_job("pot")
-    cell = LockstepCell(config, 1)
+    cell = VirtualCell(config, 1)
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     whereabouts = Whereabouts(cell.devices.vehicle)
     here = Workplace(config, job, nominal, None, cell.devices, NoFrames(), tmp_path, whereabouts)  # type: ignore[arg-type]

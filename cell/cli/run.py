@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from cell.cli.options import (
+    CellClock,
     ConfigOption,
     Confirm,
     JobOption,
@@ -76,6 +77,9 @@ def dry_run(
     speed: Annotated[
         float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
     ] = None,
+    clock: Annotated[
+        CellClock, typer.Option(help='"virtual": without wires and without waiting; the same seed, the same bytes.')
+    ] = CellClock.wall,
     inject: Annotated[
         list[str] | None,
         typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
@@ -94,7 +98,7 @@ def dry_run(
     from cell.devices.injection import Injection
     from cell.job import load_job
     from cell.steps.kinds import find_kind
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.supervisor import Cell
 
     loaded, mesh = load_job(job)
     require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
@@ -107,9 +111,10 @@ def dry_run(
         sim="all",
         seed=seed,
         level=level.value,
-        speed=speed or SIM_SPEED,
+        speed=speed,
         surface=Path(loaded.surface.mesh).stem,
         confirm=None if confirm is None else confirm.value,
+        clock=clock.value,
     )
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
 
@@ -128,18 +133,19 @@ def resume(
     from cell.job import load_job
     from cell.run.folder import find_run
     from cell.run.resumption import UnfinishedRun
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.supervisor import Cell
 
     before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
-    simulated = before.info["simulated"]
+    simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
     opened = partial(
         Cell.open,
         config,
         sim="all" if simulated else None,
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
-        speed=before.info["speed"] if simulated else SIM_SPEED,
+        speed=before.info["speed"] if simulated and clock == "wall" else None,
         surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
+        clock=clock,
     )
     _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MAX_LENGTH_MM = 500.0
 MAX_ANGLE_DEG = 90.0
 JOG_SPEED = 0.05  # m/s
+NEEDED = {"rail": ("rail",), "arm": ("arm", "vehicle"), "vehicle": ("vehicle", "arm")}
+"""Which devices have to be connected to jog one: arm and vehicle move only while the other one is safe."""
 _USAGE = "rail +5mm · arm z -10mm · arm rx +2deg · arm j3 +5deg · vehicle +0.1m · vehicle +5deg"
 
 
@@ -87,6 +89,7 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 
 
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
+    cell.devices.vehicle.brake()
     mover = cell.mover(None)
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1
@@ -120,11 +123,16 @@ def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, 
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
     vehicle.enable()
     odometry = RelativeOdometry(vehicle)
+
+    def look() -> None:
+        check()
+        cell.whereabouts.count()
+
     try:
         if wish.axis == "yaw":
-            turn_to(vehicle, odometry, wish.amount, clock, check)
+            turn_to(vehicle, odometry, wish.amount, clock, look)
         else:
-            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, check)
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, look)
     finally:
         vehicle.brake()
     pose = odometry.pose()

@@ -12,7 +12,7 @@ from typing import Any
 
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
 from cell.job import Job
@@ -94,6 +94,7 @@ class JobRun:
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
+    `truth` asks a simulated world.
     """
 
     run: Run[Any]
@@ -107,6 +108,7 @@ class JobRun:
     script: Script = NO_SCRIPT
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
+    truth: Callable[[], dict[str, Any]] | None = None
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -125,7 +127,8 @@ class JobRun:
 
     def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
         started = time.time()
-        witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
+        begun = self.devices.clock.now()
+        witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames") as frames:
             here = Workplace(
@@ -156,7 +159,8 @@ class JobRun:
             result = runner.run()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
-        facts = {**self._facts(), "part": here.part.state.value}
+        cell_s = round(self.devices.clock.now() - begun, 3)
+        facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
         report = make_report(
             folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip

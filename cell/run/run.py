@@ -21,7 +21,7 @@ from cell.run.events import Detached, Subscription
 from drivers.errors import DeadlineError
 from statemachine.control import RunControl
 from statemachine.step import Event, Observer
-from statemachine.watch import Call, SignalInterrupt, SignalWatch
+from statemachine.watch import SignalInterrupt, SignalWatch, begin
 
 Result = TypeVar("Result")
 
@@ -48,7 +48,7 @@ class Run(Generic[Result]):
         self._past: deque[Event] = deque(maxlen=KEPT_EVENTS)
         self._observer = None if observer is None else Detached(observer)
         self._work = work
-        self._call = Call(f"run: {kind}", self._perform)
+        self._call = begin(f"run: {kind}", self._perform)
 
     def pause(self) -> None:
         """Hold the run at its next safe point: before its next free motion or its next step."""

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.steps.camera_poses import ScanPlan
@@ -49,6 +49,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     camera.configure(scan.exposure, scan.frame_rate)
     clocks = ClockMap()
     clocks.add([arm.latch_clock()])
+    # Before anything is lit and moved in vain.
+    shift_by_times([TimeBound(arm.name, "arm", clocks.uncertainty)], scan.speed, errors)
     with devices.laser.lit(), arm.record() as states, camera.stream() as frames:
         motion, patience = mover.begin(line)
         over: list[float] = []

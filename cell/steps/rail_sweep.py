@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover

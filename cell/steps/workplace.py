@@ -11,7 +11,7 @@ import numpy as np
 
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.inversion import NominalSurface
 from cell.job import Job
 from cell.run.frames import FrameStore

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_s
 pytestmark = pytest.mark.wire
 
 
-def dry_run(folder: Path, *faults: str) -> dict[str, Any]:
-    """The report of a dry run in which the faults happen."""
+def dry_run(folder: Path, *faults: str, job: str = "pot") -> dict[str, Any]:
+    """The report of a dry run of the job in which the faults happen."""
     options = [word for fault in faults for word in ("--inject", fault)]
-    done = cell("dry-run", "--seed", "3", "--json", "--confirm", "simulated", *options, folder=folder)
+    done = cell("dry-run", "--seed", "3", "--json", "--confirm", "simulated", "-j", job, *options, folder=folder)
     assert "Traceback" not in done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["injected"] == list(faults)
@@ -107,6 +108,17 @@ def wait_for_end(folder: Path, before: set[Path]) -> None:
             return
         Clock().sleep(0.01)
     raise AssertionError("no run placed")
+
+
+def test_an_arm_whose_states_all_come_late_does_not_sweep(place: Path) -> None:
+    shipped = (files("cell") / "jobs" / "pot.toml").read_text()
+    (place / "arm.toml").write_text(
+        shipped.replace('mode = "rail"', 'mode = "arm"').replace("pot.stl", str(files("cell") / "jobs" / "pot.stl"))
+    )
+    report = dry_run(place, "arm.late_states@laser_sweep:0%", job="arm")
+    assert report["outcome"] == "faulted"
+    assert report["reason"].startswith("arm: replies come so late that times are not known")
+    assert report["end_state"]["part"]["held"]
 
 
 def test_a_vehicle_that_was_turned_by_hand_is_not_driven_blind(place: Path) -> None:

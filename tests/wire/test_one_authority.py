@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cell import Cell, RunOutcome
-from cell.report.truth import ask_truth
+from cell.devices.truth_link import ask_truth
 from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
 from cell.run.folder import is_going, list_runs, read_report
 from cell.run.run import Run

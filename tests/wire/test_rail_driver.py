@@ -50,7 +50,9 @@ class Bench:
         return self.model.carriage(host_time + self.world.now() - self.clock.now())
 
 
-def connect(url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1) -> TmclRail:
+def connect(
+    url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1, control: bool = True
+) -> TmclRail:
     return TmclRail(
         "rail",
         url,
@@ -62,6 +64,7 @@ def connect(url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), ad
         acceleration=ACCELERATION,
         address=address,
         motor=0,
+        control=control,
         clock=clock,
     )
 
@@ -372,6 +375,38 @@ def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) ->
 
 
 @pytest.mark.wire
+def test_a_motor_that_stalls_before_its_target_loses_the_zero(bench: Bench) -> None:
+    bench.model.params = replace(bench.model.params, ends=(-0.004, 0.08))  # something lies in the carriage's way
+    rail = connect(bench.peer.url, bench.clock)
+    rail.home().wait(20.0)
+    with pytest.raises(DeviceFault, match="stall detected") as caught:
+        rail.move_to(0.09).wait(30.0)
+    assert caught.value.code == "rail.stalled"
+    assert not rail.state().homed
+    rail.close()
+    # The flag is gone once it has moved off the end; that does not make the count right.
+    bench.model.rotate(bench.world.now(), -51_200)
+    bench.clock.sleep(2.0)
+    again = connect(bench.peer.url, bench.clock)
+    assert not again.state().homed
+    again.close()
+
+
+@pytest.mark.wire
+def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench) -> None:
+    rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    rail.home().wait(20.0)
+    rail.close()
+    bench.model.rotate(bench.world.now(), 5 * 51_200)
+    bench.clock.sleep(4.0)
+    again = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    state = again.state()
+    assert state.right_switch
+    assert not state.homed
+    again.close()
+
+
+@pytest.mark.wire
 def test_a_reset_between_two_motions_is_told_before_anything_moves(homed: Bench) -> None:
     homed.rail.move_to(0.03).wait(10.0)
     homed.peer.fault("rail.reset")
@@ -576,3 +611,31 @@ def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(mo
         rail.move_to(0.05).wait(10.0)
     assert not rail.state().homed
     rail.close()
+
+
+@pytest.mark.wire
+def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(4, 0, round(0.09 / 0.002 * 200 * 256)))
+    before = homed.model.settings
+    looking = connect(homed.peer.url, homed.clock, control=False)
+    state = looking.state()
+    assert state.moving
+    assert state.homed
+    for command in (looking.home, lambda: looking.move_to(0.01), looking.stop):
+        with pytest.raises(InterlockError, match="looked at only"):
+            command()
+    looking.close()
+    assert homed.model.settings == before
+    homed.clock.sleep(4.0)
+    assert homed.carriage() == pytest.approx(0.09, abs=1e-5)
+
+
+@pytest.mark.wire
+def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 140, 7))
+    looking = connect(homed.peer.url, homed.clock, control=False)
+    assert not looking.state().homed
+    looking.close()
+    assert homed.model.settings.microsteps == 7

@@ -10,7 +10,7 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.aiming import Aim
 from cell.calibration.store import nominal_camera
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
 from cell.steps.moves import HOME, Mover

@@ -16,11 +16,9 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import Job
-from cell.lab.bench.lockstep import LockstepCell
-from cell.lab.bench.lockstep_arm import LockstepArm
-from cell.lab.bench.lockstep_camera import LockstepCamera, Shot
 from cell.run.frames import FrameStore
 from cell.run.job_run import classify
 from cell.steps.kinds import PLACE
@@ -30,6 +28,7 @@ from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
+from sim_backends.direct.camera import Shot
 from sim_backends.world.truth import truth
 from statemachine.runner import StepContext
 
@@ -88,7 +87,7 @@ def run_whole_job(
     """
     tell = progress or (lambda fraction, text: None)
     record = JobRecord(seed, level)
-    cell = LockstepCell(config, seed, level, Path(job.surface.mesh).stem)
+    cell = VirtualCell(config, seed, level, Path(job.surface.mesh).stem)
     try:
         if calibrated is not None:
             record.calibration, record.observations = calibrated.calibration, calibrated.observations
@@ -103,25 +102,23 @@ def run_whole_job(
         failure = classify(error)
         record.outcome, record.reason = failure.outcome.value, failure.reason
     record.at_end = truth(cell.world)
-    arm = cell.devices.arm
-    assert isinstance(arm, LockstepArm)
     before = [] if calibrated is None or calibrated.rests is None else list(calibrated.rests)
-    record.rests = np.array([*before, *arm.rests])
+    record.rests = np.array([*before, *cell.arm.rests])
     return record
 
 
-def _calibrate(cell: LockstepCell, config: CellConfig, job: Job, record: JobRecord, tell: Progress) -> CellCalibration:
+def _calibrate(cell: VirtualCell, config: CellConfig, job: Job, record: JobRecord, tell: Progress) -> CellCalibration:
     mover = Mover(cell.devices.arm, cell.clock, config, job)
     cell.devices.vehicle.brake()
     scan = collect_scan(config, cell.devices, mover, _never, lambda f, t: tell(0.6 * f, t))
     target = collect_target(config, cell.devices, mover, _never, lambda f, t: tell(0.6 + 0.2 * f, t))
     record.observations = (scan, target)
     tell(0.8, "solving")
-    return CellCalibration.solve(scan, target, cell.identities(), config)
+    return CellCalibration.solve(scan, target, _identities(cell), config)
 
 
 def _steps(
-    cell: LockstepCell,
+    cell: VirtualCell,
     config: CellConfig,
     job: Job,
     nominal: NominalSurface,
@@ -146,10 +143,13 @@ def _steps(
             record.shots = _shots(cell, record.results[name])
 
 
-def _shots(cell: LockstepCell, sweep: SweepRecord) -> list[Shot]:
-    camera = cell.devices.scan_camera
-    assert isinstance(camera, LockstepCamera)
-    return [camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
+def _shots(cell: VirtualCell, sweep: SweepRecord) -> list[Shot]:
+    return [cell.scan_camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
+
+
+def _identities(cell: VirtualCell) -> dict[str, str]:
+    named = (cell.arm, cell.rail, cell.scan_camera, cell.target_camera)
+    return {device.name: device.identity().serial for device in named}
 
 
 class _Timed:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import load_job
 from cell.lab.bench.accuracy import LIMITS, figures, summed_up
 from cell.lab.bench.expected import mean_distance
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from drivers.errors import InterlockError
 from sim_backends.clock import SteppedClock
@@ -26,8 +26,8 @@ Run = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def cell() -> LockstepCell:
-    made = LockstepCell(CONFIG, seed=4, level="ideal")
+def cell() -> VirtualCell:
+    made = VirtualCell(CONFIG, seed=4, level="ideal")
     made.devices.rail.home().wait(60.0)
     return made
 
