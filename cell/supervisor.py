@@ -14,8 +14,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import cached_property
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -35,9 +35,11 @@ from cell.check.fit import require_fit
 from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
 from cell.devices.assembly import connect, connected_for
 from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
 from cell.devices.injection import Injection, Injector
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.run.folder import CellLock, find_run
@@ -52,7 +54,7 @@ from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
-from statemachine.watch import EndSignals, SignalWatch
+from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
@@ -77,7 +79,12 @@ class Cell:
     """
 
     def __init__(
-        self, config: CellConfig, folder: Path, lock: CellLock, devices: Devices, simulated: SimulatedCell | None
+        self,
+        config: CellConfig,
+        folder: Path,
+        lock: AbstractContextManager[object],
+        devices: Devices,
+        simulated: Simulation | None,
     ) -> None:
         self.config = config
         self.folder = folder
@@ -101,15 +108,20 @@ class Cell:
         sim: str | None = None,
         seed: int = 1,
         level: str = "nominal",
-        speed: float = SIM_SPEED,
+        speed: float | None = None,
         surface: str = "pot",
         confirm: Confirm | None = None,
         only: Collection[str] = tuple(DEVICES),
+        clock: str = "wall",
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
 
         With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
         may be switched off, and what is asked of them is a `NotConnectedError`.
+
+        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall
+        (`SIM_SPEED`). With `clock="virtual"` its models are in this process behind the devices' interfaces, without
+        wires and without waiting: the same seed then takes the same course, to the byte.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -121,20 +133,30 @@ class Cell:
             raise ConfigError(
                 f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices'
             )
+        if clock not in ("wall", "virtual"):
+            raise ConfigError(
+                f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait'
+            )
+        if clock == "virtual" and (sim is None or speed is not None):
+            wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
+            raise ConfigError(f'clock="virtual": {wrong}; leave that out')
         path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
         folder = beside(path)
         with EndSignals(), ExitStack() as opened:
-            if sim == "all":
-                simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface=surface)
-                opened.callback(simulated.close)
-                loaded = with_endpoints(loaded, simulated.endpoints)
+            if clock == "virtual":
+                virtual = VirtualCell(loaded, seed, level, surface)
+                cell = cls(loaded, folder, nullcontext(), virtual.devices, virtual)
             else:
                 simulated = None
-            needed = connected_for(loaded, only)
-            lock = opened.enter_context(CellLock(loaded, needed))
-            devices = connect(loaded, needed)
-            opened.callback(devices.close)
-            cell = cls(loaded, folder, lock, devices, simulated)
+                if sim == "all":
+                    simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
+                    opened.callback(simulated.close)
+                    loaded = with_endpoints(loaded, simulated.endpoints)
+                needed = connected_for(loaded, only)
+                lock = opened.enter_context(CellLock(loaded, needed))
+                devices = connect(loaded, needed)
+                opened.callback(devices.close)
+                cell = cls(loaded, folder, lock, devices, simulated)
             opened.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.
         cell._signals.__enter__()
@@ -146,7 +168,12 @@ class Cell:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except SignalInterrupt:
+            # The first reason to end is the one that is told.
+            if error is None:
+                raise
 
     @cached_property
     def whereabouts(self) -> Whereabouts:
@@ -225,9 +252,10 @@ class Cell:
     def close(self) -> None:
         """End the run that is going on, stop and disconnect everything, let go of the cell.
 
-        Idempotent, callable from any thread, shielded from interrupts.
+        Idempotent, callable from any thread, shielded from interrupts: one that comes meanwhile is raised at the end,
+        as `SignalInterrupt`.
         """
-        with SignalWatch():
+        with SignalWatch() as signals:
             with self._beginning:
                 if self._closed:
                     return
@@ -247,6 +275,8 @@ class Cell:
         self._signals.__exit__(None, None, None)
         for problem in problems:
             log.warning("closing the cell: %s", problem)
+        if signals.number is not None:
+            raise SignalInterrupt(signals.number)
 
     def begin(
         self,
@@ -303,8 +333,14 @@ class Cell:
 
     def _simulation(self) -> dict[str, Any]:
         if self.simulated is None:
-            return {"simulated": False, "seed": None, "level": None}
-        return {"simulated": True, **{key: self.simulated.endpoints[key] for key in ("seed", "level")}}
+            return {"simulated": False, "seed": None, "level": None, "clock": "wall"}
+        return self.simulated.facts
+
+    def _truth(self) -> Callable[[], dict[str, Any]] | None:
+        """How the report asks a simulated world for its truth; None where there is none."""
+        if self.simulated is not None:
+            return self.simulated.truth
+        return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     # --- jobs ---
 
@@ -344,13 +380,15 @@ class Cell:
         """
         loaded, _ = load_job(job)
         injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
-        if injections and self.simulated is None:
-            raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
         info: dict[str, Any] = {}
         inline: tuple[Observer, ...] = ()
         if injections:
+            if self.simulated is None:
+                raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
+            for injection in injections:
+                self.simulated.require_fault(injection.fault)
             info["injected"] = [str(injection) for injection in injections]
-            inline = (Injector(self.config.cell.truth, injections),)
+            inline = (Injector(self.simulated.fault, injections),)
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
@@ -407,7 +445,18 @@ class Cell:
                 earlier, why = before.sweep(loaded, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
             job_run = JobRun(
-                run, self.config, self.devices, loaded, nominal, calibration, info, kind, script, inline, earlier
+                run,
+                self.config,
+                self.devices,
+                loaded,
+                nominal,
+                calibration,
+                info,
+                kind,
+                script,
+                inline,
+                earlier,
+                self._truth(),
             )
             try:
                 return job_run.perform(self.runs_folder, self.whereabouts)

@@ -20,6 +20,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock_map import Latch as Latch
+
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""
 Image = NDArray[np.uint8]
@@ -263,6 +265,13 @@ class Arm(Device, Protocol):
 
     def record(self) -> AbstractContextManager[list[ArmState]]:
         """Every state that arrives while the context is open, in order, in a list that grows."""
+
+    def latch_clock(self) -> Latch:
+        """The arm's clock, as `device_time` of its states tells it, between two host times; takes a tenth of a second.
+
+        That a state was measured when its time says so has to be taken on trust: how long the arm itself held it back
+        before it was stamped cannot be known from outside.
+        """
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sim_backends.faults import (
     ARM_FAULTS,
     CAMERA_FAULTS,
+    CONTROLLER_FAULTS,
     FAULT_NAMES,
     RAIL_FAULTS,
     TARGET_CAMERA_FAULTS,
@@ -91,6 +92,7 @@ class ServedCell:
             self._peers = bound.pop_all()
         self._faults: dict[str, Callable[[], None]] = {
             **{name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS},
+            **{name: partial(self._arm.fault, name) for name in CONTROLLER_FAULTS},
             **{name: partial(self._rail.fault, name) for name in RAIL_FAULTS},
             **{name: partial(self._vehicle.fault, name) for name in VEHICLE_FAULTS},
             **{name: partial(self._cameras["scan"].fault, name) for name in CAMERA_FAULTS},
@@ -143,6 +145,7 @@ class ServedCell:
     def reset(self) -> None:
         """Take away every fault's cause."""
         self.world.arm.clear()
+        self._arm.clear()
         self._rail.clear()
         self._vehicle.clear()
         for camera in self._cameras.values():

@@ -1,8 +1,9 @@
 """Drives a sequence of steps to its end, whatever happens, and ends it safe.
 
-The work is done by the steps that are passed in, each in a thread of its own; the runner watches deadlines, requests
-and signals, repeats what the policy lets it repeat, and writes everything to the journal as it happens. It knows
-neither devices nor the cell: exceptions are judged by `classify`, the cell is brought to rest by `safe_stop`.
+The work is done by the steps that are passed in; the runner watches deadlines, requests and signals meanwhile (see
+`statemachine.waiting` for how), repeats what the policy lets it repeat, and writes everything to the journal as it
+happens. It knows neither devices nor the cell: exceptions are judged by `classify`, the cell is brought to rest by
+`safe_stop`.
 """
 
 from __future__ import annotations
@@ -30,12 +31,11 @@ from statemachine.step import (
     StepRecord,
     Summarised,
 )
+from statemachine.waiting import POLL_S, Waiting, waiting_on
 from statemachine.watch import Call, Clock, SignalWatch
 
 __all__ = ["Event", "FaultRecord", "RunResult", "Runner", "StepContext", "StepRecord"]
 
-POLL_S = 0.02
-"""How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
 REQUEST_POLLS = 10
 """The journal's requests are looked at every so many polls."""
 HEALTH_POLLS = 5
@@ -60,9 +60,9 @@ class Runner:
     """Runs one job. `run()` is called once; what a person or another program asks comes through `control`.
 
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
-    stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
-    a step is cut short, and exactly once more at the end of every run. `recover(error, token, confirmed)` clears a
-    recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
+    stopped. It must be idempotent and leave a cell that can go on, since it is called when a step fails or is cut
+    short, before every repetition, and exactly once more at the end of every run. `recover(error, token, confirmed)`
+    clears a recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
     `health()` is called about ten times a second while a step works, and raises what must end it whatever it does.
     """
 
@@ -78,6 +78,7 @@ class Runner:
     health: Callable[[], None] | None = None
     control: RunControl = field(default_factory=RunControl)
     script: Script = NO_SCRIPT
+    _waiting: Waiting = field(init=False)
     _polls: int = field(default=0, init=False)
     _signals: SignalWatch = field(default_factory=SignalWatch, init=False)
     _records: dict[str, StepRecord] = field(default_factory=dict, init=False)
@@ -91,6 +92,7 @@ class Runner:
         if missing:
             raise ValueError(f"no work was given for {', '.join(missing)}")
         self._records = {name: StepRecord(name) for name in self.sequence.steps}
+        self._waiting = waiting_on(self.clock)
 
     def run(self, done: Mapping[str, object] | None = None) -> RunResult:
         """Do the steps that are not in `done` (results of an earlier run by step name) and return how it ended.
@@ -161,9 +163,8 @@ class Runner:
 
     def _scripted(self, name: str, work: Callable[[], object]) -> tuple[Failure | None, object]:
         """Let the script work between two steps: why that ended the run, or None, and what it gave."""
-        what = f"the script after {name}"
-        call = Call(what, work)
-        end = self._watch(call, math.inf, what, CancelToken(self.control.token), ailing=True)
+        token = CancelToken(self.control.token)
+        call, end = self._watch(f"the script after {name}", work, math.inf, token, ailing=True)
         if end is None and call.error is not None:
             self._error = call.error
             end = self._ask() or self._judge(call.error)
@@ -210,8 +211,8 @@ class Runner:
                 return refused, None
         self.sequence.fire(Trigger.RECOVER)
         token = CancelToken(self.control.token)
-        call = Call("recovery", lambda: recover(error, token, by is not None))
-        failed = self._watch(call, self.clock.now() + self.policy.recovery_deadline_s, "the recovery", token)
+        deadline = self.clock.now() + self.policy.recovery_deadline_s
+        call, failed = self._watch("the recovery", lambda: recover(error, token, by is not None), deadline, token)
         if failed is None and call.error is not None:
             self._error = call.error
             failed = self._ask()
@@ -249,16 +250,21 @@ class Runner:
         """One try: None, or the end that it leads to unless it is repeated."""
         started, begun = self.clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
-        context = StepContext(step, attempt, deadline, dict(self._results), self.clock, self._tell, self.control)
+        context = StepContext(
+            step, attempt, deadline, dict(self._results), self.clock, self._tell, self.control, self._waiting.look
+        )
         key = self.journal.step_started(step.name, attempt)
         self._tell(Event("step_started", step.name, {"attempt": attempt}))
         self._error = None
-        call = Call(step.name, lambda: self.steps[step.name](context))
-        end = self._watch(call, deadline, step.name, context.token, ailing=True)
+        call, end = self._watch(step.name, lambda: self.steps[step.name](context), deadline, context.token, ailing=True)
+        context.token.cancel(f"{step.name} has ended")
         if end is None and call.error is not None:
             self._error = call.error
+            # At rest before anything is read or written: a disk may stall.
+            stopped = f"{step.name} failed"
+            trouble = self._halt(stopped)
             end = self._ask() or self._judge(call.error)
-        context.token.cancel(f"{step.name} has ended")
+            self._tell(Event("safe_stop", None, {"reason": stopped, "trouble": trouble}))
         duration = self.clock.now() - started
         before = self._records[step.name]
         wall = before.wall_s + time.monotonic() - begun
@@ -277,34 +283,47 @@ class Runner:
     # --- watching ---
 
     def _watch(
-        self, call: Call, deadline: float, what: str, token: CancelToken, ailing: bool = False
-    ) -> Failure | None:
-        """Wait for the end of `call`; on a request, a signal or the deadline end it, stop the cell and say why.
+        self, what: str, work: Callable[[], object], deadline: float, token: CancelToken, ailing: bool = False
+    ) -> tuple[Call, Failure | None]:
+        """Have `work` done; on a request, a signal or the deadline end it, stop the cell and say why.
 
         With `ailing` the cell's health is looked at as well. Time for which the run is held does not count.
         """
         cause: Failure | None = None
+        trouble: str | None = None
         held = self.control.held_s
-        while cause is None:
-            if self.clock.wait(call.done, POLL_S * self.clock.rate):
+
+        def cut() -> str | None:
+            nonlocal cause, trouble
+            cause = self._cause(what, deadline, held, ailing)
+            if cause is None:
                 return None
-            try:
-                cause = self._ask()
-            except JournalError as error:
-                self._error = error
-                cause = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
-            if cause is None and ailing:
-                cause = self._ail()
-            if cause is None and self.clock.now() > deadline + (self.control.held_s - held) * self.clock.rate:
-                self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
-                cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
-        token.cancel(cause.reason)
-        trouble = self._halt(cause.reason)
-        if not self.clock.wait(call.done, self.policy.grace_s * self.clock.rate):
+            token.cancel(cause.reason)
+            trouble = self._halt(cause.reason)
+            return cause.reason
+
+        call = self._waiting.do(what, work, cut, self.policy.grace_s)
+        if cause is None:
+            return call, None
+        if not call.done.is_set():
             self._abandoned = True
             text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
             cause = replace(cause, reason=text)
         self._tell(Event("safe_stop", None, {"reason": cause.reason, "trouble": trouble}))
+        return call, cause
+
+    def _cause(self, what: str, deadline: float, held: float, ailing: bool) -> Failure | None:
+        """What is to end the work `what` now, if anything."""
+        try:
+            cause = self._ask()
+        except JournalError as error:
+            self._error = error
+            return Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
+        if cause is None and ailing:
+            cause = self._ail()
+        if cause is None and self.clock.now() > deadline + (self.control.held_s - held) * self.clock.rate:
+            self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
+            cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
         return cause
 
     def _ask(self) -> Failure | None:
@@ -345,8 +364,11 @@ class Runner:
         return end
 
     def _pause_briefly(self) -> Failure | None:
-        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any."""
-        self.clock.wait(self.control.token.event, POLL_S * self.clock.rate)
+        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any.
+
+        On the wall's time: it is for a person, and the cell stands.
+        """
+        self.control.token.event.wait(POLL_S)
         return self._ask()
 
     def _judge(self, error: BaseException) -> Failure:
@@ -363,10 +385,14 @@ class Runner:
     # --- the end ---
 
     def _halt(self, reason: str) -> str | None:
-        """Call `safe_stop` in a thread that no signal reaches; what went wrong with it, or None."""
-        call = Call("safe stop", lambda: self.safe_stop(reason))
-        if not self.clock.wait(call.done, self.policy.stop_deadline_s * self.clock.rate):
-            return f"it did not end within {self.policy.stop_deadline_s:g} s"
+        """Call `safe_stop` where no signal reaches it; what went wrong with it, or None."""
+        until = self.clock.now() + self.policy.stop_deadline_s * self.clock.rate
+        late = f"it did not end within {self.policy.stop_deadline_s:g} s"
+        call = self._waiting.do(
+            "safe stop", lambda: self.safe_stop(reason), lambda: late if self.clock.now() > until else None, 0.0
+        )
+        if not call.done.is_set():
+            return late
         return None if call.error is None else f"{type(call.error).__name__}: {call.error}"
 
     def _stop(self, reason: str, end: Failure) -> Failure | None:

@@ -48,7 +48,8 @@ class StepContext:
     """What a step is given: earlier results, its deadline, its end, and ways to report.
 
     `results` maps the earlier steps' names to what they returned. `deadline` is in seconds of the cell's clock.
-    `token` ends this attempt: with the run, or by itself when the attempt is cut short.
+    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `look` is how work that is held
+    sees what is asked of the run, where nobody else looks for it.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class StepContext:
         clock: Clock,
         tell: Observer,
         control: RunControl | None = None,
+        look: Callable[[], None] = lambda: None,
     ) -> None:
         self.step = step
         self.attempt = attempt
@@ -68,6 +70,7 @@ class StepContext:
         self._clock = clock
         self._tell = tell
         self._control = control or RunControl()
+        self._look = look
         self.token = CancelToken(self._control.token)
 
     def made(self, kind: type[Made]) -> Made:
@@ -92,7 +95,7 @@ class StepContext:
             kind = "paused" if held else "going_on"
             self._tell(Event(kind, self.step.name, {"text": "held before its next motion" if held else "goes on"}))
 
-        self._control.safe_point(self.token, say)
+        self._control.safe_point(self.token, say, self._look)
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""

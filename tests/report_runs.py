@@ -11,11 +11,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cell.config import CellConfig, load_config
 from cell.devices.direct import VirtualCell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.lab.bench.whole_job import JobRecord
@@ -29,7 +31,6 @@ from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import CellError
-from sim_backends.peers.truth import TruthPeer
 from statemachine.policy import Failure, Outcome
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
 
@@ -120,15 +121,9 @@ def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (
     if not simulated:
         return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
     at_end = record.at_end
-    peer = TruthPeer(lambda: at_end, lambda name: None, lambda: None)
-    peer.start()
-    try:
-        config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": peer.address})})
-        witness = Witness(peer.address)
-        witness.at_sweep = record.at_sweep
-        return reported(folder, config, job, nominal, work, result, frames, witness)
-    finally:
-        peer.stop()
+    witness = Witness(lambda: at_end)
+    witness.at_sweep = record.at_sweep
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
 
 
 def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tuple[FaultRecord, ...] = ()) -> Ended:
@@ -172,9 +167,11 @@ def reported(
         "part": work.part.state.value,
         "cell": config.cell.name,
         "job": job.job.name,
+        "job_kind": job.job.kind,
         "simulated": simulated,
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
+        "clock": "wall",
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),
@@ -271,5 +268,5 @@ def crippled(record: JobRecord, root: Path) -> Ended:
         (folder / "frames").rmdir()
         frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
-    config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": "127.0.0.1:1"})})
-    return reported(folder, config, job, nominal, work, result, frames, Witness("127.0.0.1:1"))
+    witness = Witness(partial(ask_truth, "127.0.0.1:1"))
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)

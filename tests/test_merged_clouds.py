@@ -22,6 +22,7 @@ from cell.reconstruction import (
     merge,
 )
 from cell.vision.stripe.extract import StripeProfile
+from drivers.clock_map import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
 
@@ -213,10 +214,15 @@ def states(delays: Array, period: float = 0.008) -> list[ArmState]:
     return made
 
 
-def test_late_packets_do_not_move_the_flange() -> None:
-    delays = 0.0005 + np.random.default_rng(0).exponential(0.004, 200)
-    track = FlangeTrack("arm", states(delays))
-    times = 1000.0 + delays.min() + np.linspace(0.1, 1.5, 40)
+CLOCKS = ClockMap()
+CLOCKS.add([Latch(999.9999, 77.0, 1000.0001)])
+
+
+@pytest.mark.parametrize("late", [0.0005, 0.2])
+def test_late_packets_do_not_move_the_flange_not_even_if_all_are(late: float) -> None:
+    delays = late + np.random.default_rng(0).exponential(0.004, 200)
+    track = FlangeTrack("arm", states(delays), CLOCKS)
+    times = 1000.0 + np.linspace(0.1, 1.5, 40)
     poses = track.at(times)
     assert np.abs(poses[:, 0, 3] - (0.5 + 0.02 * np.linspace(0.1, 1.5, 40))).max() < 1e-9
     angle = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
@@ -230,15 +236,15 @@ def test_a_pause_that_no_state_tells_of_leaves_the_way_there_unknown() -> None:
     evenly = whole[:100] + whole[108:]
     paused = whole[:100] + [replace(late, flange=whole[k - 4].flange) for k, late in enumerate(whole[108:], start=108)]
     times = np.array([1000.4, 1000.82, 1001.2])
-    assert FlangeTrack("arm", evenly).even(times).tolist() == [True, True, True]
-    assert FlangeTrack("arm", paused).even(times).tolist() == [True, False, True]
+    assert FlangeTrack("arm", evenly, CLOCKS).even(times).tolist() == [True, True, True]
+    assert FlangeTrack("arm", paused, CLOCKS).even(times).tolist() == [True, False, True]
 
 
 def test_a_gap_in_the_states_is_a_fault_and_not_bridged() -> None:
     given = states(np.zeros(100))
     del given[40:80]
     with pytest.raises(DeviceFault, match=r"no state of the arm came for 0\.3\d* s"):
-        FlangeTrack("arm", given).at(np.array([1000.5]))
+        FlangeTrack("arm", given, CLOCKS).at(np.array([1000.5]))
     with pytest.raises(DeviceFault, match="only 3 states"):
-        FlangeTrack("arm", given[:3])
+        FlangeTrack("arm", given[:3], CLOCKS)
     assert from_ur(given[0].flange).translation[0] == pytest.approx(0.5)

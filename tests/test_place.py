@@ -124,10 +124,12 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     assert np.linalg.norm(where.translation - true.translation) < 1e-3
 
 
-def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not_crushed() -> None:
+@pytest.mark.parametrize("early", [0.002, 0.004])
+def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not_crushed(early: float) -> None:
+    """Also one that is met just before the slow part of the descent, where the fast one does not feel it yet."""
     site = Site()
     with pytest.raises(RefusedError, match=r"touched something more than 1\.00 mm above"):
-        site.place(too_low=0.004)
+        site.place(too_low=early)
     assert site.held
     assert site.part.state is PartState.HELD
     assert site.height_above() > 0.5 * JOB.place.approach

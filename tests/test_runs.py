@@ -13,6 +13,7 @@ import pytest
 from cell.config import CellConfig, load_config
 from cell.run.folder import (
     CellLock,
+    Question,
     awaited_word,
     find_going,
     find_run,
@@ -139,9 +140,10 @@ def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
     folder = new_run(tmp_path / "runs")
     journal = Journal(folder, folder.name)
     assert awaited_word(folder) is None
-    journal.event("confirm_needed", "laser_sweep", {"reason": "the arm is in protective stop", "code": "x"})
-    assert awaited_word(folder) == "the arm is in protective stop"
-    journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "the arm is in protective stop"})
+    journal.event("confirm_needed", "laser_sweep", {"reason": "the arm has stopped", "code": "x", "number": 2})
+    assert awaited_word(folder) == Question(2, "the arm has stopped")
+    assert read_report(folder)["reason"] == "waits for a person, question 2: the arm has stopped"
+    journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "the arm has stopped"})
     assert awaited_word(folder) is None
 
 

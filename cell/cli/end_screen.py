@@ -10,6 +10,7 @@ from typing import Any
 
 from cell.job import job_path, shipped_jobs
 from cell.report.figures import shown_limit, shown_value
+from cell.run.folder import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -82,8 +83,9 @@ def _facts(report: Mapping[str, Any]) -> str:
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
     if report.get("simulated"):
         facts.append(f"simulated, seed {report.get('seed')}, level {report.get('level')}")
-    if report.get("wall_s") is not None:
-        facts.append(f"{duration(report['wall_s'])} on the wall")
+    if (wall := wall_seconds(report)) is not None:
+        simulated = f"{duration(report['cell_s'])} of the cell's in " if report.get("cell_s") is not None else ""
+        facts.append(f"{simulated}{duration(wall)} on the wall")
     if report.get("started"):
         facts.append(str(report["started"])[:16].replace("T", " "))
     return " · ".join(facts)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
@@ -13,6 +11,7 @@ from cell.devices.interlocks import Interlocks
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
 from drivers.interfaces import Arm, Camera, Claw, Device, Rail, Vehicle
+from statemachine.waiting import waiting_on
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
@@ -103,7 +102,7 @@ class Devices:
         return (device for device in everything if device is not None)
 
     def stop(self) -> list[str]:
-        """Laser off, vehicle stopped and braked, rail and arm stopped; all at once, none waits for another.
+        """Laser off, vehicle stopped and braked, rail and arm stopped; none waits for another to confirm it.
 
         Whoever works with the devices now cannot begin anything new with them. Returns what could not be confirmed, a
         line each; an empty list means that everything answered.
@@ -118,7 +117,7 @@ class Devices:
             actions["rail stopped"] = self._rail.stop
         if self._arm is not None:
             actions["arm stopped"] = self._arm.stop
-        return _all_at_once(actions)
+        return waiting_on(self.clock).each(actions, SAFE_STOP_TIMEOUT_S)
 
     def close(self) -> list[str]:
         """Close every device, the arm last because laser and claw hang on its outputs."""
@@ -138,27 +137,3 @@ def _there(name: str, device: Kind | None) -> Kind:
     if device is None:
         raise NotConnectedError(name, "this command works without it and did not connect it. Open the whole cell")
     return device
-
-
-def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
-    problems: list[str] = []
-
-    def run(what: str, action: Callable[[], None]) -> None:
-        # Whatever ends the thread: what it was to confirm is not confirmed.
-        try:
-            action()
-        except BaseException as error:
-            problems.append(f"{what}: not confirmed, {error}")
-
-    threads = {
-        what: threading.Thread(target=run, args=(what, action), name=f"safe stop: {what}", daemon=True)
-        for what, action in actions.items()
-    }
-    for thread in threads.values():
-        thread.start()
-    deadline = time.monotonic() + SAFE_STOP_TIMEOUT_S
-    for what, thread in threads.items():
-        thread.join(max(0.0, deadline - time.monotonic()))
-        if thread.is_alive():
-            problems.append(f"{what}: not confirmed within {SAFE_STOP_TIMEOUT_S:.0f} s")
-    return problems

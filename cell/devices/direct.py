@@ -13,7 +13,7 @@ from cell.devices.built_in import TmclRailConfig
 from cell.devices.devices import Devices
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
-from drivers.camera.clock_map import ClockMap, Latch
+from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error

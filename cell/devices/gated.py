@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 
 from cell.devices.gate import Gate, Gated
 from cell.devices.interlocks import Command
+from drivers.clock_map import Latch
 from drivers.interfaces import (
     Arm,
     ArmMotion,
@@ -35,6 +36,10 @@ class GatedArm(Gated[Arm]):
     def record(self) -> AbstractContextManager[list[ArmState]]:
         """See `Arm.record`."""
         return self.bare.record()
+
+    def latch_clock(self) -> Latch:
+        """See `Arm.latch_clock`."""
+        return self.bare.latch_clock()
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_joints`."""

@@ -139,11 +139,16 @@ def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, 
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
     vehicle.enable()
     odometry = RelativeOdometry(vehicle)
+
+    def look() -> None:
+        check()
+        cell.whereabouts.count()
+
     try:
         if wish.axis == "yaw":
-            turn_to(vehicle, odometry, wish.amount, clock, check)
+            turn_to(vehicle, odometry, wish.amount, clock, look)
         else:
-            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, check)
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, look)
     finally:
         vehicle.brake()
     pose = odometry.pose()

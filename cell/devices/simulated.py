@@ -13,12 +13,33 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any
+from typing import Any, Protocol
 
 from cell.config import DEVICES, CellConfig, default_toml
+from cell.devices.truth_link import ask_truth, cause_fault
 from drivers.errors import ConfigError, DeviceFault
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
+
+
+class Simulation(Protocol):
+    """A simulated cell, through whichever door its devices are reached."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """For journal and report: `simulated`, `seed`, `level` and `clock`, "wall" or "virtual"."""
+
+    def truth(self) -> dict[str, Any]:
+        """Everything true about the world now."""
+
+    def require_fault(self, name: str) -> None:
+        """`ConfigError` for a fault that it cannot have."""
+
+    def fault(self, name: str) -> None:
+        """Cause a fault by its name, one of `sim_backends.faults.FAULT_NAMES`."""
+
+    def close(self) -> None:
+        """End its world."""
 
 
 class SimulatedCell:
@@ -41,6 +62,22 @@ class SimulatedCell:
         except BaseException:
             self.close()
             raise
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Which world it is, for journal and report."""
+        return {"simulated": True, **{key: self.endpoints[key] for key in ("seed", "level")}, "clock": "wall"}
+
+    def truth(self) -> dict[str, Any]:
+        """Everything true about the world now; `CellError` when it does not answer."""
+        return ask_truth(self.endpoints["truth"]["address"])
+
+    def require_fault(self, name: str) -> None:
+        """Over its wires it can have every fault."""
+
+    def fault(self, name: str) -> None:
+        """Cause a fault by its name; `CellError` when that was not taken."""
+        cause_fault(self.endpoints["truth"]["address"], name)
 
     @property
     def pid(self) -> int:

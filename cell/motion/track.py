@@ -1,7 +1,7 @@
 """Where the flange was at a given time: between the states that the arm reported while it moved.
 
-A packet's arrival tells its time only roughly, always late; the arm's own clock runs evenly. The earliest arrivals tie
-one to the other, and then every state has its time.
+A packet's arrival tells its time only roughly, always late, and all of them may be late alike. The arm's own clock
+runs evenly; round trips tie it to the host's, and then every state has its time.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.poses import from_ur
+from drivers.clock_map import ClockMap
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmState, Vector
 
@@ -26,15 +27,17 @@ MOST_BEND_M = 2e-5
 class FlangeTrack:
     """The poses base_from_flange of a motion by host time in s."""
 
-    def __init__(self, name: str, states: Sequence[ArmState], longest_gap: float = LONGEST_GAP_S) -> None:
-        """`name` is the arm's, for errors: `DeviceFault` when there are too few states. `longest_gap` is in s."""
+    def __init__(
+        self, name: str, states: Sequence[ArmState], clocks: ClockMap, longest_gap: float = LONGEST_GAP_S
+    ) -> None:
+        """`name` is the arm's, for errors: `DeviceFault` when there are too few states. `clocks` maps its clock to the
+        host's; `longest_gap` is in s."""
         device = np.array([state.device_time for state in states])
-        stamps = np.array([state.stamp for state in states])
         kept = np.flatnonzero(np.diff(device, prepend=-np.inf) > 0)
         self._name, self._longest_gap = name, longest_gap
         if len(kept) < LEAST_STATES:
             raise self._fault(f"only {len(kept)} states of the arm came during the motion, at least {LEAST_STATES}")
-        self.times: Vector = device[kept] + float(np.min((stamps - device)[kept]))
+        self.times: Vector = np.array([clocks.host_time(time) for time in device[kept]])
         poses = [from_ur(states[int(k)].flange) for k in kept]
         self.translations: Vector = np.array([pose.translation for pose in poses])
         self._rotations = [pose.rotation for pose in poses]

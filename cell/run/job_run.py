@@ -38,6 +38,7 @@ from drivers.errors import (
     RefusedError,
 )
 from statemachine.cancel import CancelToken
+from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome
 from statemachine.runner import Event, Runner
@@ -55,19 +56,26 @@ log = logging.getLogger(__name__)
 class RunOutcome:
     """How a run ended: `outcome` is placed (done, for a kind of job that places nothing), refused, faulted or aborted;
     `report` is what report.json holds, `results` what each step made, by its name.
+
+    One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same.
     """
 
     outcome: str
     reason: str
     folder: Path
     report: Mapping[str, Any]
-    interrupted: bool = False
     results: Mapping[str, object] = field(default_factory=dict, repr=False)
+    control: RunControl = field(default_factory=RunControl, repr=False, compare=False)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has asked the program to end since the run began."""
+        return self.control.signal is not None
 
     @property
     def exit_code(self) -> int:
-        """0 placed or done, 130 interrupted, 1 otherwise."""
-        return 0 if self.outcome in ("placed", "done") else 130 if self.interrupted else 1
+        """130 interrupted, else 0 placed or done, 1 otherwise."""
+        return 130 if self.interrupted else 0 if self.outcome in ("placed", "done") else 1
 
     def __str__(self) -> str:
         return f"{self.outcome}: {self.reason}"
@@ -86,6 +94,7 @@ class JobRun:
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
+    `truth` asks a simulated world.
     """
 
     run: Run[Any]
@@ -99,6 +108,7 @@ class JobRun:
     script: Script = NO_SCRIPT
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
+    truth: Callable[[], dict[str, Any]] | None = None
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -117,7 +127,8 @@ class JobRun:
 
     def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
         started = time.time()
-        witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
+        begun = self.devices.clock.now()
+        witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames") as frames:
             here = Workplace(
@@ -151,12 +162,12 @@ class JobRun:
             self.devices.gate.clear()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
-        facts = {**self._facts(), "part": here.part.state.value}
+        cell_s = round(self.devices.clock.now() - begun, 3)
+        facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
         report = make_report(
             folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
-        interrupted = self.run.control.signal is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted, result.results)
+        return RunOutcome(report["outcome"], report["reason"], folder, report, result.results, self.run.control)
 
     def _facts(self) -> dict[str, Any]:
         return {

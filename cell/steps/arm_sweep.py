@@ -1,7 +1,8 @@
 """A sweep by the arm alone: the rail stands still, the flange runs along a straight line under the lit laser.
 
-Every line has a flange pose of its own, between the states that the arm reported. What the two clocks differ by shifts
-the whole sweep along its way; the shift is stated in the covariance.
+Every line has a flange pose of its own, between the states that the arm reported. What is not known of the two clocks
+shifts the whole sweep along its way: it is bounded by round trips before and after the sweep, and stated in the
+covariance. How long the arm held a state back before it put its time on it cannot be known.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
 from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from drivers.clock_map import ClockMap
 from drivers.errors import CellError, DeviceFault
 
 RUN_UP_S = 0.7
 """Seconds at full speed by which the line is longer at both ends: the arm gains its speed and its wobble dies out."""
 LATENCY_S = 0.002
-"""What the arm's time stamps may lag behind those of the frames, 1 sigma, wall seconds: a packet's way and a poll."""
+"""What the time of a state may be off, 1 sigma, wall seconds, beside what round trips leave open: a controller's cycle,
+since nothing tells where in it the joints were read."""
 JITTER_S = 0.0003
 """The same from one line to the next."""
 
@@ -30,8 +33,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     """Move the scan head over the placement area and pair every profile with the flange's pose.
 
     Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, the arm's
-    states have gaps or it moved unevenly between them, or the camera's times are not known well enough; whatever
-    happens, the arm is stopped before the error goes on.
+    states have gaps or it moved unevenly between them, or the times of arm or camera are not known well enough;
+    whatever happens, the arm is stopped before the error goes on.
     """
     scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
     shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
@@ -44,6 +47,10 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     mover.follow(way)
     rail = devices.rail.state().position
     camera.configure(scan.exposure, scan.frame_rate)
+    clocks = ClockMap()
+    clocks.add([arm.latch_clock()])
+    # Before anything is lit and moved in vain.
+    shift_by_times([TimeBound(arm.name, "arm", clocks.uncertainty)], scan.speed, errors)
     laser, purpose = devices.laser, devices.interlocks.purpose("sweep")
     with purpose, laser.lit(), arm.record() as states, camera.stream() as frames:
         motion, patience = mover.begin(line)
@@ -63,7 +70,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
             with suppress(CellError):
                 arm.stop()
             raise
-    track = FlangeTrack(arm.name, states, LONGEST_GAP_S * max(1.0, errors.rate))
+    clocks.add([arm.latch_clock()])
+    track = FlangeTrack(arm.name, states, clocks, LONGEST_GAP_S * max(1.0, errors.rate))
     times = np.array(collector.times)
     seen = np.flatnonzero(track.inside(times))
     flanges = track.at(times[seen])
@@ -93,7 +101,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         )
     steady = np.polynomial.Polynomial.fit(times[lines], done, 1)
     residual = float(np.std(done - steady(times[lines])))
-    shift, variance = shift_by_times([TimeBound.of(camera)], scan.speed, errors)
+    known = TimeBound(arm.name, "arm", max(clocks.bound_at(float(times[k])) for k in (lines[0], lines[-1])))
+    shift, variance = shift_by_times([known, TimeBound.of(camera)], scan.speed, errors)
     shared = np.zeros((6, 6))
     shared[:3, :3] = np.outer(along, along) * ((scan.speed * LATENCY_S * errors.rate) ** 2 + variance)
     own = scan.speed * JITTER_S * errors.rate * along

@@ -36,7 +36,7 @@ class SweepErrors:
 
 @dataclass(frozen=True)
 class TimeBound:
-    """The times that the device `name`, a rail or a camera by its `kind`, tells may be off by `bound` s at most."""
+    """The times that the device `name`, a rail, arm or camera by its `kind`, tells may be off by `bound` s at most."""
 
     name: str
     kind: str
@@ -52,7 +52,7 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
     """How far (m) a sweep at `speed` m/s may lie off along its way because of its times, and the variance (m²) of it.
 
     Each time is anywhere within its bound, for all lines alike: uniform, so a third of the square. Raises `DeviceFault`
-    (rail.late_readings, camera.late_readings) of the worst device when it may be more than `errors.shift`.
+    (late_readings of the rail, the arm or the camera) of the worst device when it may be more than `errors.shift`.
     """
     shift = speed * sum(one.bound for one in known)
     if shift > errors.shift:

@@ -17,12 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from drivers.arm.clock_latch import latch_clock
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.session import ArmSession
 from drivers.arm.wrong_arm import Forward
 from drivers.clock import Clock
+from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
 from drivers.interfaces import ArmSafety, ArmState, Identity, Vector
 from drivers.quantities import check_positive, shown
@@ -123,6 +125,12 @@ class UrArm:
         states: list[ArmState] = []
         with self._feed.listening(lambda snapshot: states.append(self._state(snapshot))):
             yield states
+
+    def latch_clock(self) -> Latch:
+        """The arm's clock between two host times; see `drivers.interfaces.Arm`."""
+        self._session.require_control()
+        self._session.require_link()
+        return latch_clock(self.name, self._session.setup.address, self._clock)
 
     def _state(self, snapshot: Snapshot) -> ArmState:
         return ArmState(

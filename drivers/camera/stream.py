@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.camera.clock_map import ClockMap, Latch
 from drivers.camera.frame_link import FrameLink
 from drivers.camera.frame_protocol import Header
 from drivers.camera.frame_queue import FrameQueue
 from drivers.clock import Clock
+from drivers.clock_map import ClockMap, Latch
 from drivers.endings import in_the_end
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics

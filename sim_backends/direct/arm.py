@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from drivers.errors import Aborted, DeviceFault, InterlockError
-from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, Vector
+from drivers.interfaces import ArmSafety, ArmState, Identity, Latch, LinkStatistics, Vector
 from sim_backends.direct.arm_motion import AT_REST, STILL_TICK_S, TICK_S, ArmMove, Streamed
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import ArmSetup, within
@@ -22,6 +22,8 @@ from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
 
 _BRAKING = 4.0
 _FIRST_POINT = 0.02
+_LATCH_S = 0.0005
+"""A round trip."""
 _FORCE_SAMPLES, _FORCE_SAMPLE_S = 10, 0.006
 _OUTPUTS = 18
 _MOST_FORCE = 500.0
@@ -45,6 +47,8 @@ class DirectArm:
         """Joint angles (6,), rad, at the end of each motion so far."""
         self._setup = setup
         self._motion: ArmMove | None = None
+        self.late = 0.0
+        """By how many seconds each state comes later than the controller measured it."""
         self._recorded: list[ArmState] | None = None
         self._stops = 0
 
@@ -61,7 +65,7 @@ class DirectArm:
         model = self.model
         speeds = model.drive.qd.copy()
         return ArmState(
-            stamp=self.clock.now(),
+            stamp=self.clock.now() + self.late,
             joints=model.drive.q.copy(),
             joint_speeds=speeds,
             flange=pose_from_matrix(model.reported_flange()),
@@ -81,6 +85,12 @@ class DirectArm:
             yield self._recorded
         finally:
             self._recorded = None
+
+    def latch_clock(self) -> Latch:
+        """The world's clock, told as late as the states are."""
+        asked = self.clock.now()
+        self.clock.sleep(_LATCH_S + self.late)
+        return Latch(asked, asked + 0.5 * _LATCH_S, self.clock.now())
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""

@@ -30,6 +30,9 @@ from sim_backends.peers.script_port import robot_mode, version_message
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
+FAULTS = ("arm.late_states",)
+LATE_S = 0.1
+"""Seconds on the wall by which `arm.late_states` delays every state."""
 _CATCH_UP = 100
 """Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT = 30004, 29999, 30003, 30002
@@ -62,6 +65,7 @@ class RtdePeer:
         self._lines: dict[Client, bytes] = {}
         self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT), host)
         self._tick_count = 0
+        self._late = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm controller", daemon=True)
         self.lateness: list[float] = []
@@ -82,6 +86,19 @@ class RtdePeer:
         if self._thread.is_alive():
             self._thread.join(5.0)
         self._ports.close()
+
+    def fault(self, name: str) -> None:
+        """Cause a fault of `FAULTS`; ValueError for another name.
+
+        `arm.late_states`: from now on every state comes `LATE_S` after it was measured and stamped, on all connections.
+        """
+        if name not in FAULTS:
+            raise ValueError(f"unknown arm fault {name!r}; known: {', '.join(FAULTS)}")
+        self._late = round(LATE_S / PERIOD)
+
+    def clear(self) -> None:
+        """Take away the fault."""
+        self._late = 0
 
     def claim(self, name: str, session: Session) -> bool:
         """Give an input variable to a connection; False when another one holds it."""
@@ -129,7 +146,7 @@ class RtdePeer:
         self._view.runtime_state = self._program.runtime_state
         for session in list(self._sessions.values()):
             if session.started:
-                session.send_state(self._view, self._tick_count)
+                session.send_state(self._view, self._tick_count, self._late)
         if self._tick_count % _REPORT_EVERY == 0:
             for client in self._listeners:
                 client.send(robot_mode(self._model, self._program.runtime_state))

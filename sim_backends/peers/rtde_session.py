@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -38,6 +39,7 @@ class Session:
         self._calls = 0
         self._inputs: dict[int, InputRecipe] = {}
         self._outputs: list[OutputRecipe] = []
+        self._held: deque[tuple[int, bytes]] = deque()
         self.started = False
 
     def feed(self, data: bytes) -> None:
@@ -65,11 +67,13 @@ class Session:
             if left == 0 and len(self._buffer) < _FLOOD:
                 return
 
-    def send_state(self, view: View, tick: int) -> None:
-        """Send a data packet for every output recipe that is due at this tick."""
+    def send_state(self, view: View, tick: int, late: int = 0) -> None:
+        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one."""
         for recipe in self._outputs:
             if tick % recipe.every == 0:
-                self._client.send(recipe.packet(view))
+                self._held.append((tick, recipe.packet(view)))
+        while self._held and self._held[0][0] + late <= tick:
+            self._client.send(self._held.popleft()[1])
 
     def _reply(self, kind: str, payload: bytes) -> None:
         self._client.send(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)

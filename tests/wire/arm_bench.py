@@ -1,8 +1,8 @@
 """A simulated arm in a process of its own for the tests of the arm driver, above a stiff table if asked.
 
-Commands come on standard input, one a line, and are answered by one JSON line each: the name of a fault, `clear` (its
-cause is gone), `reset` (as after switching on), `input INDEX 0|1`, `output INDEX 0|1`, or `show` for what the arm
-itself knows.
+Commands come on standard input, one a line, and are answered by one JSON line each: the name of a fault or
+`late_states`, `clear` (its cause is gone), `reset` (as after switching on), `input INDEX 0|1`, `output INDEX 0|1`, or
+`show` for what the arm itself knows.
 """
 
 from __future__ import annotations
@@ -90,12 +90,15 @@ def _main(speed: float, table: float | None, name: str) -> None:
                 model.write_digital_outputs(1 << int(index), int(value) << int(index))
             case ["clear"]:
                 model.clear()
+                peer.clear()
             case ["show"]:
                 answer = {
                     "outputs": model.digital_outputs, "moving": model.moving, "q": model.drive.q.tolist(),
                     "time": model.time, "fault": model.fault_text, "payload": model.payload[0],
                     "tcp": model.drive.flange_from_tcp.tolist(),
                 }  # fmt: skip
+            case ["late_states"]:
+                peer.fault("arm.late_states")
             case [fault]:
                 model.fault(fault)
         print(json.dumps(answer), flush=True)

@@ -6,10 +6,12 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -510,3 +512,56 @@ def test_a_world_ten_times_as_fast_is_driven_with_a_clock_ten_times_as_fast():
         assert time.monotonic() - begun < 1.5, "three seconds of the cell take a third of one on the wall"
         assert np.abs(arm.state().joints - joints[-1]).max() < 2e-3
         arm.close()
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
+    with ArmBench(speed=rate) as bench:
+        clock = Clock(rate)
+        arm = UrArm("arm", bench.address, clock=clock)
+        try:
+            prompt = arm.latch_clock()
+            assert prompt.bound < 0.0015 * rate
+            bench.ask("late_states")
+            assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
+            late = arm.latch_clock()
+            # The states show nothing of it, but half of their lateness of 0.1 s is what is not known now.
+            assert late.bound == pytest.approx(0.05 * rate, rel=0.2)
+            error = (late.host - late.device) - (prompt.host - prompt.device)
+            assert 0.04 * rate < error < late.bound + prompt.bound + 0.004 * rate
+            bench.ask("clear")
+            assert soon(lambda: lateness(arm, prompt) < 0.03 * rate)
+            assert arm.latch_clock().bound < 0.0015 * rate
+        finally:
+            arm.close()
+
+
+def lateness(arm, latch):
+    """By how many seconds the newest state came later than the arm's own clock says."""
+    state = arm.state()
+    return (state.stamp - state.device_time) - (latch.host - latch.device)
+
+
+def test_a_latch_needs_its_register_and_an_arm(arm, bench):
+    with held_register(bench.address), pytest.raises(DeviceFault, match="end the program that holds it") as caught:
+        arm.latch_clock()
+    assert caught.value.code == "arm.refused"
+    with ArmBench() as other:
+        away = UrArm("arm", other.address, clock=Clock())
+        other.kill()
+        with pytest.raises((NotConnectedError, DeviceFault)):
+            away.latch_clock()
+        away.close()
+
+
+@contextmanager
+def held_register(address):
+    """Another client that has taken the register for itself."""
+    name = b"input_int_register_47"
+    with socket.create_connection((address, 30004), timeout=5.0) as link:
+        link.sendall(struct.pack(">HBH", 5, ord("V"), 2) + struct.pack(">HB", 3 + len(name), ord("I")) + name)
+        # The reply to V, and the head of that to I.
+        got = b""
+        while len(got) < 4 + 4:
+            got += link.recv(64)
+        yield

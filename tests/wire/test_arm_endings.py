@@ -284,6 +284,31 @@ def test_a_protective_stop_is_unlocked_only_when_a_person_has_confirmed(arm, ben
     assert arm.state().safety is ArmSafety.NORMAL
 
 
+def test_a_recovery_ends_the_old_program_before_it_unlocks_even_if_its_process_hangs(arm, bench):
+    """Nobody has confirmed, so it unlocks nothing; whoever then does so at the pendant must not wake the old move."""
+    swinging(arm, bench)
+    os.kill(arm._session.link.pid, signal.SIGSTOP)
+    bench.ask("protective_stop")
+    with pytest.raises(DeviceFault, match="a person confirms"):
+        arm.recover()
+    os.kill(arm._session.link.pid, signal.SIGCONT)
+    bench.ask("clear")
+    dashboard(bench, "play")
+    assert stands_still(bench)
+    arm.recover()
+
+
+def test_a_motion_that_a_protective_stop_ended_does_not_go_on_when_it_is_unlocked_by_hand(arm, bench):
+    moving = swinging(arm, bench)
+    bench.ask("protective_stop")
+    with pytest.raises(DeviceFault, match="protective stop"):
+        moving.wait(5.0)
+    bench.ask("clear")
+    dashboard(bench, "play")
+    assert stands_still(bench)
+    arm.recover()
+
+
 @pytest.mark.parametrize("ended_by", ["stop", "close"])
 def test_a_recovery_that_is_stopped_neither_unlocks_nor_starts_anything(arm, bench, ended_by):
     swinging(arm, bench)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.camera.clock_map import ClockMap, Latch
 from drivers.camera.folder import FolderCamera, image_files, read_image
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
+from drivers.clock_map import ClockMap, Latch
 from drivers.errors import (
     Aborted,
     ConfigError,

@@ -375,6 +375,38 @@ def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) ->
 
 
 @pytest.mark.wire
+def test_a_motor_that_stalls_before_its_target_loses_the_zero(bench: Bench) -> None:
+    bench.model.params = replace(bench.model.params, ends=(-0.004, 0.08))  # something lies in the carriage's way
+    rail = connect(bench.peer.url, bench.clock)
+    rail.home().wait(20.0)
+    with pytest.raises(DeviceFault, match="stall detected") as caught:
+        rail.move_to(0.09).wait(30.0)
+    assert caught.value.code == "rail.stalled"
+    assert not rail.state().homed
+    rail.close()
+    # The flag is gone once it has moved off the end; that does not make the count right.
+    bench.model.rotate(bench.world.now(), -51_200)
+    bench.clock.sleep(2.0)
+    again = connect(bench.peer.url, bench.clock)
+    assert not again.state().homed
+    again.close()
+
+
+@pytest.mark.wire
+def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench) -> None:
+    rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    rail.home().wait(20.0)
+    rail.close()
+    bench.model.rotate(bench.world.now(), 5 * 51_200)
+    bench.clock.sleep(4.0)
+    again = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    state = again.state()
+    assert state.right_switch
+    assert not state.homed
+    again.close()
+
+
+@pytest.mark.wire
 def test_a_reset_between_two_motions_is_told_before_anything_moves(homed: Bench) -> None:
     homed.rail.move_to(0.03).wait(10.0)
     homed.peer.fault("rail.reset")

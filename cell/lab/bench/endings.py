@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.report.truth import TIMEOUT_S
+from cell.devices.truth_link import TIMEOUT_S
 from cell.run.folder import is_going, list_runs
 from cell.steps.kinds import PLACE
 from drivers.clock import Clock

@@ -64,9 +64,13 @@ class ClockMap:
     @property
     def uncertainty(self) -> float:
         """Bound in s on the error of `host_time` near the newest latch."""
+        return self.bound_at(self._newest.host)
+
+    def bound_at(self, host: float) -> float:
+        """Bound in s on the error of `host_time` near the host time `host`, s."""
         if self._best is None:
             raise ValueError("the clocks have not been compared yet")
-        return self._best.bound + self._drift * (self._newest.host - self._best.host)
+        return self._best.bound + self._drift * abs(host - self._best.host)
 
     @property
     def drift(self) -> float:

@@ -1,0 +1,99 @@
+"""A run is resumed with its own job, and its sweep is trusted only as long as nothing that it stands on has changed."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from test_rail_sweep import CONFIG, sweep
+from test_stored_calibration import made
+
+from cell.geometry.poses import from_parts
+from cell.job import load_job
+from cell.run.resumption import UnfinishedRun, job_hash
+from cell.steps.laser_sweep import SweepRecord
+from cell.steps.photograph import BoardFix
+from cell.steps.stored_sweep import FILE, StoredSweep
+from drivers.errors import CalibrationStale, ConfigError
+from statemachine.journal import Journal
+
+CALIBRATION = made()
+SIGMA_M, SIGMA_RAD = 1e-4, 2e-4
+SEEN = np.diag([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
+BOARD = from_parts(np.array([0.9, 0.1, 0.3]))
+
+
+def fix(base_from_board: pin.SE3) -> BoardFix:
+    return BoardFix(base_from_board, SEEN, 0.1, 0.3, ())
+
+
+@pytest.fixture(scope="module")
+def stored() -> StoredSweep:
+    return StoredSweep(Path("run"), SweepRecord((sweep(),)), BOARD, SEEN)
+
+
+@pytest.mark.parametrize("away", [0.0, 2.0])
+def test_a_sweep_holds_while_the_board_is_seen_where_it_was(stored: StoredSweep, away: float) -> None:
+    """`away` in standard deviations of the difference of two photographs."""
+    confirmed = stored.confirmed_by(fix(BOARD * from_parts((away * np.sqrt(2) * SIGMA_M, 0.0, 0.0))))
+    (before,), (after,) = stored.sweep.swaths, confirmed.swaths
+    # What two photographs leave open is not known better than that.
+    assert np.trace((after.covariance - before.covariance)[:3, :3]) > 2 * 3 * SIGMA_M**2 * 0.999
+
+
+@pytest.mark.parametrize("way", [(7.0, 0, 0, 0, 0, 0), (0, 0, -7.0, 0, 0, 0), (0, 0, 0, 0, 7.0, 0)])
+def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way: tuple[float, ...]) -> None:
+    step = np.sqrt(2) * np.array(way) * np.array([SIGMA_M] * 3 + [SIGMA_RAD] * 3)
+    moved = pin.SE3(pin.exp3(step[3:]), step[:3])
+    with pytest.raises(CalibrationStale, match="the board has moved by"):
+        stored.confirmed_by(fix(BOARD * moved))
+
+
+def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
+    """A run with its own copy of a job that was killed after its sweep."""
+    jobs = Path(str(files("cell") / "jobs"))
+    for name in ("pot.toml", "pot.stl"):
+        shutil.copyfile(jobs / name, folder / name)
+    run = folder / "run"
+    run.mkdir()
+    job = folder / "pot.toml"
+    info = {
+        "job_file": str(job), "job_hash": job_hash(job), "simulated": False,
+        "configuration_hash": CONFIG.calibration_hash(), "calibration_hash": CALIBRATION.hash(), **other,
+    }  # fmt: skip
+    Journal(run, "run", info).close()
+    (run / FILE).write_bytes(b"")
+    return UnfinishedRun.find(run), job
+
+
+@pytest.mark.parametrize("name", ["pot.toml", "pot.stl"])
+def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path: Path, name: str) -> None:
+    run, _ = cut_short(tmp_path)
+    assert run.job == str(tmp_path / "pot.toml")
+    with (tmp_path / name).open("ab") as file:
+        file.write(b"\n# changed\n")
+    with pytest.raises(ConfigError, match="was changed since run"):
+        UnfinishedRun.find(run.folder)
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({}, "cannot be read as a sweep"),
+        ({"calibration_hash": "another"}, "the calibration was changed"),
+        ({"configuration_hash": "another"}, "the configuration was changed"),
+        ({"simulated": True}, "simulated world"),
+    ],
+)
+def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
+    tmp_path: Path, other: dict[str, Any], said: str
+) -> None:
+    run, job = cut_short(tmp_path, **other)
+    sweep, why = run.sweep(load_job(job)[0], CONFIG, CALIBRATION)
+    assert sweep is None
+    assert said in why
