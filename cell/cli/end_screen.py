@@ -4,7 +4,7 @@ beside its limit, what went wrong on the way, where the report is, and what to t
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     outcome = str(report["outcome"])
     head = _cut_lines(f"{outcome}  {report.get('reason', '')}", width, REASON_LINES)
     head.append(_cut(_facts(report), width))
-    steps = _steps(report.get("steps") or ())
+    steps = _steps(report)
     tail = [*_trouble(report, width), *_labelled("report", _shown_path(folder), width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
@@ -84,14 +84,14 @@ def _facts(report: Mapping[str, Any]) -> str:
     if report.get("simulated"):
         facts.append(f"simulated, seed {report.get('seed')}, level {report.get('level')}")
     if (wall := wall_seconds(report)) is not None:
-        simulated = f"{duration(report['cell_s'])} of the cell's in " if report.get("cell_s") is not None else ""
-        facts.append(f"{simulated}{duration(wall)} on the wall")
+        facts.append(f"{duration(wall)} on the wall")
     if report.get("started"):
         facts.append(str(report["started"])[:16].replace("T", " "))
     return " · ".join(facts)
 
 
-def _steps(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _steps(report: Mapping[str, Any]) -> list[str]:
+    rows = report.get("steps") or ()
     if not rows:
         return []
     lines = [f"{'step':<18}{'state':<10}{'cell time':>11}{'wall time':>12}{'retries':>9}"]
@@ -100,6 +100,8 @@ def _steps(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         cell, wall = (_seconds(row.get(key)) if begun else "" for key in ("duration_s", "wall_s"))
         retries = str(row.get("retries", "")) if begun else ""
         lines.append(f"{row['name']!s:<18}{row['state']!s:<10}{cell:>11}{wall:>12}{retries:>9}")
+    if report.get("cell_s") is not None:
+        lines.append(f"{'whole run':<28}{_seconds(report['cell_s']):>11}{_seconds(wall_seconds(report)):>12}")
     return lines
 
 

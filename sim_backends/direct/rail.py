@@ -11,7 +11,7 @@ from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, RailState
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import RailSetup, within
-from sim_backends.direct.rail_motion import DirectSweep, RailMove
+from sim_backends.direct.rail_motion import POLL_S, DirectSweep, RailMove
 from sim_backends.models.rail import RailModel
 
 ROUND_TRIP_S = 0.0005
@@ -120,9 +120,11 @@ class DirectRail:
         return sweep
 
     def stop(self) -> None:
-        """Stop on the ramp; a motion that is under way ends with `Aborted`, a search is not to be trusted."""
+        """Stop on the ramp, and wait for its end: no time passes by itself. What is under way ends with `Aborted`."""
         self.stops += 1
         self.model.rotate(self.clock.now(), 0)
+        while self.model.velocity(self.clock.now()) != 0:
+            self.clock.sleep(POLL_S)
 
     def close(self) -> None:
         """Stop."""
