@@ -31,9 +31,9 @@ from cell.steps.moves import HOME
 from drivers.errors import ConfigError
 from statemachine.control import RunControl
 from statemachine.journal import Journal, request
-from statemachine.policy import Policy, Step
+from statemachine.policy import OnFailure, Policy, Step
 from statemachine.runner import Runner, RunResult, StepContext
-from statemachine.sequence import STEPS, Sequence
+from statemachine.sequence import Sequence
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -261,17 +261,18 @@ def test_the_command_line_says_what_time_passed_here_and_there(
 # --- the runner in line, on single steps ---
 
 
-def run_steps(cell: VirtualCell, folder: Path, first: Any, policy: Policy | None = None) -> RunResult:
-    """Run a job whose first step is `first` and whose others do nothing."""
+POLICY = Policy((Step("work", 2.0, on_failure=OnFailure.STOP), Step("rest", 2.0)))
+
+
+def run_steps(cell: VirtualCell, folder: Path, first: Any) -> RunResult:
+    """Run a job of two steps, `first`, which has two seconds, and one that does nothing."""
     folder.mkdir()
-    work: dict[str, Any] = {step.value: lambda context: None for step in STEPS}
-    work[STEPS[0].value] = first
     journal = Journal(folder, "here")
     try:
         return Runner(
-            sequence=Sequence(),
-            steps=work,
-            policy=policy or Policy(),
+            sequence=Sequence(("work", "rest")),
+            steps={"work": first, "rest": lambda context: None},
+            policy=POLICY,
             journal=journal,
             clock=cell.clock,
             classify=classify,
@@ -284,6 +285,7 @@ def run_steps(cell: VirtualCell, folder: Path, first: Any, policy: Policy | None
 
 def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(folder: Path) -> None:
     cell = VirtualCell(load_config(None), SEED)
+    cell.devices.vehicle.brake()
     threads: list[str] = []
 
     def slow(context: StepContext) -> None:
@@ -291,8 +293,7 @@ def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(
         cell.devices.gate.enter(context.token)
         cell.devices.arm.move_joints(HOME + np.array([3.0, 0, 0, 0, 0, 0]), 0.05, 0.5).wait(600.0)
 
-    policy = Policy().with_step(Step(STEPS[0].value, 2.0, on_failure=Policy().of(STEPS[5]).on_failure))
-    result = run_steps(cell, folder / "late", slow, policy)
+    result = run_steps(cell, folder / "late", slow)
     assert (result.outcome.value, result.code) == ("faulted", "step.deadline")
     assert threads == [threading.current_thread().name]
     assert not cell.world.arm.moving
@@ -311,8 +312,7 @@ def test_a_step_that_catches_its_end_and_goes_on_is_told_again(folder: Path) -> 
             except RuntimeError as error:
                 told.append(str(error))
 
-    policy = Policy().with_step(Step(STEPS[0].value, 2.0, on_failure=Policy().of(STEPS[5]).on_failure))
-    result = run_steps(cell, folder / "stubborn", stubborn, policy)
+    result = run_steps(cell, folder / "stubborn", stubborn)
     assert result.code == "step.deadline"
     assert len(told) == 3
-    assert cell.clock.now() < 2.0 + 3 * Policy().grace_s + 2.0
+    assert cell.clock.now() < 2.0 + 3 * POLICY.grace_s + 2.0
