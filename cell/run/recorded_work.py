@@ -17,10 +17,12 @@ from typing import Any, TypeVar
 from cell.devices.assembly import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
 from cell.run.folder import REPORT, new_run, when, write_json
+from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
 from cell.version import release
 from drivers.errors import Aborted, CellError, Interrupted, RefusedError
+from drivers.interfaces import Frame
 from statemachine.journal import Journal, JournalError
 from statemachine.step import Event
 from statemachine.watch import Call
@@ -29,6 +31,8 @@ POLL_S = 0.05
 GRACE_S = 5.0
 """Wall seconds that stopped work has to end."""
 HEALTH_POLLS = 2
+FRAMES = "frames"
+"""Where in the run's folder the pictures are that its work looked at."""
 
 Made = TypeVar("Made")
 
@@ -37,11 +41,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Hands:
-    """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused."""
+    """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
+
+    `keep(what, frame)` leaves a picture that the work looked at in the run's folder.
+    """
 
     check: Callable[[], None]
     safe_point: Callable[[], None]
     progress: Callable[[float, str], None]
+    keep: Callable[[str, Frame], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +82,10 @@ class RecordedWork:
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
+        frames = FrameStore(folder / FRAMES)
         try:
-            with run_log(folder):
-                return self._watched(work, journal)
+            with run_log(folder), frames:
+                return self._watched(work, journal, frames)
         except BaseException as error:
             ended, outcome, reason = error, _outcome(error), str(error)
             raise
@@ -88,15 +97,21 @@ class RecordedWork:
                 "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),
                 **facts,
             }  # fmt: skip
+            if outcome != "done" and frames.recent:
+                report["last_frames"] = [f"{FRAMES}/{name}" for name in frames.recent]
+            if frames.failure is not None:
+                report["frames_missing"] = frames.failure
             for action in (
                 lambda: journal.run_ended(outcome, reason), journal.close, lambda: write_json(folder / REPORT, report),
             ):  # fmt: skip
                 _last(action, ended)
             self.run.folder = outer or folder
 
-    def _watched(self, work: Callable[[Hands], Made], journal: Journal) -> Made:
+    def _watched(self, work: Callable[[Hands], Made], journal: Journal, frames: FrameStore) -> Made:
         control = self.run.control
-        hands = Hands(control.token.check, lambda: control.safe_point(control.token, self._say), self._progress)
+        hands = Hands(
+            control.token.check, lambda: control.safe_point(control.token, self._say), self._progress, frames.keep
+        )
         made: list[Made] = []
 
         def begin() -> None:

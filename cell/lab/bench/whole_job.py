@@ -114,8 +114,9 @@ def run_whole_job(
 def _calibrate(cell: LockstepCell, config: CellConfig, job: Job, record: JobRecord, tell: Progress) -> CellCalibration:
     mover = Mover(cell.devices.arm, cell.clock, config, job)
     cell.devices.vehicle.brake()
-    scan = collect_scan(config, cell.devices, mover, _never, lambda f, t: tell(0.6 * f, t))
-    target = collect_target(config, cell.devices, mover, _never, lambda f, t: tell(0.6 + 0.2 * f, t))
+    keep = NoFrames().keep
+    scan = collect_scan(config, cell.devices, mover, _never, lambda f, t: tell(0.6 * f, t), keep)
+    target = collect_target(config, cell.devices, mover, _never, lambda f, t: tell(0.6 + 0.2 * f, t), keep)
     record.observations = (scan, target)
     tell(0.8, "solving")
     return CellCalibration.solve(scan, target, cell.identities(), config)
