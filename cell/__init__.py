@@ -26,9 +26,12 @@ if TYPE_CHECKING:
         NotObservable,
         RefusedError,
     )
+    from statemachine.script import Again as Again
+    from statemachine.script import Script as Script
 
 __all__ = [
     "Aborted",
+    "Again",
     "CalibrationStale",
     "Cell",
     "CellError",
@@ -43,6 +46,7 @@ __all__ = [
     "NotObservable",
     "RefusedError",
     "RunOutcome",
+    "Script",
 ]
 
 
@@ -58,6 +62,10 @@ def __getattr__(name: str) -> object:
             from cell.run.job_run import RunOutcome
 
             return RunOutcome
+        case "Again" | "Script":
+            from statemachine import script
+
+            return getattr(script, name)
     from drivers import errors
 
     return getattr(errors, name)

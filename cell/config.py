@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
 
 from cell.addresses import Folder, Name, checked_endpoint, is_example
 from cell.device_config import (
@@ -21,12 +21,16 @@ from cell.device_config import (
     CalibrationConfig,
     CameraConfig,
     ClawConfig,
+    DeviceConfig,
     LaserConfig,
     RailConfig,
     VehicleConfig,
 )
+from cell.devices.built_in import BUILT_IN
+from cell.devices.make import AnyMake
+from cell.devices.makes import make_of, record_of
 from cell.toml_file import Table, read_toml, validate
-from cell.units import number
+from cell.units import number, shown
 from drivers.errors import ConfigError
 
 __all__ = [
@@ -70,49 +74,59 @@ class CellSection(Table):
         return self
 
 
+DEVICES = {
+    "arm": "arm",
+    "rail": "rail",
+    "vehicle": "vehicle",
+    "scan_camera": "camera",
+    "target_camera": "camera",
+    "laser": "laser",
+    "claw": "claw",
+}
+"""The cell's devices by the name of their table, and what kind each is."""
+
+
 class CellConfig(Table):
-    """The whole configuration, as typed and checked records."""
+    """The whole configuration, as typed and checked records; a device's record is that of its make."""
 
     cell: CellSection
-    rail: RailConfig
-    arm: ArmConfig
-    vehicle: VehicleConfig
-    scan_camera: CameraConfig
-    target_camera: CameraConfig
-    laser: LaserConfig
-    claw: ClawConfig
+    rail: Annotated[SerializeAsAny[RailConfig], WrapValidator(record_of("rail"))]
+    arm: Annotated[SerializeAsAny[ArmConfig], WrapValidator(record_of("arm"))]
+    vehicle: Annotated[SerializeAsAny[VehicleConfig], WrapValidator(record_of("vehicle"))]
+    scan_camera: Annotated[SerializeAsAny[CameraConfig], WrapValidator(record_of("camera"))]
+    target_camera: Annotated[SerializeAsAny[CameraConfig], WrapValidator(record_of("camera"))]
+    laser: Annotated[SerializeAsAny[LaserConfig], WrapValidator(record_of("laser"))]
+    claw: Annotated[SerializeAsAny[ClawConfig], WrapValidator(record_of("claw"))]
     calibration: CalibrationConfig
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
-        if self.laser.output == self.claw.output:
-            raise ValueError(
-                f"laser.output and claw.output are both {self.laser.output}; each needs an output of its own"
-            )
         found: dict[str, str] = {}
-        for name, address in (
-            ("rail.url", self.rail.url),
-            ("arm.address", self.arm.address),
-            ("vehicle.channel", self.vehicle.channel.partition("@")[0]),
-            ("scan_camera.address", self.scan_camera.address),
-            ("target_camera.address", self.target_camera.address),
-            ("cell.truth", self.cell.truth),
-        ):
-            other = found.setdefault(address.lower(), name)
-            if address and other != name:
-                raise ValueError(f'{other} and {name} are both "{address}"; each device has an address of its own')
+        places = {f"{name}.{self.device(name).ADDRESS}": self.device(name).place for name in DEVICES}
+        for key, place in (*places.items(), ("cell.truth", self.cell.truth)):
+            other = found.setdefault(place.lower(), key)
+            if place and other != key:
+                raise ValueError(f"{other} and {key} are both {shown(place)}; each device has an address of its own")
         return self
 
+    def device(self, name: str) -> DeviceConfig:
+        """The record of the device of that name."""
+        record: DeviceConfig = getattr(self, name)
+        return record
+
+    def make(self, name: str) -> AnyMake:
+        """The make of the device of that name."""
+        return make_of(DEVICES[name], self.device(name).driver)
+
     def calibration_hash(self) -> str:
-        """Hash of everything that a calibration depends on: optics, mounting, rail and boards, not addresses."""
-        parts = {
-            "rail": self.rail.model_dump(include={"lead", "steps_per_turn", "microsteps"}),
-            "arm": self.arm.model_dump(include={"model"}),
-            "scan_camera": self.scan_camera.model_dump(exclude={"address", "driver", "photo_exposure"}),
-            "target_camera": self.target_camera.model_dump(exclude={"address", "driver", "photo_exposure"}),
-            "laser": self.laser.model_dump(exclude={"output"}),
-            "calibration": self.calibration.model_dump(include={"fine", "large"}),
-        }
+        """Hash of everything that a calibration depends on: boards, and what each device's make says, not addresses."""
+        parts = {"calibration": self.calibration.model_dump(include={"fine", "large"})}
+        for name, kind in DEVICES.items():
+            make = self.make(name)
+            if make.calibrated:
+                parts[name] = self.device(name).model_dump(include=set(make.calibrated))
+                if make not in BUILT_IN:
+                    parts[name] |= {"driver": f"{kind}.{make.name}"}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -155,12 +169,8 @@ def load_config(path: Path | None) -> CellConfig:
 
 def example_addresses(config: CellConfig) -> list[str]:
     """The keys whose addresses are still those of the example, which no device has."""
-    addresses = {
-        "arm.address": config.arm.address,
-        "scan_camera.address": config.scan_camera.address,
-        "target_camera.address": config.target_camera.address,
-    }
-    return [f'{key} = "{address}"' for key, address in addresses.items() if is_example(address)]
+    records = {name: config.device(name) for name in DEVICES}
+    return [f'{name}.{r.ADDRESS} = "{r.place}"' for name, r in records.items() if is_example(r.place)]
 
 
 def require_real_addresses(config: CellConfig) -> None:
@@ -176,9 +186,9 @@ def require_confirm(config: CellConfig) -> None:
             'cell.confirm = "simulated" is only for a simulated cell (one that gives cell.truth, or --sim all): at a '
             'real one a person looks and confirms; write confirm = "person" or leave it out'
         )
-    if config.cell.confirm == "simulated" and not config.arm.address.startswith(("127.", "localhost")):
+    if config.cell.confirm == "simulated" and not config.arm.place.startswith(("127.", "localhost")):
         raise ConfigError(
-            f'cell.confirm = "simulated", but the arm at {config.arm.address} is not on this machine, so it '
+            f'cell.confirm = "simulated", but the arm at {config.arm.place} is not on this machine, so it '
             'may be a real one; write confirm = "person" or leave it out'
         )
 

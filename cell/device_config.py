@@ -1,29 +1,26 @@
-"""The devices of `cell.toml`, a record each: where a device is, how it is mounted and what it may do.
+"""What the cell has to know of each kind of device, whatever its make: how it is mounted and what it may do.
 
-Ranges are those of the devices and of the drivers behind them, so that what passes here can be asked of them.
+A make's record adds where the device is and how it is set up: `cell.devices.built_in` has those of the makes that come
+with the cell. Ranges are those of the devices, so that what passes here can be asked of them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+import os
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
 from pydantic import AfterValidator, model_validator
 
-from cell.addresses import Endpoint, Host, Port, checked_can
 from cell.toml_file import Table
 from cell.units import number, quantity, whole
 from drivers.errors import ConfigError
 
-MODULE_COUNTS = 2**31 - 1
-"""Microsteps to which the rail's module counts, positions and microsteps per second alike."""
-
 Length = Annotated[float, quantity("mm", -20_000, 20_000)]
 Offset = Annotated[float, quantity("mm", -1_000, 1_000)]
 Angle = Annotated[float, quantity("deg", -360, 360)]
-Connector = Annotated[int, whole(0, 17, meaning=": 0-7 standard, 8-15 configurable, 16-17 tool")]
 Pixels = Annotated[int, whole(64, 8192)]
 Exposure = Annotated[float, quantity("ms", 0.01, 1000)]
 PhotoExposure = Annotated[float, quantity("ms", 0.01, 100)]
@@ -49,19 +46,46 @@ class Mounting(Pose):
     translation: tuple[Offset, Offset, Offset]
 
 
+def real_path(address: str) -> str:
+    """A device file by the name of what it is, whichever link to it the configuration names; others as they are."""
+    return os.path.realpath(address) if address.startswith("/") else address
+
+
+class DeviceConfig(Table):
+    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is."""
+
+    ADDRESS: ClassVar[str] = "address"
+
+    driver: str
+
+    @property
+    def place(self) -> str:
+        """Where the device is: no other device of the cell is there."""
+        return str(getattr(self, self.ADDRESS))
+
+    @property
+    def held(self) -> str:
+        """What this computer knows the device by: one program at a time holds it."""
+        return real_path(self.place)
+
+
+OfMake = TypeVar("OfMake", bound=DeviceConfig)
+
+
+def of_make(record: DeviceConfig, kind: type[OfMake]) -> OfMake:
+    """The record as that of one make; `ConfigError` when it is another's."""
+    if not isinstance(record, kind):
+        raise ConfigError(f'driver = "{record.driver}" does not work here: a device of {kind.__name__} is needed')
+    return record
+
+
 Travel = Annotated[float, quantity("mm", -100, 2_000)]
 
 
-class RailConfig(Table):
-    """The stepper rail, a TMCL module on a serial line."""
+class RailConfig(DeviceConfig):
+    """A rail; `lead` is the travel per turn of its motor."""
 
-    driver: Literal["tmcl"] = "tmcl"
-    url: Annotated[str, Port]
-    address: Annotated[int, whole(1, 255)] = 1
-    motor: Annotated[int, whole(0, 5)] = 0
     lead: Annotated[float, quantity("mm", 0.1, 50)]
-    steps_per_turn: Annotated[int, whole(20, 2000)]
-    microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
     travel: tuple[Travel, Travel]
     max_speed: Annotated[float, quantity("mm/s", 0.1, 500)]
     acceleration: Annotated[float, quantity("mm/s^2", 1, 10_000)]
@@ -71,29 +95,16 @@ class RailConfig(Table):
         low, high = self.travel
         if not high - low >= 0.01:
             raise ValueError(f"travel {low * 1e3:g} to {high * 1e3:g} mm: the first must be smaller, by 10 mm or more")
-        counts = self.steps_per_turn * self.microsteps / self.lead
-        for name, value in (
-            ("travel", max(-low, high)),
-            ("max_speed", self.max_speed),
-            ("acceleration", self.acceleration),
-        ):
-            if value * counts > MODULE_COUNTS:
-                raise ValueError(
-                    f"{name} would be {value * counts:.3g} microsteps with this lead, steps_per_turn and microsteps; "
-                    f"the module counts to {MODULE_COUNTS}. Use fewer microsteps"
-                )
         return self
 
 
 Centre = Annotated[float, quantity("mm", -500, 500)]
 
 
-class ArmConfig(Table):
-    """The arm and where it stands on the vehicle."""
+class ArmConfig(DeviceConfig):
+    """The arm and where it stands on the vehicle; the cell plans with the kinematics of `model`."""
 
-    driver: Literal["ur"] = "ur"
     model: Literal["UR10e"] = "UR10e"
-    address: Annotated[str, Host]
     max_joint_speed: Annotated[float, quantity("deg/s", 1, 120)]
     max_joint_acceleration: Annotated[float, quantity("deg/s^2", 1, 800)]
     max_joint_jerk: Annotated[float, quantity("deg/s^3", 10, 40_000)]
@@ -121,29 +132,18 @@ class ArmConfig(Table):
         return self
 
 
-class VehicleConfig(Table):
-    """The carrier, AgileX protocol v2 on CAN."""
+class VehicleConfig(DeviceConfig):
+    """The carrier."""
 
-    driver: Literal["agilex"] = "agilex"
-    interface: str
-    channel: str
-    bitrate: Annotated[float, quantity("kbit/s", 10, 1000)]
     track: Annotated[float, quantity("mm", 100, 3000)]
     max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]
     max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)]
     lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0004
 
-    @model_validator(mode="after")
-    def _reachable(self) -> Self:
-        checked_can(self.interface, self.channel, self.bitrate)
-        return self
 
+class CameraConfig(DeviceConfig):
+    """A camera with its nominal optics and mounting."""
 
-class CameraConfig(Table):
-    """A camera on the frame stream protocol, with its nominal optics and mounting."""
-
-    driver: Literal["stream"] = "stream"
-    address: Annotated[str, Endpoint]
     width: Pixels
     height: Pixels
     pixel: Annotated[float, quantity("um", 0.5, 30)]
@@ -167,19 +167,15 @@ class CameraConfig(Table):
         return self
 
 
-class LaserConfig(Table):
-    """The line laser: the arm's output that switches it, and its nominal place in the scan camera's frame."""
+class LaserConfig(DeviceConfig):
+    """The line laser with its nominal place in the scan camera's frame."""
 
-    output: Connector
     baseline: Annotated[float, quantity("mm", 5, 500)]
     tan_theta: Annotated[float, number(0.2, 20)]
 
 
-class ClawConfig(Table):
-    """The claw: the arm's output that closes it and the input that shows a held part."""
-
-    output: Connector
-    feedback: Connector
+class ClawConfig(DeviceConfig):
+    """The claw."""
 
 
 class PlateConfig(Table):

@@ -28,9 +28,10 @@ Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 
 
 class JobSection(Table):
-    """The job as a whole."""
+    """The job as a whole; `kind` says which steps it has (`cell.steps.kinds`)."""
 
     name: Annotated[str, Name]
+    kind: Annotated[str, Name] = "place"
 
 
 class BoardSection(Table):

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -31,26 +32,36 @@ from cell.calibration.store import (
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.check.fit import require_fit
-from cell.config import CellConfig, Confirm, beside, config_to_open
-from cell.devices.assembly import Devices, connect
+from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import connect, connected_for
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
 from cell.devices.injection import Injection, Injector
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.run.folder import CellLock, find_run
 from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.maintenance import recorded_maintenance
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.run import Run
+from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
 from statemachine.runner import Event
-from statemachine.watch import EndSignals, SignalWatch
+from statemachine.script import NO_SCRIPT, Script
+from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
+
+HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
+"""The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
+while the vehicle is braked."""
 
 CLOSE_WAIT_S = 20.0
 """Wall seconds that a run has to end when the cell is closed."""
@@ -68,15 +79,19 @@ class Cell:
     """
 
     def __init__(
-        self, config: CellConfig, folder: Path, lock: CellLock, devices: Devices, simulated: SimulatedCell | None
+        self,
+        config: CellConfig,
+        folder: Path,
+        lock: AbstractContextManager[object],
+        devices: Devices,
+        simulated: Simulation | None,
     ) -> None:
         self.config = config
         self.folder = folder
         self.devices = devices
         self.simulated = simulated
         self._lock = lock
-        self.whereabouts = Whereabouts(devices.vehicle)
-        if simulated is not None:
+        if simulated is not None and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
         self._beginning = threading.Lock()
@@ -93,11 +108,20 @@ class Cell:
         sim: str | None = None,
         seed: int = 1,
         level: str = "nominal",
-        speed: float = SIM_SPEED,
+        speed: float | None = None,
         surface: str = "pot",
         confirm: Confirm | None = None,
+        only: Collection[str] = tuple(DEVICES),
+        clock: str = "wall",
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+
+        With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
+        may be switched off, and what is asked of them is a `NotConnectedError`.
+
+        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall
+        (`SIM_SPEED`). With `clock="virtual"` its models are in this process behind the devices' interfaces, without
+        wires and without waiting: the same seed then takes the same course, to the byte.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -109,19 +133,30 @@ class Cell:
             raise ConfigError(
                 f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices'
             )
+        if clock not in ("wall", "virtual"):
+            raise ConfigError(
+                f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait'
+            )
+        if clock == "virtual" and (sim is None or speed is not None):
+            wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
+            raise ConfigError(f'clock="virtual": {wrong}; leave that out')
         path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
         folder = beside(path)
         with EndSignals(), ExitStack() as opened:
-            if sim == "all":
-                simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface=surface)
-                opened.callback(simulated.close)
-                loaded = with_endpoints(loaded, simulated.endpoints)
+            if clock == "virtual":
+                virtual = VirtualCell(loaded, seed, level, surface)
+                cell = cls(loaded, folder, nullcontext(), virtual.devices, virtual)
             else:
                 simulated = None
-            lock = opened.enter_context(CellLock(loaded))
-            devices = connect(loaded)
-            opened.callback(devices.close)
-            cell = cls(loaded, folder, lock, devices, simulated)
+                if sim == "all":
+                    simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
+                    opened.callback(simulated.close)
+                    loaded = with_endpoints(loaded, simulated.endpoints)
+                needed = connected_for(loaded, only)
+                lock = opened.enter_context(CellLock(loaded, needed))
+                devices = connect(loaded, needed)
+                opened.callback(devices.close)
+                cell = cls(loaded, folder, lock, devices, simulated)
             opened.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.
         cell._signals.__enter__()
@@ -133,7 +168,17 @@ class Cell:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except SignalInterrupt:
+            # The first reason to end is the one that is told.
+            if error is None:
+                raise
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """What is known of where the vehicle stands."""
+        return Whereabouts(self.devices.vehicle)
 
     @property
     def runs_folder(self) -> Path:
@@ -171,12 +216,46 @@ class Cell:
             run.abort("stopped with Cell.stop()")
         stop_cell(self.devices)
 
+    def clear_stop(self, by: str) -> None:
+        """A person, `by` name, has seen that the cell may move again after a stop: direct commands pass again.
+
+        A new run needs no such word. `ConfigError` when nobody is named.
+        """
+        if not by.strip():
+            raise ConfigError("clear_stop needs the name of the person who has looked at the cell")
+        log.warning("the stop was cleared by %s", by)
+        self.devices.gate.clear()
+
+    @contextmanager
+    def maintenance(self, reason: str, lift: Sequence[str]) -> Iterator[None]:
+        """Inside this context the interlocks named in `lift` do not hold (docs/interlocks.md lists them).
+
+        On a person's responsibility, and recorded: in the log of the run that is going on, else as a run of its own;
+        runs that are begun meanwhile say so in their report. `ConfigError` without a reason, or for a name that is
+        none or that nobody can lift.
+        """
+        if not reason.strip() or not lift:
+            raise ConfigError("maintenance needs a reason, and the names of the interlocks to lift")
+        with ExitStack() as over:
+            over.enter_context(self.devices.interlocks.lifted(lift))
+            text = f"maintenance ({reason}): lifted {', '.join(lift)}"
+            if (run := self.current) is not None:
+                run.tell(Event("note", None, {"text": text}))
+            else:
+                over.enter_context(recorded_maintenance(self.runs_folder, self._facts(), reason, lift))
+            log.warning("%s", text)
+            try:
+                yield
+            finally:
+                log.warning("maintenance (%s) is over: %s hold again", reason, ", ".join(lift))
+
     def close(self) -> None:
         """End the run that is going on, stop and disconnect everything, let go of the cell.
 
-        Idempotent, callable from any thread, shielded from interrupts.
+        Idempotent, callable from any thread, shielded from interrupts: one that comes meanwhile is raised at the end,
+        as `SignalInterrupt`.
         """
-        with SignalWatch():
+        with SignalWatch() as signals:
             with self._beginning:
                 if self._closed:
                     return
@@ -196,6 +275,8 @@ class Cell:
         self._signals.__exit__(None, None, None)
         for problem in problems:
             log.warning("closing the cell: %s", problem)
+        if signals.number is not None:
+            raise SignalInterrupt(signals.number)
 
     def begin(
         self,
@@ -237,15 +318,29 @@ class Cell:
     def _recorded(
         self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
     ) -> Made:
-        facts = {"cell": self.config.cell.name, **self._world(), **(info or {})}
+        facts = {**self._facts(), **(info or {})}
         health = require_no_emergency_stop if kind == "jog" else require_healthy
         return RecordedWork(run, kind, self.devices, self.runs_folder, facts, health).perform(work)
 
+    def _facts(self) -> dict[str, Any]:
+        return {"cell": self.config.cell.name, **self._world()}
+
     def _world(self) -> dict[str, Any]:
-        """Whether this cell is simulated, and which world."""
+        """Whether this cell is simulated, and which world; and the interlocks that do not hold, if any."""
+        if lifted := sorted(self.devices.interlocks.names_lifted):
+            return {**self._simulation(), "interlocks_lifted": lifted}
+        return self._simulation()
+
+    def _simulation(self) -> dict[str, Any]:
         if self.simulated is None:
-            return {"simulated": False, "seed": None, "level": None}
-        return {"simulated": True, **{key: self.simulated.endpoints[key] for key in ("seed", "level")}}
+            return {"simulated": False, "seed": None, "level": None, "clock": "wall"}
+        return self.simulated.facts
+
+    def _truth(self) -> Callable[[], dict[str, Any]] | None:
+        """How the report asks a simulated world for its truth; None where there is none."""
+        if self.simulated is not None:
+            return self.simulated.truth
+        return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     # --- jobs ---
 
@@ -256,9 +351,11 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> RunOutcome:
         """`start` a job and wait for its end. Raises only for what is wrong before anything moves."""
-        return self.start(job, observer, inject, at_start=at_start).result()
+        return self.start(job, observer, inject, at_start=at_start, until=until, script=script).result()
 
     def start(
         self,
@@ -267,6 +364,8 @@ class Cell:
         inject: Sequence[str] = (),
         *,
         at_start: bool = False,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         """Begin a job and hold it: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
 
@@ -275,16 +374,22 @@ class Cell:
 
         A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
+
+        With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
+        `script` looks at results between the steps and decides about refusals.
         """
-        injections = [Injection.parse(text) for text in inject]
-        if injections and self.simulated is None:
-            raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
+        loaded, _ = load_job(job)
+        injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
         info: dict[str, Any] = {}
         inline: tuple[Observer, ...] = ()
         if injections:
+            if self.simulated is None:
+                raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
+            for injection in injections:
+                self.simulated.require_fault(injection.fault)
             info["injected"] = [str(injection) for injection in injections]
-            inline = (Injector(self.config.cell.truth, injections),)
-        return self._start(job, observer, info, None, inline, at_start=at_start)
+            inline = (Injector(self.simulated.fault, injections),)
+        return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
         self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
@@ -307,11 +412,15 @@ class Cell:
         inline: tuple[Observer, ...] = (),
         *,
         at_start: bool,
+        until: str | None = None,
+        script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         self._require_free()
         stops = self._stops
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config, mesh)
+        kind = find_kind(loaded.job.kind).until(until)
+        kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
         stored: CellCalibration | None = None
         try:
@@ -335,7 +444,20 @@ class Cell:
             if before is not None:
                 earlier, why = before.sweep(loaded, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
-            job_run = JobRun(run, self.config, self.devices, loaded, nominal, calibration, info, inline, earlier)
+            job_run = JobRun(
+                run,
+                self.config,
+                self.devices,
+                loaded,
+                nominal,
+                calibration,
+                info,
+                kind,
+                script,
+                inline,
+                earlier,
+                self._truth(),
+            )
             try:
                 return job_run.perform(self.runs_folder, self.whereabouts)
             finally:
@@ -409,6 +531,7 @@ class Cell:
                 run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
 
             def work(hands: Hands) -> Verification:
+                self.devices.interlocks.work_with(calibration.configuration)
                 self.devices.vehicle.brake()
                 mover = self.mover(loaded, hands.safe_point)
                 seen = collect_verification(
@@ -422,11 +545,16 @@ class Cell:
 
         return self.begin("verification", verification, observer).result()
 
-    def home(self) -> None:
-        """Home the rail and fold the arm above the deck."""
+    def home(self, device: str | None = None) -> None:
+        """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        if device not in (None, *HOMED):
+            raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
         def work(hands: Hands) -> None:
-            self.devices.rail.home().wait(60.0)
-            self.mover(None, hands.safe_point).to_joints(HOME)
+            if device != "arm":
+                self.devices.rail.home().wait(60.0)
+            if device != "rail":
+                self.devices.vehicle.brake()
+                self.mover(None, hands.safe_point).to_joints(HOME)
 
         self.perform("homing", work)

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock_map import Latch
+from drivers.clock_map import Latch as Latch
 
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""

@@ -25,6 +25,10 @@ class Asked(Protocol):
     def reason(self) -> str:
         """In the words of whoever asked."""
 
+    @property
+    def number(self) -> int | None:
+        """Of the question that a confirmation answers."""
+
 
 class RunControl:
     """The reins of one run; every method may be called from any thread."""
@@ -89,7 +93,7 @@ class RunControl:
                 case "go-on":
                     self.go_on()
                 case "confirm":
-                    self.confirm(request.reason)
+                    self.confirm(request.reason, request.number)
 
     # --- asked by the run ---
 
@@ -109,10 +113,13 @@ class RunControl:
             since = self._held_since
             return self._held_s + (0.0 if since is None else time.monotonic() - since)
 
-    def safe_point(self, token: CancelToken, say: Callable[[bool], None]) -> None:
+    def safe_point(
+        self, token: CancelToken, say: Callable[[bool], None], look: Callable[[], None] = lambda: None
+    ) -> None:
         """Stay here for as long as the run is paused; `say(True)` when it is held, `say(False)` when it goes on.
 
-        Raises `Cancelled` when `token` ends the work.
+        Held on the wall's time, whatever the cell's clock; `look()` is called meanwhile, and raises when it finds that
+        the work is to end. Raises `Cancelled` when `token` ends the work.
         """
         token.check()
         if not self.paused():
@@ -124,6 +131,7 @@ class RunControl:
             while self.paused():
                 if token.event.wait(0.02):
                     token.check()
+                look()
         finally:
             with self._change:
                 self._held_s += time.monotonic() - (self._held_since or time.monotonic())

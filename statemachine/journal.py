@@ -26,7 +26,7 @@ REQUESTS = ("abort", "pause", "go-on", "confirm")
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS runs (
-    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL);
+    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL, pid INTEGER);
 CREATE TABLE IF NOT EXISTS steps (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, name TEXT NOT NULL, attempt INTEGER NOT NULL,
     started REAL NOT NULL, ended REAL, state TEXT NOT NULL, duration_s REAL, result TEXT, error TEXT);
@@ -34,7 +34,7 @@ CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, at REAL NOT NULL, kind TEXT NOT NULL, step TEXT,
     data TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS requests (
-    id INTEGER PRIMARY KEY, at REAL NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL, taken REAL);
+    id INTEGER PRIMARY KEY, at REAL NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL, number INTEGER);
 """
 
 
@@ -44,7 +44,10 @@ class JournalError(RuntimeError):
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed."""
+    """One run; `ended`, `outcome` and `reason` are None while it runs, and for ever if it was killed.
+
+    `pid` is the process that does it, None where an older journal does not tell.
+    """
 
     id: str
     started: float
@@ -52,6 +55,7 @@ class RunRow:
     outcome: str | None
     reason: str | None
     info: dict[str, Any]
+    pid: int | None = None
 
 
 @dataclass(frozen=True)
@@ -80,17 +84,21 @@ class EventRow:
 
 @dataclass(frozen=True)
 class Request:
-    """Something that another process asked for."""
+    """Something that another process asked for; `number` is that of the question that a "confirm" answers."""
 
     kind: str
     reason: str
+    number: int | None = None
 
 
 class Journal:
     """Writes the record of one run into `folder`/journal.sqlite; safe to use from several threads."""
 
     def __init__(self, folder: Path, run: str, info: Mapping[str, object] | None = None) -> None:
-        """Begin the run `run`; `info` is JSON-ready (seed, level, job, hashes …). `JournalError` if it cannot."""
+        """Begin the run `run`; `info` is JSON-ready (seed, level, job, hashes …), its "pid" the process that does it.
+
+        `JournalError` if it cannot.
+        """
         self.run = run
         self.path = folder / FILE_NAME
         self._lock = threading.Lock()
@@ -99,9 +107,16 @@ class Journal:
             self._base.execute("PRAGMA journal_mode=WAL")
             self._base.execute("PRAGMA synchronous=FULL")
             self._base.executescript(_SCHEMA)
+            self._asked = sqlite3.connect(self.path, timeout=1.0, isolation_level=None, check_same_thread=False)
+            # What was asked of an earlier run in this file does not concern this one.
+            self._taken = int(self._asked.execute("SELECT coalesce(max(id), 0) FROM requests").fetchone()[0])
         except sqlite3.Error as error:
             raise JournalError(f"the journal {self.path} cannot be opened: {error}. Is the folder writable?") from error
-        self._write("INSERT INTO runs (id, started, info) VALUES (?, ?, ?)", run, time.time(), _dump(info or {}))
+        about = dict(info or {})
+        pid = about.pop("pid", None)
+        self._write(
+            "INSERT INTO runs (id, started, info, pid) VALUES (?, ?, ?, ?)", run, time.time(), _dump(about), pid
+        )
 
     def step_started(self, name: str, attempt: int) -> int:
         """Record that an attempt (counted from 1) at a step begins; returns the key for `step_ended`."""
@@ -134,19 +149,24 @@ class Journal:
         )
 
     def take_requests(self) -> list[Request]:
-        """What other processes have asked for since the last call, oldest first."""
-        with self._lock:
-            try:
-                rows = self._base.execute("SELECT id, kind, reason FROM requests WHERE taken IS NULL").fetchall()
-                for key, _, _ in rows:
-                    self._base.execute("UPDATE requests SET taken = ? WHERE id = ?", (time.time(), key))
-            except sqlite3.Error as error:
-                raise JournalError(f"the journal {self.path} cannot be read: {error}") from error
-        return [Request(kind, reason) for _, kind, reason in rows]
+        """What other processes have asked for since the last call, oldest first; asked by one thread.
+
+        It only reads, over a connection of its own: a write that stalls keeps nobody from being heard.
+        """
+        try:
+            rows = self._asked.execute(
+                "SELECT id, kind, reason, number FROM requests WHERE id > ? ORDER BY id", (self._taken,)
+            ).fetchall()
+        except sqlite3.Error as error:
+            raise JournalError(f"the journal {self.path} cannot be read: {error}") from error
+        if rows:
+            self._taken = rows[-1][0]
+        return [Request(*row) for _, *row in rows]
 
     def close(self) -> None:
         """Close the file; the record is complete without it as well."""
         with self._lock:
+            self._asked.close()
             self._base.close()
 
     def _write(self, statement: str, *values: object) -> int:
@@ -185,10 +205,11 @@ def read(folder: Path) -> Record:
     """Read the journal in a run's folder, also while it is being written; `JournalError` if there is none."""
 
     def rows(base: sqlite3.Connection) -> Record:
+        columns = "id, started, ended, outcome, reason, info, " + ("pid" if _tells_pid(base) else "NULL")
         runs = tuple(
-            RunRow(key, started, ended, outcome, reason, json.loads(info))
-            for key, started, ended, outcome, reason, info in base.execute(
-                "SELECT id, started, ended, outcome, reason, info FROM runs ORDER BY rowid"
+            RunRow(key, started, ended, outcome, reason, json.loads(info), pid)
+            for key, started, ended, outcome, reason, info, pid in base.execute(
+                f"SELECT {columns} FROM runs ORDER BY rowid"
             )
         )
         if not runs:
@@ -219,13 +240,25 @@ def read(folder: Path) -> Record:
     return _in_existing(folder, rows)
 
 
-def request(folder: Path, kind: str, reason: str) -> None:
-    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second."""
+def _tells_pid(base: sqlite3.Connection) -> bool:
+    return "pid" in (row[1] for row in base.execute("PRAGMA table_info(runs)"))
+
+
+def request(folder: Path, kind: str, reason: str, number: int | None = None) -> None:
+    """Ask the run in `folder` for `kind`, one of `REQUESTS`; the runner sees it within a fraction of a second.
+
+    A "confirm" has the `number` of the question that it answers: it counts for no other.
+    """
     if kind not in REQUESTS:
         raise ValueError(f"request '{kind}' is unknown; a run takes {', '.join(REQUESTS)}")
 
+    if kind == "confirm" and number is None:
+        raise ValueError("a confirmation needs the number of its question")
+
     def write(base: sqlite3.Connection) -> None:
-        base.execute("INSERT INTO requests (at, kind, reason) VALUES (?, ?, ?)", (time.time(), kind, reason))
+        base.execute(
+            "INSERT INTO requests (at, kind, reason, number) VALUES (?, ?, ?, ?)", (time.time(), kind, reason, number)
+        )
 
     _in_existing(folder, write)
 

@@ -6,16 +6,15 @@ A failure is looked at in this order: an end that was asked for; a retry; a reco
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
-
-from statemachine.sequence import STEPS, State
 
 
 class Outcome(Enum):
-    """How a run ended."""
+    """How a run ended: done where nothing is placed."""
 
     PLACED = "placed"
+    DONE = "done"
     REFUSED = "refused"
     FAULTED = "faulted"
     ABORTED = "aborted"
@@ -61,9 +60,6 @@ class Step:
     on_wall: bool = False
 
     def __post_init__(self) -> None:
-        names = [step.value for step in STEPS]
-        if self.name not in names:
-            raise ValueError(f"step '{self.name}' is unknown; the steps are {', '.join(names)}")
         if not self.deadline_s > 0:
             raise ValueError(f"step '{self.name}': deadline {self.deadline_s} s must be greater than 0 s")
         if self.max_retries < 0:
@@ -74,21 +70,9 @@ class Step:
         return any(base.__name__ in self.retry_on for base in type(error).__mro__)
 
 
-def _default_steps() -> tuple[Step, ...]:
-    return (
-        Step("drive_to_target", 180.0, 1, ("DeadlineError",)),
-        Step("board_photo", 60.0, 2, ("DeadlineError",)),
-        Step("laser_sweep", 120.0, 2, ("DeadlineError",)),
-        Step("reconstruct", 60.0, on_wall=True),
-        Step("invert_pose", 60.0, on_wall=True),
-        # A part that may have touched the surface is not placed a second time by itself.
-        Step("place", 180.0, on_failure=OnFailure.STOP),
-    )
-
-
 @dataclass(frozen=True)
 class Policy:
-    """The steps' policies and the time that stopping, ending and recovering may take.
+    """The steps' policies in the steps' order, and the time that stopping, ending and recovering may take.
 
     `stop_deadline_s` bounds one safe stop and `grace_s` the time that a step has to end after it was stopped, both in
     seconds on the wall; `recovery_deadline_s` bounds a recovery, in seconds of the cell's clock. A run that needs a
@@ -96,7 +80,7 @@ class Policy:
     cell, where nobody can be hurt.
     """
 
-    steps: tuple[Step, ...] = field(default_factory=_default_steps)
+    steps: tuple[Step, ...]
     stop_deadline_s: float = 10.0
     grace_s: float = 5.0
     recovery_deadline_s: float = 60.0
@@ -105,13 +89,12 @@ class Policy:
 
     def __post_init__(self) -> None:
         names = [step.name for step in self.steps]
-        missing = [state.value for state in STEPS if state.value not in names]
-        if missing or len(names) != len(set(names)):
-            raise ValueError(f"a policy names each step once; missing: {missing}, given: {names}")
+        if len(names) != len(set(names)):
+            raise ValueError(f"a policy names each step once, given: {names}")
 
-    def of(self, state: State) -> Step:
-        """The policy of one step."""
-        return next(step for step in self.steps if step.name == state.value)
+    def of(self, name: str) -> Step:
+        """The policy of the step of this name."""
+        return next(step for step in self.steps if step.name == name)
 
     def with_step(self, step: Step) -> Policy:
         """A copy in which the policy of `step.name` is `step`."""

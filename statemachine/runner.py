@@ -1,12 +1,14 @@
 """Drives a sequence of steps to its end, whatever happens, and ends it safe.
 
-The work is done by the steps that are passed in, each in a thread of its own; the runner watches deadlines, requests
-and signals, repeats what the policy lets it repeat, and writes everything to the journal as it happens. It knows
-neither devices nor the cell: exceptions are judged by `classify`, the cell is brought to rest by `safe_stop`.
+The work is done by the steps that are passed in; the runner watches deadlines, requests and signals meanwhile (see
+`statemachine.waiting` for how), repeats what the policy lets it repeat, and writes everything to the journal as it
+happens. It knows neither devices nor the cell: exceptions are judged by `classify`, the cell is brought to rest by
+`safe_stop`.
 """
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -16,7 +18,8 @@ from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
-from statemachine.sequence import STEPS, Sequence, SequenceError, State, Trigger
+from statemachine.script import NO_SCRIPT, Again, Script
+from statemachine.sequence import Sequence, SequenceError, Trigger
 from statemachine.step import (
     Event,
     FaultRecord,
@@ -28,18 +31,19 @@ from statemachine.step import (
     StepRecord,
     Summarised,
 )
+from statemachine.waiting import POLL_S, Waiting, waiting_on
 from statemachine.watch import Call, Clock, SignalWatch
 
 __all__ = ["Event", "FaultRecord", "RunResult", "Runner", "StepContext", "StepRecord"]
 
-POLL_S = 0.02
-"""How often the runner looks at requests and deadlines while a step works, in seconds on the wall."""
 REQUEST_POLLS = 10
 """The journal's requests are looked at every so many polls."""
 HEALTH_POLLS = 5
 """The cell's health is looked at every so many polls."""
 
-JOURNALLED = frozenset(("state", "safe_stop", "note", "fault", "confirm_needed", "confirmed", "paused", "going_on"))
+JOURNALLED = frozenset(
+    ("state", "safe_stop", "note", "fault", "confirm_needed", "confirmed", "paused", "going_on", "decided")
+)
 """The kinds of events that are written to the journal; steps have a table of their own there."""
 
 Recover = Callable[[BaseException, CancelToken, bool], None]
@@ -56,9 +60,9 @@ class Runner:
     """Runs one job. `run()` is called once; what a person or another program asks comes through `control`.
 
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
-    stopped. It must be idempotent and leave a cell that can go on, since it is called before every repetition, when
-    a step is cut short, and exactly once more at the end of every run. `recover(error, token, confirmed)` clears a
-    recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
+    stopped. It must be idempotent and leave a cell that can go on, since it is called when a step fails or is cut
+    short, before every repetition, and exactly once more at the end of every run. `recover(error, token, confirmed)`
+    clears a recoverable fault, begins nothing once `token` is cancelled, and is told whether a person has confirmed.
     `health()` is called about ten times a second while a step works, and raises what must end it whatever it does.
     """
 
@@ -73,6 +77,8 @@ class Runner:
     recover: Recover | None = None
     health: Callable[[], None] | None = None
     control: RunControl = field(default_factory=RunControl)
+    script: Script = NO_SCRIPT
+    _waiting: Waiting = field(init=False)
     _polls: int = field(default=0, init=False)
     _signals: SignalWatch = field(default_factory=SignalWatch, init=False)
     _records: dict[str, StepRecord] = field(default_factory=dict, init=False)
@@ -82,10 +88,11 @@ class Runner:
     _abandoned: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        missing = [step.value for step in STEPS if step.value not in self.steps]
+        missing = [name for name in self.sequence.steps if name not in self.steps]
         if missing:
             raise ValueError(f"no work was given for {', '.join(missing)}")
-        self._records = {step.value: StepRecord(step.value) for step in STEPS}
+        self._records = {name: StepRecord(name) for name in self.sequence.steps}
+        self._waiting = waiting_on(self.clock)
 
     def run(self, done: Mapping[str, object] | None = None) -> RunResult:
         """Do the steps that are not in `done` (results of an earlier run by step name) and return how it ended.
@@ -94,7 +101,7 @@ class Runner:
         the safe stop.
         """
         for name, result in (done or {}).items():
-            self.sequence.facts.done.add(State(name))
+            self.sequence.facts.done.add(name)
             self._results[name] = result
             self._records[name] = StepRecord(name, "resumed")
         self.sequence.on_change = self._on_change
@@ -113,13 +120,55 @@ class Runner:
         if (end := self._ask()) is not None:
             return end
         self.sequence.fire(Trigger.START)
-        while (state := self.sequence.state) in STEPS:
-            end = self._hold() or self._perform(self.policy.of(state))
-            if end is not None:
+        while (state := self.sequence.state) in self.sequence.steps:
+            end = self._hold() or self._perform(self.policy.of(state)) or self._after(state)
+            if end is None:
+                self.sequence.facts.done.add(state)
+                self.sequence.fire(Trigger.NEXT)
+            elif (end := self._again(state, end)) is not None:
+                self._note_fault(state, self._attempts(state), end, "ended the run")
                 return end
-            self.sequence.facts.done.add(state)
-            self.sequence.fire(Trigger.NEXT)
         return None
+
+    def _after(self, name: str) -> Failure | None:
+        """What the script does after a step: why that ends the run, or None."""
+        if (look := self.script.after.get(name)) is None:
+            return None
+        result = self._results[name]
+        return self._scripted(name, lambda: look(result))[0]
+
+    def _again(self, name: str, end: Failure) -> Failure | None:
+        """Ask the script about a refusal: None when the run goes on from a step of its choice, else why it ends."""
+        decide = self.script.on_refusal
+        if decide is None or end.outcome is not Outcome.REFUSED:
+            return end
+        failed, chosen = self._scripted(name, lambda: decide(name, end))
+        if failed is not None or not isinstance(chosen, Again):
+            return failed or end
+        steps = self.sequence.steps
+        allowed = steps[: steps.index(name) + 1]
+        if chosen.step not in allowed:
+            text = f"{end.reason}; the script chose to go on from {chosen.step!r}, allowed: {', '.join(allowed)}"
+            return replace(end, reason=text)
+        if (unsafe := self._stop(f"before {chosen.step} is done again", end)) is not None:
+            return unsafe
+        self._note_fault(name, self._attempts(name), end, f"again from {chosen.step}")
+        self._tell(Event("decided", name, {"reason": end.reason, "again": chosen.step, "why": chosen.why}))
+        for later in steps[steps.index(chosen.step) :]:
+            self._results.pop(later, None)
+            self._records[later] = replace(self._records[later], state="open")
+        self.sequence.facts.chosen = chosen.step
+        self.sequence.fire(Trigger.AGAIN)
+        return None
+
+    def _scripted(self, name: str, work: Callable[[], object]) -> tuple[Failure | None, object]:
+        """Let the script work between two steps: why that ended the run, or None, and what it gave."""
+        token = CancelToken(self.control.token)
+        call, end = self._watch(f"the script after {name}", work, math.inf, token, ailing=True)
+        if end is None and call.error is not None:
+            self._error = call.error
+            end = self._ask() or self._judge(call.error)
+        return end, call.result
 
     def _perform(self, step: Step) -> Failure | None:
         """Do one step, with its repetitions; None when it has succeeded."""
@@ -128,24 +177,20 @@ class Runner:
             left = step.max_retries + 1 - attempt
             error = self._error
             if left == 0 or error is None or self._abandoned or end.outcome is Outcome.ABORTED:
-                self._note_fault(step.name, attempt, end, "ended the run")
                 return end
             self.sequence.facts.retries_left = left
             self.sequence.facts.recoverable = end.recoverable
             if step.retries(error):
                 if (unsafe := self._stop(f"before {step.name} is tried again", end)) is not None:
-                    self._note_fault(step.name, attempt, unsafe, "ended the run")
                     return unsafe
                 self._note_fault(step.name, attempt, end, "tried again")
                 self.sequence.fire(Trigger.RETRY)
             elif end.recoverable and step.on_failure is OnFailure.RECOVER and self.recover is not None:
                 failed, by = self._recover(step, end, error, self.recover)
-                remedy = "ended the run" if failed else f"confirmed by {by}, recovered" if by else "recovered"
-                self._note_fault(step.name, attempt, end, remedy)
                 if failed is not None:
                     return failed
+                self._note_fault(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
             else:
-                self._note_fault(step.name, attempt, end, "ended the run")
                 return end
             if (asked := self._hold()) is not None:
                 return asked
@@ -166,8 +211,8 @@ class Runner:
                 return refused, None
         self.sequence.fire(Trigger.RECOVER)
         token = CancelToken(self.control.token)
-        call = Call("recovery", lambda: recover(error, token, by is not None))
-        failed = self._watch(call, self.clock.now() + self.policy.recovery_deadline_s, "the recovery", token)
+        deadline = self.clock.now() + self.policy.recovery_deadline_s
+        call, failed = self._watch("the recovery", lambda: recover(error, token, by is not None), deadline, token)
         if failed is None and call.error is not None:
             self._error = call.error
             failed = self._ask()
@@ -205,16 +250,21 @@ class Runner:
         """One try: None, or the end that it leads to unless it is repeated."""
         started, begun = self.clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
-        context = StepContext(step, attempt, deadline, dict(self._results), self.clock, self._tell, self.control)
+        context = StepContext(
+            step, attempt, deadline, dict(self._results), self.clock, self._tell, self.control, self._waiting.look
+        )
         key = self.journal.step_started(step.name, attempt)
         self._tell(Event("step_started", step.name, {"attempt": attempt}))
         self._error = None
-        call = Call(step.name, lambda: self.steps[step.name](context))
-        end = self._watch(call, deadline, step.name, context.token, ailing=True)
+        call, end = self._watch(step.name, lambda: self.steps[step.name](context), deadline, context.token, ailing=True)
+        context.token.cancel(f"{step.name} has ended")
         if end is None and call.error is not None:
             self._error = call.error
+            # At rest before anything is read or written: a disk may stall.
+            stopped = f"{step.name} failed"
+            trouble = self._halt(stopped)
             end = self._ask() or self._judge(call.error)
-        context.token.cancel(f"{step.name} has ended")
+            self._tell(Event("safe_stop", None, {"reason": stopped, "trouble": trouble}))
         duration = self.clock.now() - started
         before = self._records[step.name]
         wall = before.wall_s + time.monotonic() - begun
@@ -233,34 +283,47 @@ class Runner:
     # --- watching ---
 
     def _watch(
-        self, call: Call, deadline: float, what: str, token: CancelToken, ailing: bool = False
-    ) -> Failure | None:
-        """Wait for the end of `call`; on a request, a signal or the deadline end it, stop the cell and say why.
+        self, what: str, work: Callable[[], object], deadline: float, token: CancelToken, ailing: bool = False
+    ) -> tuple[Call, Failure | None]:
+        """Have `work` done; on a request, a signal or the deadline end it, stop the cell and say why.
 
         With `ailing` the cell's health is looked at as well. Time for which the run is held does not count.
         """
         cause: Failure | None = None
+        trouble: str | None = None
         held = self.control.held_s
-        while cause is None:
-            if self.clock.wait(call.done, POLL_S * self.clock.rate):
+
+        def cut() -> str | None:
+            nonlocal cause, trouble
+            cause = self._cause(what, deadline, held, ailing)
+            if cause is None:
                 return None
-            try:
-                cause = self._ask()
-            except JournalError as error:
-                self._error = error
-                cause = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
-            if cause is None and ailing:
-                cause = self._ail()
-            if cause is None and self.clock.now() > deadline + (self.control.held_s - held) * self.clock.rate:
-                self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
-                cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
-        token.cancel(cause.reason)
-        trouble = self._halt(cause.reason)
-        if not self.clock.wait(call.done, self.policy.grace_s * self.clock.rate):
+            token.cancel(cause.reason)
+            trouble = self._halt(cause.reason)
+            return cause.reason
+
+        call = self._waiting.do(what, work, cut, self.policy.grace_s)
+        if cause is None:
+            return call, None
+        if not call.done.is_set():
             self._abandoned = True
             text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
             cause = replace(cause, reason=text)
         self._tell(Event("safe_stop", None, {"reason": cause.reason, "trouble": trouble}))
+        return call, cause
+
+    def _cause(self, what: str, deadline: float, held: float, ailing: bool) -> Failure | None:
+        """What is to end the work `what` now, if anything."""
+        try:
+            cause = self._ask()
+        except JournalError as error:
+            self._error = error
+            return Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.journal")
+        if cause is None and ailing:
+            cause = self._ail()
+        if cause is None and self.clock.now() > deadline + (self.control.held_s - held) * self.clock.rate:
+            self._error = StepOverrun(f"{what} did not end within its deadline and was stopped")
+            cause = Failure(Outcome.FAULTED, str(self._error), "step.deadline")
         return cause
 
     def _ask(self) -> Failure | None:
@@ -290,7 +353,7 @@ class Runner:
         """Stay paused for as long as it is asked for."""
         end = self._ask()
         if end is None and self.control.paused():
-            step = self.sequence.state.value
+            step = self.sequence.state
             self.sequence.fire(Trigger.PAUSE)
             self._tell(Event("paused", step, {"text": f"held before {step}"}))
             while end is None and self.control.paused():
@@ -301,15 +364,18 @@ class Runner:
         return end
 
     def _pause_briefly(self) -> Failure | None:
-        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any."""
-        self.clock.wait(self.control.token.event, POLL_S * self.clock.rate)
+        """Wait for one poll, or less if the run is to end; the end that somebody asked for, if any.
+
+        On the wall's time: it is for a person, and the cell stands.
+        """
+        self.control.token.event.wait(POLL_S)
         return self._ask()
 
     def _judge(self, error: BaseException) -> Failure:
         if isinstance(error, KeyboardInterrupt | SystemExit):
             return Failure(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
         text = "".join(traceback.format_exception(error))
-        self.journal.event("traceback", self.sequence.state.value, {"text": text})
+        self.journal.event("traceback", str(self.sequence.state), {"text": text})
         try:
             return self.classify(error)
         except Exception as second:
@@ -319,10 +385,14 @@ class Runner:
     # --- the end ---
 
     def _halt(self, reason: str) -> str | None:
-        """Call `safe_stop` in a thread that no signal reaches; what went wrong with it, or None."""
-        call = Call("safe stop", lambda: self.safe_stop(reason))
-        if not self.clock.wait(call.done, self.policy.stop_deadline_s * self.clock.rate):
-            return f"it did not end within {self.policy.stop_deadline_s:g} s"
+        """Call `safe_stop` where no signal reaches it; what went wrong with it, or None."""
+        until = self.clock.now() + self.policy.stop_deadline_s * self.clock.rate
+        late = f"it did not end within {self.policy.stop_deadline_s:g} s"
+        call = self._waiting.do(
+            "safe stop", lambda: self.safe_stop(reason), lambda: late if self.clock.now() > until else None, 0.0
+        )
+        if not call.done.is_set():
+            return late
         return None if call.error is None else f"{type(call.error).__name__}: {call.error}"
 
     def _stop(self, reason: str, end: Failure) -> Failure | None:
@@ -334,7 +404,7 @@ class Runner:
         return Failure(Outcome.FAULTED, f"{end.reason}; the safe stop after it failed: {trouble}", "safe_stop")
 
     def _finish(self, end: Failure | None) -> RunResult:
-        outcome = Outcome.PLACED if end is None else end.outcome
+        outcome = Outcome(self.sequence.success.value) if end is None else end.outcome
         reason = f"end of the run ({outcome.value})"
         # Whoever still works in an abandoned thread begins nothing any more.
         self.control.token.cancel("the run has ended")
@@ -356,7 +426,7 @@ class Runner:
             end = Failure(outcome, f"{said}; the end could not be recorded: {error}", "run.internal")
             said = end.reason
         self._tell(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
-        records = tuple(self._records[step.value] for step in STEPS)
+        records = tuple(self._records[name] for name in self.sequence.steps)
         code = "" if end is None else end.code
         return RunResult(
             outcome, said, code, records, dict(self._results), self._error, self.control.signal, tuple(self._faults)
@@ -370,8 +440,11 @@ class Runner:
             return
         self._tell(Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy}))
 
-    def _on_change(self, trigger: Trigger, source: State, target: State) -> None:
-        self._tell(Event("state", None, {"trigger": trigger.value, "from": source.value, "to": target.value}))
+    def _attempts(self, name: str) -> int:
+        return self._records[name].retries + 1
+
+    def _on_change(self, trigger: Trigger, source: str, target: str) -> None:
+        self._tell(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))
 
     def _tell(self, event: Event) -> None:
         """Write to the journal what is not in its steps table, and tell the observer; from any thread."""

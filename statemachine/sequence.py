@@ -1,49 +1,31 @@
-"""The sequence of the job as data: states, triggers, transitions and the guards on them.
+"""The sequence of a job as data: its steps, the states around them, triggers, transitions and the guards on them.
 
-`Sequence` walks through that table with the `transitions` library. Its callbacks only guard and log; no work is done
-here, and nothing is known of what a step does. `fault` and `abort` lead out of every state.
+Which steps there are, and in which order, a job chooses. `Sequence` walks through the table that follows from them
+with the `transitions` library. Its callbacks only guard and log; no work is done here, and nothing is known of what a
+step does. `fault` and `abort` lead out of every state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, StrEnum
 from functools import partial
 
 from transitions import Machine, MachineError
 
 
-class State(Enum):
-    """Where the job stands."""
+class State(StrEnum):
+    """Where a job stands when it is in none of its steps; in a step, its state is the step's name."""
 
     IDLE = "idle"
-    DRIVE_TO_TARGET = "drive_to_target"
-    BOARD_PHOTO = "board_photo"
-    LASER_SWEEP = "laser_sweep"
-    RECONSTRUCT = "reconstruct"
-    INVERT_POSE = "invert_pose"
-    PLACE = "place"
     PLACED = "placed"
+    DONE = "done"
     PAUSED = "paused"
     FAULTED = "faulted"
     RECOVERING = "recovering"
     ABORTED = "aborted"
     REFUSED = "refused"
-
-
-STEPS: tuple[State, ...] = (
-    State.DRIVE_TO_TARGET,
-    State.BOARD_PHOTO,
-    State.LASER_SWEEP,
-    State.RECONSTRUCT,
-    State.INVERT_POSE,
-    State.PLACE,
-)
-"""The working states, in their order."""
-
-ENDS: tuple[State, ...] = (State.PLACED, State.REFUSED, State.FAULTED, State.ABORTED)
-"""The states in which a run can end."""
 
 
 class Trigger(Enum):
@@ -52,6 +34,7 @@ class Trigger(Enum):
     START = "start"
     NEXT = "next"
     RETRY = "retry"
+    AGAIN = "again"
     PAUSE = "pause"
     RESUME = "resume"
     REFUSE = "refuse"
@@ -71,6 +54,7 @@ class Guard(Enum):
     RETRIES_LEFT = "retries left"
     RECOVERABLE = "recoverable"
     INTERRUPTED = "interrupted step"
+    CHOSEN = "chosen step"
 
 
 @dataclass(frozen=True)
@@ -78,31 +62,37 @@ class Transition:
     """`trigger` takes the job from `source` to `target` if `guard` holds."""
 
     trigger: Trigger
-    source: State
-    target: State
+    source: str
+    target: str
     guard: Guard = Guard.ALWAYS
 
 
-def _table() -> tuple[Transition, ...]:
-    rows = [Transition(Trigger.START, State.IDLE, step, Guard.FIRST_OPEN) for step in STEPS]
+def table(steps: tuple[str, ...], success: State) -> tuple[Transition, ...]:
+    """Every transition of a job with these steps, which ends in `success` when all are done."""
+    around = [state for state in State if state is success or state not in (State.PLACED, State.DONE)]
+    states = [*around, *steps]
+    rows = [Transition(Trigger.START, State.IDLE, step, Guard.FIRST_OPEN) for step in steps]
     rows += [
         Transition(Trigger.NEXT, step, after, Guard.DONE)
-        for step, after in zip(STEPS, (*STEPS[1:], State.PLACED), strict=True)
+        for step, after in zip(steps, (*steps[1:], success), strict=True)
     ]
-    rows += [Transition(Trigger.RETRY, step, step, Guard.RETRIES_LEFT) for step in STEPS]
-    rows += [Transition(Trigger.PAUSE, step, State.PAUSED) for step in STEPS]
-    rows += [Transition(Trigger.RESUME, State.PAUSED, step, Guard.INTERRUPTED) for step in STEPS]
-    rows += [Transition(Trigger.REFUSE, step, State.REFUSED) for step in (State.IDLE, *STEPS)]
+    rows += [Transition(Trigger.RETRY, step, step, Guard.RETRIES_LEFT) for step in steps]
+    rows += [
+        Transition(Trigger.AGAIN, step, earlier, Guard.CHOSEN)
+        for k, step in enumerate(steps)
+        for earlier in steps[: k + 1]
+    ]
+    rows += [Transition(Trigger.PAUSE, step, State.PAUSED) for step in steps]
+    rows += [Transition(Trigger.RESUME, State.PAUSED, step, Guard.INTERRUPTED) for step in steps]
+    rows += [Transition(Trigger.REFUSE, step, State.REFUSED) for step in (State.IDLE, *steps)]
     rows += [Transition(Trigger.RECOVER, State.FAULTED, State.RECOVERING, Guard.RECOVERABLE)]
-    rows += [Transition(Trigger.RECOVERED, State.RECOVERING, step, Guard.INTERRUPTED) for step in STEPS]
-    rows += [Transition(Trigger.FAULT, state, State.FAULTED) for state in State]
-    rows += [Transition(Trigger.ABORT, state, State.ABORTED) for state in State]
-    rows += [Transition(Trigger.RESET, end, State.IDLE) for end in ENDS]
+    rows += [Transition(Trigger.RECOVERED, State.RECOVERING, step, Guard.INTERRUPTED) for step in steps]
+    rows += [Transition(Trigger.FAULT, state, State.FAULTED) for state in states]
+    rows += [Transition(Trigger.ABORT, state, State.ABORTED) for state in states]
+    rows += [
+        Transition(Trigger.RESET, end, State.IDLE) for end in (success, State.REFUSED, State.FAULTED, State.ABORTED)
+    ]
     return tuple(rows)
-
-
-TRANSITIONS: tuple[Transition, ...] = _table()
-"""Every transition there is."""
 
 
 class SequenceError(RuntimeError):
@@ -113,83 +103,100 @@ class SequenceError(RuntimeError):
 class Facts:
     """What the guards look at; whoever drives the sequence keeps it up to date."""
 
-    done: set[State] = field(default_factory=set)
-    interrupted: State | None = None
+    done: set[str] = field(default_factory=set)
+    interrupted: str | None = None
+    chosen: str | None = None
     retries_left: int = 0
     recoverable: bool = False
 
 
-ChangeHook = Callable[[Trigger, State, State], None]
+ChangeHook = Callable[[Trigger, str, str], None]
 
 
 class _Model:
     """What `transitions` moves: it sets `state` and adds the method `trigger`."""
 
-    state: State
+    state: str
     trigger: Callable[[str], bool]
 
 
 class Sequence:
-    """The state of one job. `on_change(trigger, source, target)` is called after every change, to log it.
+    """The state of one job with these `steps`. `on_change(trigger, source, target)` is called after every change.
 
-    Not thread-safe: one thread fires the triggers. Reading `state` is safe anywhere.
+    `success` is the state in which it ends when all are done. Not thread-safe: one thread fires the triggers. Reading
+    `state` is safe anywhere. Raises ValueError when two steps have one name, or one that of a state.
     """
 
-    def __init__(self, on_change: ChangeHook | None = None) -> None:
+    def __init__(
+        self, steps: tuple[str, ...], success: State = State.PLACED, on_change: ChangeHook | None = None
+    ) -> None:
+        if not steps or len(set(steps)) < len(steps) or set(steps) & set(State):
+            raise ValueError(f"steps need names of their own, other than {', '.join(State)}; given: {list(steps)}")
+        self.steps = steps
+        self.success = success
         self.facts = Facts()
         self.on_change = on_change
+        self.table = table(steps, success)
         self._model = _Model()
         # Not queued: a queued trigger returns True even when its guard held it back.
         self._machine = Machine(
-            model=self._model, states=State, initial=State.IDLE, auto_transitions=False, queued=False, send_event=False
+            model=self._model,
+            states=list(dict.fromkeys(str(row.source) for row in self.table)),
+            initial=State.IDLE.value,
+            auto_transitions=False,
+            queued=False,
+            send_event=False,
         )
-        for row in TRANSITIONS:
+        for row in self.table:
             self._machine.add_transition(
-                row.trigger.value, row.source, row.target, conditions=partial(self._holds, row)
+                row.trigger.value, str(row.source), str(row.target), conditions=partial(self._holds, row)
             )
 
     @property
-    def state(self) -> State:
-        """The present state."""
+    def state(self) -> str:
+        """The present state: a step's name, or a `State`."""
         return self._model.state
 
-    def fire(self, trigger: Trigger) -> State:
+    def fire(self, trigger: Trigger) -> str:
         """Take the transition that `trigger` names and return the new state; `SequenceError` if there is none."""
         source = self.state
-        if source in STEPS and trigger in (Trigger.PAUSE, Trigger.FAULT):
+        if source in self.steps and trigger in (Trigger.PAUSE, Trigger.FAULT):
             self.facts.interrupted = source
         try:
             moved = self._model.trigger(trigger.value)
         except MachineError as error:
-            raise SequenceError(f"'{trigger.value}' leads nowhere from state '{source.value}'") from error
+            raise SequenceError(f"'{trigger.value}' leads nowhere from state '{source}'") from error
         if not moved:
-            guards = {row.guard.value for row in TRANSITIONS if (row.trigger, row.source) == (trigger, source)}
-            raise SequenceError(f"'{trigger.value}' is held back in state '{source.value}': not {', '.join(guards)}")
+            guards = {row.guard.value for row in self.table if (row.trigger, row.source) == (trigger, source)}
+            raise SequenceError(f"'{trigger.value}' is held back in state '{source}': not {', '.join(guards)}")
         if trigger is Trigger.RESET:
             self.facts = Facts()
+        if trigger is Trigger.AGAIN:
+            self.facts.done -= set(self.steps[self.steps.index(self.state) :])
+            self.facts.chosen = None
         if self.on_change is not None:
             self.on_change(trigger, source, self.state)
         return self.state
 
     def allowed(self) -> tuple[Transition, ...]:
         """The transitions that could be taken now."""
-        return tuple(row for row in TRANSITIONS if row.source is self.state and self._holds(row))
+        return tuple(row for row in self.table if row.source == self.state and self._holds(row))
 
     def rows(self) -> tuple[Transition, ...]:
         """The transitions as the machine itself holds them, for the diagram."""
-        guards = {(row.trigger, row.source, row.target): row.guard for row in TRANSITIONS}
+        guards = {(row.trigger, str(row.source), str(row.target)): row.guard for row in self.table}
         found = []
         for trigger in Trigger:
             for way in self._machine.get_transitions(trigger.value):
-                key = (trigger, State[str(way.source)], State[str(way.dest)])
-                found.append(Transition(*key, guards[key]))
+                source, target = str(way.source), str(way.dest)
+                found.append(Transition(trigger, source, target, guards[trigger, source, target]))
         return tuple(found)
 
     def _holds(self, row: Transition) -> bool:
         facts = self.facts
         match row.guard:
             case Guard.FIRST_OPEN:
-                return row.target is next((step for step in STEPS if step not in facts.done), None)
+                return row.target == next((step for step in self.steps if step not in facts.done), None)
             case Guard.DONE:
                 return row.source in facts.done
             case Guard.RETRIES_LEFT:
@@ -197,5 +204,7 @@ class Sequence:
             case Guard.RECOVERABLE:
                 return facts.recoverable and facts.interrupted is not None and facts.retries_left > 0
             case Guard.INTERRUPTED:
-                return row.target is facts.interrupted
+                return row.target == facts.interrupted
+            case Guard.CHOSEN:
+                return row.target == facts.chosen
         return True

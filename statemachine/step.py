@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.policy import Outcome, Step
 from statemachine.watch import Clock
+
+Made = TypeVar("Made")
 
 
 class StepOverrun(RuntimeError):
@@ -30,7 +32,7 @@ class Event:
     """What an observer is told, with the time in seconds since the epoch.
 
     `kind` is state, step_started, step_done, step_failed, progress, safe_stop, note, fault, confirm_needed, confirmed,
-    paused, going_on or run_ended.
+    decided, paused, going_on or run_ended.
     """
 
     kind: str
@@ -46,7 +48,8 @@ class StepContext:
     """What a step is given: earlier results, its deadline, its end, and ways to report.
 
     `results` maps the earlier steps' names to what they returned. `deadline` is in seconds of the cell's clock.
-    `token` ends this attempt: with the run, or by itself when the attempt is cut short.
+    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `look` is how work that is held
+    sees what is asked of the run, where nobody else looks for it.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class StepContext:
         clock: Clock,
         tell: Observer,
         control: RunControl | None = None,
+        look: Callable[[], None] = lambda: None,
     ) -> None:
         self.step = step
         self.attempt = attempt
@@ -66,7 +70,15 @@ class StepContext:
         self._clock = clock
         self._tell = tell
         self._control = control or RunControl()
+        self._look = look
         self.token = CancelToken(self._control.token)
+
+    def made(self, kind: type[Made]) -> Made:
+        """The newest result of the earlier steps that is of this type; LookupError when none of them made one."""
+        for result in reversed(list(self.results.values())):
+            if isinstance(result, kind):
+                return result
+        raise LookupError(f"{self.step.name} needs a {kind.__name__}, which none of {', '.join(self.results)} made")
 
     def remaining(self) -> float:
         """Seconds of the cell's clock until the deadline, at least 0."""
@@ -83,7 +95,7 @@ class StepContext:
             kind = "paused" if held else "going_on"
             self._tell(Event(kind, self.step.name, {"text": "held before its next motion" if held else "goes on"}))
 
-        self._control.safe_point(self.token, say)
+        self._control.safe_point(self.token, say, self._look)
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""

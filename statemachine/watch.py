@@ -1,8 +1,4 @@
-"""Small pieces that keep a run in hand: a call in its own thread, and signals that are noted instead of raised.
-
-A step runs in a thread of its own so that the thread that watches it can always act: on a deadline, a request to
-abort, or Ctrl-C, even while the step sits in a long computation.
-"""
+"""Small pieces that keep a run in hand: work whose end can be awaited, and signals that are noted, not raised."""
 
 from __future__ import annotations
 
@@ -26,23 +22,29 @@ class Clock(Protocol):
 
 
 class Call:
-    """`work()` in its own daemon thread; `done` is set when it has ended, with `result` or `error`."""
+    """A piece of work and what became of it: `done` is set when it has ended, with `result` or `error`."""
 
-    def __init__(self, name: str, work: Callable[[], object]) -> None:
+    def __init__(self) -> None:
         self.done = threading.Event()
         self.result: object = None
         self.error: BaseException | None = None
-        self._work = work
-        threading.Thread(target=self._run, name=name, daemon=True).start()
 
-    def _run(self) -> None:
+    def perform(self, work: Callable[[], object]) -> None:
+        """Do it in this thread."""
         try:
-            self.result = self._work()
-        # Everything is handed to the thread that watches, which decides what it means.
+            self.result = work()
+        # Everything is handed to whoever watches, who decides what it means.
         except BaseException as error:
             self.error = error
         finally:
             self.done.set()
+
+
+def begin(name: str, work: Callable[[], object]) -> Call:
+    """Begin `work()` in a daemon thread of its own."""
+    call = Call()
+    threading.Thread(target=call.perform, args=(work,), name=name, daemon=True).start()
+    return call
 
 
 class SignalInterrupt(BaseException):

@@ -11,13 +11,15 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cell.config import CellConfig, load_config
+from cell.devices.direct import VirtualCell
+from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
 from cell.report.truth import Witness
@@ -25,16 +27,15 @@ from cell.run.folder import new_run
 from cell.run.frames import FrameStore
 from cell.run.job_run import classify
 from cell.run.resumption import job_source
-from cell.run.work import JobWork
+from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import CellError
-from sim_backends.peers.truth import TruthPeer
-from statemachine.policy import Failure, Outcome, Policy
+from statemachine.policy import Failure, Outcome
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
-from statemachine.sequence import STEPS, State
 
 CONFIG = load_config(None)
-NAMES = [step.value for step in STEPS]
+NAMES = list(PLACE.names)
 LOST = FaultRecord(
     1_790_000_000.0, "laser_sweep", 1, "camera.frames_lost", "scan_camera: 61 frames were lost", "tried again"
 )
@@ -61,26 +62,26 @@ class Ended:
 
 
 def work_of(
-    cell: LockstepCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
-) -> JobWork:
-    """The steps of a job on a cell whose vehicle stands at its start."""
+    cell: VirtualCell, job: Job, nominal: NominalSurface, record: JobRecord, frames: FrameStore, folder: Path
+) -> Workplace:
+    """The workplace of a job on a cell whose vehicle stands at its start."""
     assert record.calibration is not None
     whereabouts = Whereabouts(cell.devices.vehicle)
     whereabouts.say_at_start()
-    return JobWork(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
+    return Workplace(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
 
 
 def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root: Path) -> Ended:
     """A run on a cell just started that did the steps before `step` as in `record` and then this one, by itself."""
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
-        context = StepContext(Policy().of(State(step)), 1, math.inf, before, cell.clock, lambda event: None)
+        context = StepContext(PLACE.policy().of(step), 1, math.inf, before, cell.clock, lambda event: None)
         try:
-            made = work.steps()[step](context)
+            made = PLACE.work(work)[step](context)
         except CellError as error:
             failed, failure = error, classify(error)
         else:
@@ -114,21 +115,15 @@ def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (
     assert record.calibration is not None and record.at_end is not None
     folder = new_run(root)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
     if not simulated:
         return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
     at_end = record.at_end
-    peer = TruthPeer(lambda: at_end, lambda name: None, lambda: None)
-    peer.start()
-    try:
-        config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": peer.address})})
-        witness = Witness(peer.address)
-        witness.at_sweep = record.at_sweep
-        return reported(folder, config, job, nominal, work, result, frames, witness)
-    finally:
-        peer.stop()
+    witness = Witness(lambda: at_end)
+    witness.at_sweep = record.at_sweep
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
 
 
 def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tuple[FaultRecord, ...] = ()) -> Ended:
@@ -136,7 +131,7 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
     job, nominal = pot()
     assert record.calibration is not None
     folder = new_run(root)
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         frames.keep("stripe", record.results["laser_sweep"].middle)
@@ -158,7 +153,7 @@ def reported(
     config: CellConfig,
     job: Job,
     nominal: NominalSurface,
-    work: JobWork,
+    work: Workplace,
     result: RunResult,
     frames: FrameStore,
     witness: Witness | None,
@@ -172,14 +167,16 @@ def reported(
         "part": work.part.state.value,
         "cell": config.cell.name,
         "job": job.job.name,
+        "job_kind": job.job.kind,
         "simulated": simulated,
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
+        "clock": "wall",
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),
-        "calibration_hash": work._calibration.hash(),
-        "calibration_date": work._calibration.date,
+        "calibration_hash": work.calibration.hash(),
+        "calibration_date": work.calibration.date,
     }
     started = time.time() - 31.0
     report = make_report(
@@ -265,11 +262,11 @@ def crippled(record: JobRecord, root: Path) -> Ended:
     assert record.calibration is not None
     folder = new_run(root)
     (folder / "picture.png").mkdir()
-    cell = LockstepCell(CONFIG, record.seed, record.level)
+    cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
         (folder / "frames").rmdir()
         frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
-    config = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"truth": "127.0.0.1:1"})})
-    return reported(folder, config, job, nominal, work, result, frames, Witness("127.0.0.1:1"))
+    witness = Witness(partial(ask_truth, "127.0.0.1:1"))
+    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)

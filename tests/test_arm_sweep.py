@@ -1,4 +1,4 @@
-"""A sweep by the arm alone, on the devices in lock step: its place is known as well as the arm's times are."""
+"""A sweep by the arm alone, on the devices in this process: its place is known as well as the arm's times are."""
 
 from __future__ import annotations
 
@@ -10,35 +10,32 @@ import pinocchio as pin
 import pytest
 from test_rail_sweep import CONFIG, ERRORS, GEOMETRY, SCAN
 
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts, from_ur
-from cell.lab.bench.lockstep import LockstepCell
-from cell.lab.bench.lockstep_arm import LockstepArm
-from cell.lab.bench.lockstep_camera import LockstepCamera
 from cell.steps.arm_sweep import LATENCY_S, arm_sweep
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import HOME, Mover
 from cell.steps.swath import Collector, Swath
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
+from sim_backends.direct.arm import DirectArm
 
 LENGTH = 0.02
 
 
-def nothing(arm: LockstepArm) -> None:
+def nothing(arm: DirectArm) -> None:
     """Nobody meddles."""
 
 
-def sweep(late: float = 0.0, meddle: Callable[[LockstepArm], None] = nothing) -> tuple[Swath, float]:
+def sweep(late: float = 0.0, meddle: Callable[[DirectArm], None] = nothing) -> tuple[Swath, float]:
     """Sweep 20 mm at 20 mm/s, each state of the arm `late` s late; and how far off the lines truly lie, m.
 
     `meddle` is called with each of ten frames from the middle.
     """
-    cell = LockstepCell(CONFIG, seed=4, level="ideal")
-    devices, arm, camera = cell.devices, cell.devices.arm, cell.devices.scan_camera
-    assert isinstance(arm, LockstepArm)
-    assert isinstance(camera, LockstepCamera)
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    devices, arm, camera = cell.devices, cell.arm, cell.scan_camera
     devices.rail.home().wait(60.0)
-    mover = Mover(arm, cell.clock, CONFIG, None)
+    mover = Mover(devices.arm, cell.clock, CONFIG, None)
     mover.to_joints(HOME)
     start: pin.SE3 = from_ur(arm.state().flange)
     end = from_parts(np.array([0.0, LENGTH, 0.0])) * start
@@ -64,7 +61,7 @@ def test_a_sweep_that_nothing_disturbed_lies_where_it_says() -> None:
 
 
 def test_an_arm_that_is_pushed_again_and_again_is_a_fault() -> None:
-    def push(arm: LockstepArm) -> None:
+    def push(arm: DirectArm) -> None:
         arm.model.drive.q[0] += 0.001
 
     with pytest.raises(DeviceFault, match="did not move evenly") as caught:

@@ -78,7 +78,7 @@ def test_the_shipped_configuration_is_valid() -> None:
         ({"rail__travel": ["100 mm", "0 mm"]}, ["rail", "the first must be smaller"]),
         ({"rail__microsteps": 3}, ["rail.microsteps"]),
         ({"arm__max_joint_speed": "0 deg/s"}, ["arm.max_joint_speed", "1 to 120 deg/s"]),
-        ({"claw__output": 0}, ["laser.output and claw.output are both 0"]),
+        ({"claw__output": 0}, ["laser.output and claw.output are both", "arm output 0"]),
         ({"calibration__fine__board": "marked_dots:11"}, ["calibration.fine.board"]),
         ({"vehicle__driver": "tank"}, ["vehicle.driver", '"tank"', '"agilex"']),
     ],

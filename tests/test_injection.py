@@ -5,20 +5,23 @@ from __future__ import annotations
 import pytest
 
 from cell.devices.injection import Injection
+from cell.steps.kinds import PLACE
 from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 
 
 def test_a_scheduled_fault_is_written_as_fault_step_and_share() -> None:
-    assert Injection.parse("arm.protective_stop@laser_sweep:40%") == Injection(
+    assert Injection.parse("arm.protective_stop@laser_sweep:40%", PLACE.names) == Injection(
         "arm.protective_stop", "laser_sweep", 0.4
     )
-    assert Injection.parse("can.bus_off@drive_to_target") == Injection("can.bus_off", "drive_to_target", 0.0)
+    assert Injection.parse("can.bus_off@drive_to_target", PLACE.names) == Injection(
+        "can.bus_off", "drive_to_target", 0.0
+    )
 
 
 def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
     for name in FAULT_NAMES:
-        assert str(Injection.parse(f"{name}@place:12.5%")) == f"{name}@place:12.5%"
+        assert str(Injection.parse(f"{name}@place:12.5%", PLACE.names)) == f"{name}@place:12.5%"
 
 
 @pytest.mark.parametrize(
@@ -33,4 +36,4 @@ def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
 )
 def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        Injection.parse(text)
+        Injection.parse(text, PLACE.names)

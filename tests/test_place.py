@@ -10,25 +10,26 @@ import pinocchio as pin
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_matrix, from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import load_job
-from cell.lab.bench.lockstep import LockstepCell
-from cell.lab.bench.lockstep_arm import LockstepArm
 from cell.lab.bench.whole_job import NoFrames
 from cell.run.resumption import UnfinishedRun
-from cell.run.work import JobWork
+from cell.steps import drive_to_target
+from cell.steps.kinds import PLACE
 from cell.steps.moves import HOME, Mover
-from cell.steps.place import PartProgress, PartState, PlaceResult, place
+from cell.steps.part import PartProgress, PartState
+from cell.steps.place import PlaceResult, place
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from cell.vision import parse_board
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from sim_backends.world.nominal import inverse
 from statemachine.journal import Journal
-from statemachine.policy import OnFailure, Policy
+from statemachine.policy import OnFailure
 from statemachine.runner import StepContext
-from statemachine.sequence import State
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -39,12 +40,14 @@ class Site:
     """A simulated cell at its target with the part in the claw, the arm folded, and the true place of the surface."""
 
     def __init__(self) -> None:
-        self.cell = LockstepCell(CONFIG, seed=1, level="ideal")
+        self.cell = VirtualCell(CONFIG, seed=1, level="ideal")
         world = self.cell.world
         target = JOB.approach.target.se3()
         world.vehicle._x, world.vehicle._y = target.translation[:2]
         self.cell.clock.sleep(0.1)
-        self.arm = cast(LockstepArm, self.cell.devices.arm)
+        self.cell.devices.vehicle.brake()
+        self.cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+        self.arm = self.cell.devices.arm
         self.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
         world_from_base = world.world_from_base(self.cell.clock.now())
         self.base_from_surface = from_matrix(inverse(world_from_base) @ world.scene.world_from_surface)
@@ -146,7 +149,7 @@ def test_a_part_that_meets_nothing_is_not_released() -> None:
 
 def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
     site = Site()
-    site.cell.devices.claw.release()
+    site.cell.devices.claw.bare.release()
     site.heights.clear()
     with pytest.raises(RefusedError, match="does not hold the part any more before the descent"):
         site.place()
@@ -156,8 +159,8 @@ def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
 
 def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
     site = Site()
-    site.cell.devices.claw.release()
-    work = JobWork(
+    site.cell.devices.claw.bare.release()
+    here = Workplace(
         CONFIG,
         JOB,
         NOMINAL,
@@ -168,9 +171,9 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
         Whereabouts(site.cell.devices.vehicle),
     )
     before = site.arm.state().joints
-    context = StepContext(Policy().of(State.DRIVE_TO_TARGET), 1, 1e9, {}, site.cell.clock, lambda event: None)
+    context = StepContext(drive_to_target.STEP.policy, 1, 1e9, {}, site.cell.clock, lambda event: None)
     with pytest.raises(RefusedError, match="the claw holds no part"):
-        work.drive_to_target(context)
+        drive_to_target.STEP.work(here, context)
     assert np.array_equal(site.arm.state().joints, before)
 
 
@@ -197,7 +200,7 @@ def test_a_release_that_is_not_confirmed_leaves_the_part_unknown() -> None:
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
-    step = Policy().of(State.PLACE)
+    step = PLACE.policy().of("place")
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
 

@@ -1,4 +1,4 @@
-"""A sweep that something disturbed is a fault that names it, on the devices in lock step: nothing of it is used."""
+"""A sweep that something disturbed is a fault that names it, on the devices without wires: nothing of it is used."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ import pytest
 
 from cell.calibration.store import nominal_camera
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_ur
 from cell.job import load_job
-from cell.lab.bench.lockstep import LockstepCell
-from cell.lab.bench.lockstep_arm import LockstepArm
-from cell.lab.bench.lockstep_camera import LockstepCamera
-from cell.lab.bench.lockstep_rail import LockstepRail
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import HOME, Mover
@@ -36,23 +33,22 @@ GEOMETRY = ScanGeometry(
     CONFIG.scan_camera.flange_from_camera.se3(),
 )
 ERRORS = SweepErrors(np.zeros((6, 6)), 5e-6, 0.15e-3)
-Meddle = Callable[[LockstepCell], None]
+Meddle = Callable[[VirtualCell], None]
 
 
-def nothing(cell: LockstepCell) -> None:
+def nothing(cell: VirtualCell) -> None:
     """Nobody meddles."""
 
 
 def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> Swath:
     """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
-    cell = LockstepCell(CONFIG, seed=4, level="ideal")
-    devices, rail = cell.devices, cell.devices.rail
-    assert isinstance(rail, LockstepRail)
-    rail.home().wait(60.0)
-    rail.late = late
-    camera = devices.scan_camera
-    assert isinstance(camera, LockstepCamera)
-    camera.late = camera_late
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    devices = cell.devices
+    devices.vehicle.brake()
+    devices.interlocks.work_with(CONFIG.calibration_hash())
+    devices.rail.home().wait(60.0)
+    cell.rail.late = late
+    cell.scan_camera.late = camera_late
     mover = Mover(devices.arm, cell.clock, CONFIG, None)
     mover.to_joints(HOME)
     pose: pin.SE3 = from_ur(devices.arm.state().flange)
@@ -74,23 +70,19 @@ def refused(code: str, meddle: Meddle = nothing, late: float = 0.0, camera_late:
     return str(caught.value)
 
 
-def push_the_arm(cell: LockstepCell) -> None:
-    arm = cell.devices.arm
-    assert isinstance(arm, LockstepArm)
-    arm.model.drive.q[0] += 0.0005
+def push_the_arm(cell: VirtualCell) -> None:
+    cell.arm.model.drive.q[0] += 0.0005
 
 
-def drive_the_rail_slower(cell: LockstepCell) -> None:
+def drive_the_rail_slower(cell: VirtualCell) -> None:
     model, now = cell.world.rail, cell.clock.now()
     slower = dataclasses.replace(model.settings, max_velocity=round(0.9 * model.settings.max_velocity))
     model.configure(now, slower)
 
 
 def lose(count: int) -> Meddle:
-    def meddle(cell: LockstepCell) -> None:
-        camera = cell.devices.scan_camera
-        assert isinstance(camera, LockstepCamera)
-        camera.model.fault("camera.frame_loss", count)
+    def meddle(cell: VirtualCell) -> None:
+        cell.scan_camera.model.fault("camera.frame_loss", count)
 
     return meddle
 

@@ -12,9 +12,9 @@ import pytest
 
 from cell.calibration.collect.boards import collect_scan, look_for
 from cell.config import load_config
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
 from cell.job import load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
 from cell.steps.moves import HOME, Mover
@@ -30,7 +30,7 @@ def well(devices: Devices) -> None:
     """Nothing of this bench's health ends the work."""
 
 
-def recorded(root: Path, cell: LockstepCell, work: Any) -> tuple[dict[str, Any], Path]:
+def recorded(root: Path, cell: VirtualCell, work: Any) -> tuple[dict[str, Any], Path]:
     """The report of a calibration that is refused, and its folder."""
     run: Run[None] = Run(
         "calibration", lambda run: RecordedWork(run, "calibration", cell.devices, root, {}, well).perform(work)
@@ -44,9 +44,10 @@ def recorded(root: Path, cell: LockstepCell, work: Any) -> tuple[dict[str, Any],
 def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(tmp_path: Path) -> None:
     """Its lamp is out: the fine board is seen at no view."""
     dark = CONFIG.model_copy(update={"scan_camera": CONFIG.scan_camera.model_copy(update={"photo_exposure": 20e-6})})
-    cell = LockstepCell(dark, seed=4, level="ideal")
+    cell = VirtualCell(dark, seed=4, level="ideal")
 
     def work(hands: Hands) -> None:
+        cell.devices.vehicle.brake()
         mover = Mover(cell.devices.arm, cell.clock, dark, load_job("pot")[0])
         collect_scan(dark, cell.devices, mover, hands.check, hands.progress, hands.keep)
 
@@ -60,7 +61,7 @@ def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(tmp
 
 
 def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
-    cell = LockstepCell(CONFIG, seed=4, level="ideal")
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
     pictures: list[np.ndarray] = []
 
     def work(hands: Hands) -> None:
@@ -68,6 +69,7 @@ def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
             pictures.append(frame.image)
             hands.keep(what, frame)
 
+        cell.devices.vehicle.brake()
         Mover(cell.devices.arm, cell.clock, CONFIG, None).to_joints(HOME)
         cell.devices.scan_camera.configure(CONFIG.scan_camera.photo_exposure, 10.0)
         assert look_for(cell.devices.scan_camera, FINE, Counter(), keep, "fine-01") is None
@@ -83,6 +85,6 @@ def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> N
     def work(hands: Hands) -> None:
         raise RefusedError("not today")
 
-    report, folder = recorded(tmp_path, LockstepCell(CONFIG, seed=4, level="ideal"), work)
+    report, folder = recorded(tmp_path, VirtualCell(CONFIG, seed=4, level="ideal"), work)
     assert not (folder / "frames").exists()
     assert "last_frames" not in report

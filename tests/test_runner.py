@@ -4,19 +4,32 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import threading
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
 
 from drivers.clock import Clock
 from statemachine.control import RunControl
-from statemachine.journal import Journal, read, request
+from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.runner import Runner
-from statemachine.sequence import STEPS, Sequence, State
+from statemachine.sequence import Sequence
 
-NAMES = [step.value for step in STEPS]
+NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]
+POLICY = Policy(
+    (
+        Step("drive_to_target", 180.0, 1, ("DeadlineError",)),
+        Step("board_photo", 60.0, 2, ("DeadlineError",)),
+        Step("laser_sweep", 120.0, 2, ("DeadlineError",)),
+        Step("reconstruct", 60.0, on_wall=True),
+        Step("invert_pose", 60.0, on_wall=True),
+        Step("place", 180.0, on_failure=OnFailure.STOP),
+    )
+)
 
 
 class Bench:
@@ -29,9 +42,9 @@ class Bench:
         self.events = []
         work = {name: self._step(name, steps.get(name)) for name in NAMES}
         self.runner = Runner(
-            sequence=Sequence(),
+            sequence=Sequence(tuple(NAMES)),
             steps=work,
-            policy=Policy(grace_s=1.0, stop_deadline_s=1.0),
+            policy=replace(POLICY, grace_s=1.0, stop_deadline_s=1.0),
             journal=Journal(folder, "r1"),
             clock=Clock(),
             classify=self.classify,
@@ -71,7 +84,7 @@ class Bench:
         assert self.log[-1].startswith("stop: end of the run"), "the last thing is always the safe stop"
         assert sum(line.startswith("stop: end of the run") for line in self.log) == 1
         assert self.record.run.outcome == result.outcome.value
-        assert self.runner.sequence.state.value == result.outcome.value
+        assert self.runner.sequence.state == result.outcome.value
         return result
 
 
@@ -152,8 +165,8 @@ def test_a_named_exception_is_retried_from_a_cell_at_rest(tmp_path):
     assert result.results["board_photo"] == "made in attempt 3"
     assert result.steps[1].retries == 2
     start = bench.log.index("board_photo")
-    again = "stop: before board_photo is tried again"
-    assert bench.log[start : start + 5] == ["board_photo", again, "board_photo", again, "board_photo"]
+    stops = ["stop: board_photo failed", "stop: before board_photo is tried again"]
+    assert bench.log[start : start + 7] == ["board_photo", *stops, "board_photo", *stops, "board_photo"]
     assert [row.state for row in bench.record.steps if row.name == "board_photo"] == ["failed", "failed", "done"]
 
 
@@ -180,8 +193,9 @@ def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path
     assert result.outcome is Outcome.PLACED
     start = bench.log.index("laser_sweep")
     again = "stop: recovered, before laser_sweep is tried again"
-    assert bench.log[start : start + 5] == [
-        "laser_sweep", "stop: fault in laser_sweep", "recover: protective stop", again, "laser_sweep",
+    assert bench.log[start : start + 6] == [
+        "laser_sweep", "stop: laser_sweep failed", "stop: fault in laser_sweep", "recover: protective stop", again,
+        "laser_sweep",
     ]  # fmt: skip
     changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
     assert changes[3:6] == [
@@ -246,7 +260,7 @@ def test_a_step_that_does_not_end_even_after_the_stop_is_left_behind_and_not_rep
     release = threading.Event()
     bench = Bench(tmp_path, laser_sweep=lambda context: release.wait(20))
     bench.policy("laser_sweep", 0.05, 3, ("StepOverrun",))
-    bench.runner.policy = Policy(bench.runner.policy.steps, grace_s=0.1)
+    bench.runner.policy = replace(bench.runner.policy, grace_s=0.1)
     result = bench.run()
     release.set()
     assert result.outcome is Outcome.FAULTED
@@ -313,6 +327,42 @@ def test_a_paused_run_can_be_aborted(tmp_path):
     assert bench.run().outcome is Outcome.ABORTED
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_end_stops_the_moving_step(tmp_path, number):
+    def work(context):
+        os.kill(os.getpid(), number)
+        assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    with outlived(number):
+        result = bench.run()
+    assert result.outcome is Outcome.ABORTED
+    assert result.signal == number
+    assert "reconstruct" not in bench.log
+
+
+@contextmanager
+def outlived(number):
+    """A signal that the runner does not take fails the test in here, and does not end pytest."""
+    before = signal.signal(number, lambda number, frame: None)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
+    def health():
+        if bench.log[-1] == "laser_sweep":
+            raise ValueError("the vehicle reports a fault")
+
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
+    bench.runner.health = health
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.REFUSED, "the vehicle reports a fault")
+    assert "reconstruct" not in bench.log
+
+
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):
     def work(context):
         os.kill(os.getpid(), signal.SIGINT)
@@ -362,6 +412,82 @@ def test_a_journal_that_fails_ends_the_run_safe(tmp_path):
     assert "reconstruct" not in bench.log
 
 
+class StallingDisk:
+    """Another connection that holds the journal's file: whoever writes waits until it lets go."""
+
+    def __init__(self, folder):
+        self._base = sqlite3.connect(folder / FILE_NAME, isolation_level=None, check_same_thread=False)
+
+    def stall(self):
+        self._base.execute("BEGIN IMMEDIATE")
+        self.since = time.monotonic()
+
+    def go_on(self):
+        if self._base.in_transaction:
+            self._base.execute("ROLLBACK")
+
+    def stall_until_stopped(self, bench):
+        """Stall now; the first stop ends it and gives how long it came after the stall's beginning in `waited`."""
+        stop = bench.runner.safe_stop
+
+        def safe_stop(reason):
+            bench.waited.append(time.monotonic() - self.since)
+            stop(reason)
+            self.go_on()
+
+        bench.waited = []
+        bench.runner.safe_stop = safe_stop
+        self.stall()
+
+
+@pytest.mark.parametrize("error", [OSError("the arm is gone"), ConnectionError("the link is lost")])
+def test_a_disk_that_stalls_does_not_hold_up_the_stop_after_a_failed_step(tmp_path, error):
+    def work(context):
+        if context.attempt == 1:
+            disk.stall_until_stopped(bench)
+            raise error
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = lambda error, token, confirmed: None
+    disk = StallingDisk(tmp_path)
+    bench.run()
+    assert bench.waited[0] < 0.5
+    assert next(row.state for row in bench.record.steps if row.name == "laser_sweep") == "failed"
+
+
+def test_a_step_that_waits_for_the_disk_is_watched_all_the_same(tmp_path):
+    def work(context):
+        disk.stall_until_stopped(bench)
+        context.note(lost_frames=2)
+        context.token.event.wait(5)
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    bench.policy("laser_sweep", 0.3)
+    disk = StallingDisk(tmp_path)
+    assert bench.run().code == "step.deadline"
+    assert bench.waited[0] < 1.0
+
+
+def test_who_asks_from_another_process_is_heard_while_the_disk_stalls(tmp_path):
+    def work(context):
+        request(tmp_path, "abort", "cell abort")
+        disk.stall_until_stopped(bench)
+        context.note(lost_frames=2)
+
+    bench = Bench(tmp_path, laser_sweep=work)
+    disk = StallingDisk(tmp_path)
+    assert bench.run().reason == "cell abort"
+    assert bench.waited[0] < 1.0
+
+
+def test_the_start_of_a_step_is_in_the_journal_before_it_acts(tmp_path):
+    seen = []
+    bench = Bench(tmp_path, laser_sweep=lambda context: seen.append(read(tmp_path).steps[-1]))
+    bench.run()
+    assert (seen[0].name, seen[0].state) == ("laser_sweep", "running")
+
+
 def test_an_observer_that_fails_does_not_end_the_job(tmp_path):
     def observe(event):
         raise OSError("the terminal is gone")
@@ -391,7 +517,7 @@ def test_a_runner_without_work_for_a_step_is_refused(tmp_path):
     bench = Bench(tmp_path)
     with pytest.raises(ValueError, match="no work was given for place"):
         Runner(
-            Sequence(), {name: print for name in NAMES if name != State.PLACE.value}, Policy(),
+            Sequence(tuple(NAMES)), {name: print for name in NAMES if name != "place"}, POLICY,
             bench.runner.journal, Clock(), bench.classify, bench.safe_stop,
         )  # fmt: skip
 
@@ -438,7 +564,7 @@ def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(t
     def observe(event):
         if event.kind == "confirm_needed":
             bench.log.append("asked")
-            request(tmp_path, "confirm", "Ann")
+            request(tmp_path, "confirm", "Ann", event.data["number"])
 
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
@@ -448,8 +574,9 @@ def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(t
     assert result.outcome is Outcome.PLACED
     start = bench.log.index("laser_sweep")
     again = "stop: recovered, before laser_sweep is tried again"
-    assert bench.log[start : start + 6] == [
-        "laser_sweep", "stop: fault in laser_sweep", "asked", "recover, confirmed: True", again, "laser_sweep",
+    assert bench.log[start : start + 7] == [
+        "laser_sweep", "stop: laser_sweep failed", "stop: fault in laser_sweep", "asked", "recover, confirmed: True",
+        again, "laser_sweep",
     ]  # fmt: skip
     (fault,) = result.faults
     assert (fault.step, fault.attempt, fault.code) == ("laser_sweep", 1, "fault")
@@ -576,3 +703,18 @@ def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):
     bench.run()
     bench.runner.control.abort("interrupted from the keyboard", signal.SIGINT)
     assert bench.runner.control.signal == signal.SIGINT
+
+
+def test_a_word_of_another_process_counts_for_the_question_that_it_names_and_no_other(tmp_path):
+    journal, control = Journal(tmp_path, "r1"), RunControl()
+    first = control.ask("protective stop in the sweep")
+    with pytest.raises(ValueError, match="number of its question"):
+        request(tmp_path, "confirm", "Ann")
+    request(tmp_path, "confirm", "Ann", first)
+    control.asked_no_more()
+    second = control.ask("protective stop while placing")
+    control.obey(journal.take_requests())
+    assert control.answer() is None, "what was said about the first comes after the second was asked"
+    request(tmp_path, "confirm", "Bob", second)
+    control.obey(journal.take_requests())
+    assert control.answer() == "Bob"

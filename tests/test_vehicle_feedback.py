@@ -25,7 +25,9 @@ class Hand(Clock):
 class Bench:
     def __init__(self) -> None:
         self.clock = Hand()
-        self.feedback = Feedback("vehicle", self.clock, track=0.58, max_speed=0.5, statistics=LinkStatistics())
+        self.feedback = Feedback(
+            "vehicle", self.clock, track=0.58, max_speed=0.5, max_yaw_rate=0.5, statistics=LinkStatistics()
+        )
         self.tell(0, 0)
 
     def tell(self, left: int, right: int, bits: int = 0, mode: int = CAN_MODE, state: int = 0) -> None:
@@ -131,6 +133,33 @@ def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed() -> None:
         bench.feedback.check(in_command=True, driving=False)
     assert caught.value.code == "vehicle.disturbed"
     bench.feedback.check(in_command=False, driving=False)
+
+
+@pytest.mark.parametrize("after", [0.02, 1.0, 1.9, 60.0])
+def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(after: float) -> None:
+    """It counts from zero again; while it was away it cannot have driven, since nobody commanded it."""
+    bench = Bench()
+    for count in range(50):
+        bench.feedback.commanded_to_move()
+        bench.tell(10 * count, 10 * count)
+    for _ in range(250):
+        bench.tell(490, 490)
+    assert bench.interruption()[0] == 0
+    bench.clock.time += after
+    bench.tell(0, 0)
+    assert bench.interruption()[0] >= 1
+    assert bench.feedback.state(1.0, None).x == pytest.approx(0.49)
+
+
+def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> None:
+    """At 0.5 m/s and 0.5 rad/s a side counts 0.645 m in a second; it rests 4 s after its last command."""
+    for gap, counted, lost in ((1.0, 600, False), (1.0, 720, True), (100.0, 2500, False), (100.0, 2700, True)):
+        bench = Bench()
+        bench.feedback.commanded_to_move()
+        bench.clock.time += gap
+        bench.tell(counted, counted)
+        assert bench.feedback.state(1.0, None).x == pytest.approx(0.0 if lost else 1e-3 * counted), (gap, counted)
+        assert bench.interruption()[0] >= 1 or not lost
 
 
 def test_what_moves_by_our_own_command_is_no_push() -> None:

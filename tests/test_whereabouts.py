@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_matrix
 from cell.job import Job, load_job
-from cell.lab.bench.lockstep import LockstepCell
-from cell.steps.approach import Planar, RelativeOdometry, turn_to
+from cell.steps.approach import Planar, RelativeOdometry, turn_to, wrap
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.photograph import BoardFix
-from cell.steps.way import Way, distance
+from cell.steps.way import TURN_DRIFT, Way, distance
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import RefusedError
 from sim_backends.world.nominal import inverse
@@ -28,9 +28,9 @@ SIGHT_M, SIGHT = 2.3, math.radians(40)
 class Site:
     """A simulated cell whose vehicle drives; the board's sight is told by the world's truth."""
 
-    def __init__(self, seed: int = 2) -> None:
-        self.cell = LockstepCell(CONFIG, seed, "nominal")
-        self.vehicle = self.cell.devices.vehicle
+    def __init__(self, seed: int = 2, level: str = "nominal") -> None:
+        self.cell = VirtualCell(CONFIG, seed, level)
+        self.vehicle = self.cell.vehicle
         self.whereabouts = Whereabouts(self.vehicle)
         self.notes: list[str] = []
 
@@ -57,7 +57,7 @@ class Site:
     def turn(self, angle: float) -> None:
         """As `cell jog vehicle` does."""
         self.vehicle.enable()
-        turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, _never)
+        turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, self.whereabouts.count)
         self.vehicle.brake()
 
 
@@ -107,7 +107,10 @@ def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
     site = Site()
     site.whereabouts.say_at_start()
     site.turn(math.radians(20))
+    site.turn(math.radians(-40))
+    site.turn(math.radians(40))
     site.whereabouts.enter(JOB)
+    assert site.whereabouts.turned == pytest.approx(math.radians(100), abs=0.05)
     assert site.whereabouts.pose().yaw == pytest.approx(site.truth().yaw, abs=0.03)
     site.run()
     assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
@@ -188,6 +191,59 @@ def test_the_longer_it_was_not_seen_the_more_room_it_needs() -> None:
     site.whereabouts.way = 1.0
     with pytest.raises(RefusedError, match="allowed 1"):
         way.require_line(close)
+
+
+def test_turns_on_the_spot_are_counted_and_need_room_too() -> None:
+    site = Site()
+    close = Planar(-0.95, -0.2, 0.0)
+    way = seen_at(site, Planar(-1.2, -0.2, 0.0))
+    way.require_line(close)
+    start = site.whereabouts.pose().yaw
+    for goal in (0.5, -0.5, 0.0):
+        site.vehicle.enable()
+        turn_to(site.vehicle, site.whereabouts, start + goal, site.cell.clock, _never)
+    assert site.whereabouts.turned == pytest.approx(0.5 + 1.0 + 0.5, abs=0.05)
+    assert site.whereabouts.way < 0.02
+    with pytest.raises(RefusedError, match="of the table"):
+        way.require_line(close)
+    site.whereabouts.see(Planar(-1.2, -0.2, 0.0))
+    assert site.whereabouts.turned == 0.0
+    way.require_line(close)
+
+
+def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known() -> None:
+    site = Site()
+    way = seen_at(site, Planar(-1.2, -0.2, 0.0))
+    way.require_turn(math.radians(20))
+    site.whereabouts.turned = 4.0
+    with pytest.raises(RefusedError, match="of the table"):
+        way.require_turn(math.radians(20))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(seed: int) -> None:
+    site = Site(seed, "harsh")
+    site.whereabouts.enter(JOB)
+    site.whereabouts.see(site.truth())
+    for goal in (1.5, 3.0):
+        site.vehicle.enable()
+        turn_to(site.vehicle, site.whereabouts, goal, site.cell.clock, _never)
+    off = abs(wrap(site.whereabouts.pose().yaw - site.truth().yaw))
+    assert site.whereabouts.turned == pytest.approx(3.0, abs=0.1)
+    assert off < TURN_DRIFT * site.whereabouts.turned
+
+
+def test_a_curve_is_way_and_no_turn_on_the_spot() -> None:
+    site = Site()
+    site.whereabouts.enter(JOB)
+    site.whereabouts.see(Planar(-3.0, 0.0, 0.0))
+    site.vehicle.enable()
+    for _ in range(60):
+        site.vehicle.drive(0.3, 0.3)
+        site.cell.clock.sleep(0.04)
+        site.whereabouts.pose()
+    assert site.whereabouts.way > 0.5
+    assert site.whereabouts.turned < 0.02
 
 
 def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose() -> None:

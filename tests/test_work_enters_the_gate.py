@@ -8,30 +8,29 @@ from pathlib import Path
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import load_job
-from cell.lab.bench.lockstep import LockstepCell
 from cell.lab.bench.whole_job import NoFrames
-from cell.run.work import JobWork
+from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import Aborted
 from statemachine.cancel import Cancelled, CancelToken
 from statemachine.control import RunControl
-from statemachine.policy import Policy
-from statemachine.sequence import State
 from statemachine.step import StepContext
 
 
 def test_every_step_enters_the_gate_with_the_token_that_ends_it(tmp_path: Path) -> None:
     config = load_config(None)
     job, mesh = load_job("pot")
-    cell = LockstepCell(config, 1)
+    cell = VirtualCell(config, 1)
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     whereabouts = Whereabouts(cell.devices.vehicle)
-    work = JobWork(config, job, nominal, None, cell.devices, NoFrames(), tmp_path, whereabouts)  # type: ignore[arg-type]
-    for name, step in work.steps().items():
+    here = Workplace(config, job, nominal, None, cell.devices, NoFrames(), tmp_path, whereabouts)  # type: ignore[arg-type]
+    for name, step in PLACE.work(here).items():
         control = RunControl()
-        context = StepContext(Policy().of(State(name)), 1, math.inf, {}, cell.clock, lambda event: None, control)
+        context = StepContext(PLACE.policy().of(name), 1, math.inf, {}, cell.clock, lambda event: None, control)
         cell.devices.gate.enter(CancelToken())
         control.abort("enough")
         with pytest.raises(Cancelled, match="enough"):

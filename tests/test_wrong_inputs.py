@@ -159,7 +159,7 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("laser.output", "1.0", ("laser.output", "no whole number")),
     ("laser.output", '"0"', ("laser.output", "no whole number")),
     ("claw.output", "99", ("claw.output", "0-7 standard, 8-15 configurable")),
-    ("claw.output", "0", ("laser.output and claw.output are both 0",)),
+    ("claw.output", "0", ("laser.output and claw.output are both", "arm output 0")),
     ("claw.feedback", "18", ("claw.feedback", "0 to 17")),
     # numbers and units
     ("rail.lead", "2", ("rail.lead", "has no unit", '"0.1 mm"')),

@@ -91,8 +91,9 @@ class CellCalibration:
         }
 
     def hash(self) -> str:
-        """Hash of its content, for reports."""
-        return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
+        """Hash of its content, for reports: of what it says, not of when it was made."""
+        content = {key: value for key, value in self.as_dict().items() if key not in ("made", "date")}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, Any]:
         """Values, standard deviations and residuals by name, units in the names."""

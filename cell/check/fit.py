@@ -20,6 +20,7 @@ from cell.geometry.poses import transform
 from cell.job import Job
 from cell.motion.bodies import tool_bodies, vehicle_bodies
 from cell.steps.camera_poses import centre_of, look_pose
+from cell.steps.kinds import find_kind
 from cell.vision import BoardSpec, parse_board
 from drivers.errors import ConfigError
 
@@ -42,6 +43,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path) -> None:
     `mesh` is the file of the job's nominal surface. All problems are told at once, a line each.
     """
     problems = [
+        *_kind(job),
         *_speeds(job, config),
         *_boards(job, config),
         *_plates(config),
@@ -56,6 +58,13 @@ def require_fit(job: Job, config: CellConfig, mesh: Path) -> None:
     problems = problems or list(reach_problems(job, config, extent))
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
+
+
+def _kind(job: Job) -> Iterator[str]:
+    try:
+        find_kind(job.job.kind)
+    except ConfigError as error:
+        yield str(error)
 
 
 def _speeds(job: Job, config: CellConfig) -> Iterator[str]:

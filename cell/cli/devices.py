@@ -1,4 +1,4 @@
-"""`cell jog`, `cell home` and `cell diag`: one device at a time."""
+"""`cell jog`, `cell home` and `cell diag`: one device at a time; `cell devices`: which makes are installed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import typer
 
 from cell.cli.options import (
     ConfigOption,
+    JobOption,
     JsonOption,
     Level,
     LevelOption,
@@ -15,6 +16,7 @@ from cell.cli.options import (
     SimOption,
     SpeedOption,
     print_json,
+    wide_console,
 )
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ def register(app: typer.Typer) -> None:
     app.command(context_settings={"ignore_unknown_options": True})(jog)
     app.command()(home)
     app.command()(diag)
+    app.command()(devices)
 
 
 def jog(
@@ -34,19 +37,20 @@ def jog(
         list[str], typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg.")
     ],
     config: ConfigOption = None,
+    job: JobOption = "pot",
     sim: SimOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
+    from cell.devices.jogging import NEEDED, parse_jog
     from cell.devices.jogging import jog as perform
-    from cell.devices.jogging import parse_jog
     from cell.supervisor import Cell
 
     wish = parse_jog(device, motion)
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
-        result = perform(cell, wish)
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=NEEDED[wish.device]) as cell:
+        result = perform(cell, wish, job)
     if json:
         print_json(result)
     else:
@@ -54,17 +58,29 @@ def jog(
 
 
 def home(
-    config: ConfigOption = None, sim: SimOption = None, seed: SeedOption = 1, level: LevelOption = Level.nominal
+    device: Annotated[str | None, typer.Argument(help="rail or arm alone; without it both.")] = None,
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
-    from cell.supervisor import Cell
+    from cell.config import DEVICES
+    from cell.supervisor import HOMED, Cell
+    from drivers.errors import ConfigError
 
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell:
-        cell.home()
-    typer.echo("rail homed, arm folded")
+    if device not in (None, *HOMED):
+        raise ConfigError(f"cannot home {device!r}; write `cell home`, or {' or '.join(HOMED)} behind it")
+    needed = tuple(DEVICES) if device is None else HOMED[device]
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=needed) as cell:
+        cell.home(device)
+    typer.echo({"rail": "rail homed", "arm": "arm folded"}.get(device or "", "rail homed, arm folded"))
 
 
 def diag(
+    device: Annotated[
+        list[str] | None, typer.Option("--device", "-d", help="Only this device; may be given more than once.")
+    ] = None,
     config: ConfigOption = None,
     sim: SimOption = None,
     seed: SeedOption = 1,
@@ -72,16 +88,38 @@ def diag(
     speed: SpeedOption = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Ask every device how it is: connection, identity, round trips, errors, state. Exit code 1 if any fails."""
+    """Ask the devices how they are: connection, identity, round trips, errors, state. Exit code 1 if any fails.
+
+    Looks only: nothing on a device is set, started or ended.
+    """
     from cell.devices.diagnosis import diagnose
 
-    rows = diagnose(config, sim=sim, seed=seed, level=level.value, speed=speed)
+    rows = diagnose(config, device or (), sim=sim, seed=seed, level=level.value, speed=speed)
     if json:
         print_json({row.device: row.as_dict() for row in rows})
     else:
         _print_table(rows)
     if not all(row.ok for row in rows):
         raise typer.Exit(1)
+
+
+def devices(json: JsonOption = False) -> None:
+    """List the makes of devices that `driver = "…"` can name, where each comes from, and what is wrong with it."""
+    from cell.devices.makes import installed
+
+    rows = installed()
+    if json:
+        print_json([row.as_dict() for row in rows])
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table()
+    for name in ("kind", "driver", "source", "state"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(row.kind, row.make, row.source, Text(row.state, style="" if row.ok else "red"))
+    wide_console().print(table)
 
 
 def _print_table(rows: list[Diagnosis]) -> None:

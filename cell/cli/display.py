@@ -53,8 +53,11 @@ class ProgressDisplay:
         if event.kind in SAID and "text" in event.data:
             self.console.print(str(event.data["text"]), markup=False)
         elif event.kind == "confirm_needed":
-            self.console.print(f"waiting for a person: {event.data['reason']}", style="bold yellow", markup=False)
-            self.console.print("when that is done, in another shell here: cell confirm (or cell abort)", markup=False)
+            number = event.data["number"]
+            said = f"waiting for a person, question {number}: {event.data['reason']}"
+            self.console.print(said, style="bold yellow", markup=False)
+            answer = f"cell confirm --question {number} (or cell abort)"
+            self.console.print(f"when that is done, in another shell here: {answer}", markup=False)
         elif event.kind == "confirmed":
             self.console.print(f"confirmed by {event.data['by']}", markup=False)
         elif step is None:
@@ -92,6 +95,13 @@ def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False)
     if seams := (report.get("scan") or {}).get("seams"):
         _print_seams(console, seams)
     _print_noise(console, report.get("assumed_noise") or {})
+
+
+def print_late(report: Mapping[str, Any]) -> None:
+    """Say that the program was asked to end when the run had come to its end already. Writes to standard error."""
+    part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console.print(f"interrupted after {part}", style="bold magenta", markup=False)
 
 
 def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:

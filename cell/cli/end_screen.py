@@ -4,12 +4,13 @@ beside its limit, what went wrong on the way, where the report is, and what to t
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from cell.job import job_path, shipped_jobs
 from cell.report.figures import shown_limit, shown_value
+from cell.run.folder import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -24,7 +25,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     outcome = str(report["outcome"])
     head = _cut_lines(f"{outcome}  {report.get('reason', '')}", width, REASON_LINES)
     head.append(_cut(_facts(report), width))
-    steps = _steps(report.get("steps") or ())
+    steps = _steps(report)
     tail = [*_trouble(report, width), *_labelled("report", _shown_path(folder), width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
@@ -43,6 +44,8 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
         return "cell diag: the state of every device"
     match outcome:
+        case "done":
+            return f"cell report {name}: what was measured; nothing was placed"
         case "placed":
             return f"cell report {name} --noise: what was assumed; cell export: the cloud"
         case "refused" if report.get("code") == "CalibrationStale":
@@ -80,14 +83,15 @@ def _facts(report: Mapping[str, Any]) -> str:
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
     if report.get("simulated"):
         facts.append(f"simulated, seed {report.get('seed')}, level {report.get('level')}")
-    if report.get("wall_s") is not None:
-        facts.append(f"{duration(report['wall_s'])} on the wall")
+    if (wall := wall_seconds(report)) is not None:
+        facts.append(f"{duration(wall)} on the wall")
     if report.get("started"):
         facts.append(str(report["started"])[:16].replace("T", " "))
     return " · ".join(facts)
 
 
-def _steps(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _steps(report: Mapping[str, Any]) -> list[str]:
+    rows = report.get("steps") or ()
     if not rows:
         return []
     lines = [f"{'step':<18}{'state':<10}{'cell time':>11}{'wall time':>12}{'retries':>9}"]
@@ -96,6 +100,8 @@ def _steps(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         cell, wall = (_seconds(row.get(key)) if begun else "" for key in ("duration_s", "wall_s"))
         retries = str(row.get("retries", "")) if begun else ""
         lines.append(f"{row['name']!s:<18}{row['state']!s:<10}{cell:>11}{wall:>12}{retries:>9}")
+    if report.get("cell_s") is not None:
+        lines.append(f"{'whole run':<28}{_seconds(report['cell_s']):>11}{_seconds(wall_seconds(report)):>12}")
     return lines
 
 

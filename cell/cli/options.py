@@ -18,6 +18,13 @@ class Level(StrEnum):
     harsh = "harsh"
 
 
+class CellClock(StrEnum):
+    """What a simulated cell keeps time with."""
+
+    wall = "wall"
+    virtual = "virtual"
+
+
 class Confirm(StrEnum):
     """Who confirms what a person has to."""
 

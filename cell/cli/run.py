@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from cell.cli.options import (
+    CellClock,
     ConfigOption,
     Confirm,
     JobOption,
@@ -21,12 +23,14 @@ from cell.cli.options import (
 
 if TYPE_CHECKING:
     from cell.run.job_run import Observer, RunOutcome
+    from cell.supervisor import Cell
 
 RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
 NoiseOption = Annotated[
     bool, typer.Option("--noise", help="Also show the noise that is assumed, and how several sweeps agree.")
 ]
 
+UntilOption = Annotated[str | None, typer.Option(help="End the run, done, after the step of this name.")]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -49,6 +53,7 @@ def run(
     job: JobOption = "pot",
     config: ConfigOption = None,
     at_start: AtStartOption = False,
+    until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -58,9 +63,10 @@ def run(
     """
     from cell.supervisor import Cell
 
-    with Cell.open(config) as cell:
-        code = _perform(lambda display: cell.run(job, display, at_start=at_start), json, noise)
-    raise typer.Exit(code)
+    def perform(cell: Cell, display: Observer) -> RunOutcome:
+        return cell.run(job, display, at_start=at_start, until=until)
+
+    _perform(lambda: Cell.open(config), perform, json, noise)
 
 
 def dry_run(
@@ -71,6 +77,9 @@ def dry_run(
     speed: Annotated[
         float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
     ] = None,
+    clock: Annotated[
+        CellClock, typer.Option(help='"virtual": without wires and without waiting; the same seed, the same bytes.')
+    ] = CellClock.wall,
     inject: Annotated[
         list[str] | None,
         typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
@@ -79,6 +88,7 @@ def dry_run(
         Confirm | None,
         typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
     ] = None,
+    until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -87,23 +97,26 @@ def dry_run(
     from cell.config import find_config, load_config
     from cell.devices.injection import Injection
     from cell.job import load_job
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.steps.kinds import find_kind
+    from cell.supervisor import Cell
 
     loaded, mesh = load_job(job)
     require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
+    find_kind(loaded.job.kind).until(until)
     for text in inject or ():
-        Injection.parse(text)
-    with Cell.open(
+        Injection.parse(text, find_kind(loaded.job.kind).names)
+    opened = partial(
+        Cell.open,
         config,
         sim="all",
         seed=seed,
         level=level.value,
-        speed=speed or SIM_SPEED,
+        speed=speed,
         surface=Path(loaded.surface.mesh).stem,
         confirm=None if confirm is None else confirm.value,
-    ) as cell:
-        code = _perform(lambda display: cell.run(job, display, inject or ()), json, noise)
-    raise typer.Exit(code)
+        clock=clock.value,
+    )
+    _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
 
 
 def resume(
@@ -120,32 +133,48 @@ def resume(
     from cell.job import load_job
     from cell.run.folder import find_run
     from cell.run.resumption import UnfinishedRun
-    from cell.supervisor import SIM_SPEED, Cell
+    from cell.supervisor import Cell
 
     before = UnfinishedRun.find(find_run(_runs_folder(config), name, "job"))
-    simulated = before.info["simulated"]
-    with Cell.open(
+    simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
+    opened = partial(
+        Cell.open,
         config,
         sim="all" if simulated else None,
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
-        speed=before.info["speed"] if simulated else SIM_SPEED,
+        speed=before.info["speed"] if simulated and clock == "wall" else None,
         surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
-    ) as cell:
-        code = _perform(lambda display: cell.resume(before.folder, display, at_start=at_start), json, noise)
+        clock=clock,
+    )
+    _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)
+
+
+def _perform(
+    opened: Callable[[], Cell], work: Callable[[Cell, Observer], RunOutcome], json: bool, noise: bool
+) -> NoReturn:
+    """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
+    from cell.cli import EXIT_INTERRUPTED
+    from cell.cli.display import ProgressDisplay, print_late, print_report
+    from statemachine.watch import SignalInterrupt
+
+    outcome = None
+    try:
+        with opened() as cell:
+            with ProgressDisplay() as display:
+                outcome = work(cell, display)
+            if json:
+                print_json(outcome.report)
+            else:
+                print_report(outcome.report, str(outcome.folder), noise=noise)
+        code = outcome.exit_code
+    except SignalInterrupt:
+        if outcome is None:
+            raise
+        code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED and outcome.outcome != "aborted":
+        print_late(outcome.report)
     raise typer.Exit(code)
-
-
-def _perform(work: Callable[[Observer], RunOutcome], json: bool, noise: bool) -> int:
-    from cell.cli.display import ProgressDisplay, print_report
-
-    with ProgressDisplay() as display:
-        outcome = work(display)
-    if json:
-        print_json(outcome.report)
-    else:
-        print_report(outcome.report, str(outcome.folder), noise=noise)
-    return outcome.exit_code
 
 
 def abort(
@@ -177,28 +206,42 @@ def go_on(name: RunArgument = None, config: ConfigOption = None) -> None:
 def confirm(
     name: RunArgument = None,
     config: ConfigOption = None,
+    question: Annotated[
+        int | None,
+        typer.Option(help="The number that was shown with the question; without it, the one that waits now."),
+    ] = None,
     by: Annotated[str | None, typer.Option(help="Who has looked; without it, the user's name.")] = None,
 ) -> None:
-    """Say that you have looked at the cell and that the waiting run may clear its fault and go on."""
-    import getpass
+    """Say that you have looked at the cell and that the waiting run may clear its fault and go on.
 
+    The word counts for one question only. Without its number, a terminal is asked whether it is the one that was meant.
+    """
+    import getpass
+    import sys
+
+    from cell.cli import EXIT_FAILED
     from cell.run.folder import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
-    if (what := awaited_word(folder)) is None:
+    if (waits := awaited_word(folder)) is None:
         raise ConfigError(f"{folder.name} waits for nobody's word; there is nothing to confirm")
-    typer.echo(f"confirmed: {what}")
-    _ask(str(folder), config, "confirm", by or getpass.getuser(), "{} goes on")
+    if question not in (None, waits.number):
+        raise ConfigError(f"{folder.name} does not wait for question {question} but for {waits}")
+    typer.echo(str(waits))
+    if question is None and sys.stdin.isatty() and not typer.confirm("Have you looked, and may the run go on?"):
+        raise typer.Exit(EXIT_FAILED)
+    answer = f"told {{}} that question {waits.number} is confirmed"
+    _ask(str(folder), config, "confirm", by or getpass.getuser(), answer, waits.number)
 
 
-def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str) -> None:
+def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str, number: int | None = None) -> None:
     from drivers.errors import ConfigError
     from statemachine.journal import JournalError, request
 
     folder = _going(name, config)
     try:
-        request(folder, kind, reason)
+        request(folder, kind, reason, number)
     except JournalError as error:
         raise ConfigError(str(error)) from error
     typer.echo(answer.format(folder.name))

@@ -1,177 +1,99 @@
-"""The composition root: from configuration to devices. The only place that chooses a driver for a device."""
+"""The composition root: from configuration to devices, each of the make that the configuration names."""
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Collection
 from contextlib import ExitStack
-from dataclasses import dataclass
+from typing import Any
 
-from cell.config import CameraConfig, CellConfig
-from cell.devices.gate import Gate, GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
+from cell.config import DEVICES, CellConfig
+from cell.devices.built_in import ArmOutputLaserConfig, OnArm
+from cell.devices.devices import Devices
+from cell.devices.gate import Gate
+from cell.devices.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
+from cell.devices.gated_laser import GatedLaser
+from cell.devices.interlocks import Interlocks, Situation
+from cell.devices.make import Surroundings
+from cell.devices.rules import RULES
+from cell.devices.ways import Ways
 from cell.geometry.poses import to_ur
 from cell.motion.kinematics import ArmKinematics
-from drivers.arm.limits import ArmLimits
-from drivers.camera.stream import StreamCamera
+from cell.steps.moves import HOME
 from drivers.clock import Clock
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
-
-SAFE_STOP_TIMEOUT_S = 5.0
+from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vehicle
 
 
-@dataclass(frozen=True)
-class Devices:
-    """The connected devices of one cell and the clock that they share."""
-
-    clock: Clock
-    gate: Gate
-    arm: Arm
-    rail: Rail
-    vehicle: Vehicle
-    scan_camera: Camera
-    target_camera: Camera
-    laser: Laser
-    claw: Claw
-
-    def __iter__(self) -> Iterator[Device]:
-        return iter((self.laser, self.claw, self.rail, self.vehicle, self.scan_camera, self.target_camera, self.arm))
-
-    def stop(self) -> list[str]:
-        """Laser off, vehicle stopped and braked, rail and arm stopped; all at once, none waits for another.
-
-        Whoever works with the devices now cannot begin anything new with them. Returns what could not be confirmed, a
-        line each; an empty list means that everything answered.
-        """
-        self.gate.shut()
-        return _all_at_once(
-            {
-                "laser off": self.laser.stop,
-                "vehicle stopped and braked": self._halt_vehicle,
-                "rail stopped": self.rail.stop,
-                "arm stopped": self.arm.stop,
-            }
-        )
-
-    def _halt_vehicle(self) -> None:
-        self.vehicle.brake()
-
-    def close(self) -> list[str]:
-        """Close every device, the arm last because laser and claw hang on its outputs."""
-        problems = []
-        for device in self:
-            try:
-                device.close()
-            except Exception as error:
-                problems.append(f"{device.name} closed: {error}")
-        return problems
-
-
-def connect(config: CellConfig) -> Devices:
-    """Connect every device; when one fails, those already connected are closed and the error goes on."""
+def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devices:
+    """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on."""
     clock = Clock(config.cell.time_scale)
+    made: dict[str, Any] = {}
     with ExitStack() as opened:
-        arm = connect_arm(config, clock)
-        opened.callback(arm.close)
-        rail = connect_rail(config, clock)
-        opened.callback(rail.close)
-        vehicle = connect_vehicle(config, clock)
-        opened.callback(vehicle.close)
-        scan_camera = connect_camera("scan_camera", config.scan_camera, clock)
-        opened.callback(scan_camera.close)
-        target_camera = connect_camera("target_camera", config.target_camera, clock)
-        opened.callback(target_camera.close)
-        laser, claw = connect_switches(config, arm, clock)
+        for name in connected_for(config, only):
+            made[name] = connect_one(config, name, clock, arm=made.get("arm"))
+            if not config.make(name).on_arm:
+                opened.callback(made[name].close)
         opened.pop_all()
-    gate = Gate()
-    for device in (arm, rail, vehicle, laser, claw):
-        device.gate = gate
-    return Devices(clock, gate, arm, rail, vehicle, scan_camera, target_camera, laser, claw)
+    return behind_gate(config, clock, **made)
 
 
-def connect_arm(config: CellConfig, clock: Clock, control: bool = True) -> GatedArm:
-    """The arm; its own process switches the laser's output off when this one dies.
+def connected_for(config: CellConfig, wanted: Collection[str]) -> list[str]:
+    """The devices that have to be connected for these ones: with one that hangs on the arm, the arm as well."""
+    needed = {"arm" for name in wanted if config.make(name).on_arm} | set(wanted)
+    return [name for name in DEVICES if name in needed]
 
-    Without `control` it is only looked at: a program that runs on it runs on.
+
+def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None = None, look: bool = False) -> Any:
+    """One device, not behind a gate; what hangs on the arm is given the `arm`.
+
+    With `look` it is only looked at: nothing on it is set, started or ended, and what runs on it runs on.
     """
-    kinematics = ArmKinematics()
-    return GatedArm(
-        "arm",
-        config.arm.address,
-        clock=clock,
-        limits=ArmLimits(
-            joint_speeds=(config.arm.max_joint_speed,) * 6,
-            joint_acceleration=config.arm.max_joint_acceleration,
-            linear_speed=config.arm.max_tool_speed,
-        ),
-        payload=(config.arm.payload, config.arm.payload_centre),
-        safe_off_outputs=(config.laser.output,),
-        forward=lambda joints: to_ur(kinematics.fk(joints)),
-        control=control,
+    around = Surroundings(clock, look, arm)
+    if DEVICES[name] == "arm":
+        # Its own process switches the laser off when this one dies.
+        kinematics = ArmKinematics()
+        around = Surroundings(clock, look, None, safe_off_outputs(config), lambda joints: to_ur(kinematics.fk(joints)))
+    return config.make(name).connect(name, config.device(name), around)
+
+
+def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
+    """The arm's outputs that have to go off when nobody watches them any more: the laser's, if it hangs on one."""
+    return (config.laser.output,) if isinstance(config.laser, ArmOutputLaserConfig) else ()
+
+
+def behind_gate(
+    config: CellConfig,
+    clock: Clock,
+    arm: Arm | None = None,
+    rail: Rail | None = None,
+    vehicle: Vehicle | None = None,
+    scan_camera: Camera | None = None,
+    target_camera: Camera | None = None,
+    laser: Laser | None = None,
+    claw: Claw | None = None,
+) -> Devices:
+    """These devices, of whatever make, with everything that moves, shines or grips behind one gate."""
+    ways = Ways(config)
+    switched = (config.laser, "laser"), (config.claw, "claw")
+    situation = Situation(
+        arm,
+        vehicle,
+        laser,
+        claw,
+        {record.output: owner for record, owner in switched if isinstance(record, OnArm)},
+        ways.clear,
+        ways.kinematics.fk,
+        {"HOME": HOME},
+        config.calibration_hash(),
     )
-
-
-def connect_rail(config: CellConfig, clock: Clock) -> GatedRail:
-    """The rail."""
-    return GatedRail(
-        "rail",
-        config.rail.url,
-        lead=config.rail.lead,
-        steps_per_turn=config.rail.steps_per_turn,
-        microsteps=config.rail.microsteps,
-        travel=config.rail.travel,
-        max_speed=config.rail.max_speed,
-        acceleration=config.rail.acceleration,
-        address=config.rail.address,
-        motor=config.rail.motor,
-        clock=clock,
+    gate = Gate(Interlocks(situation, RULES))
+    return Devices(
+        clock,
+        gate,
+        arm=None if arm is None else GatedArm(arm, gate),
+        rail=None if rail is None else GatedRail(rail, gate),
+        vehicle=None if vehicle is None else GatedVehicle(vehicle, gate),
+        scan_camera=scan_camera,
+        target_camera=target_camera,
+        laser=None if laser is None else GatedLaser(laser, gate, clock),
+        claw=None if claw is None else GatedClaw(claw, gate),
     )
-
-
-def connect_vehicle(config: CellConfig, clock: Clock) -> GatedVehicle:
-    """The vehicle."""
-    return GatedVehicle(
-        "vehicle",
-        config.vehicle.interface,
-        config.vehicle.channel,
-        bitrate=round(config.vehicle.bitrate),
-        track=config.vehicle.track,
-        max_speed=config.vehicle.max_speed,
-        max_yaw_rate=config.vehicle.max_yaw_rate,
-        clock=clock,
-    )
-
-
-def connect_camera(name: str, config: CameraConfig, clock: Clock) -> StreamCamera:
-    """A camera, which must have the size that the configuration says."""
-    return StreamCamera(name, config.address, shape=(config.height, config.width), clock=clock)
-
-
-def connect_switches(config: CellConfig, arm: Arm, clock: Clock) -> tuple[GatedLaser, GatedClaw]:
-    """Laser and claw, on the arm's digital outputs."""
-    laser = GatedLaser("laser", arm, config.laser.output)
-    return laser, GatedClaw("claw", arm, config.claw.output, config.claw.feedback, clock=clock)
-
-
-def _all_at_once(actions: dict[str, Callable[[], None]]) -> list[str]:
-    problems: list[str] = []
-
-    def run(what: str, action: Callable[[], None]) -> None:
-        # Whatever ends the thread: what it was to confirm is not confirmed.
-        try:
-            action()
-        except BaseException as error:
-            problems.append(f"{what}: not confirmed, {error}")
-
-    threads = {
-        what: threading.Thread(target=run, args=(what, action), name=f"safe stop: {what}", daemon=True)
-        for what, action in actions.items()
-    }
-    for thread in threads.values():
-        thread.start()
-    deadline = time.monotonic() + SAFE_STOP_TIMEOUT_S
-    for what, thread in threads.items():
-        thread.join(max(0.0, deadline - time.monotonic()))
-        if thread.is_alive():
-            problems.append(f"{what}: not confirmed within {SAFE_STOP_TIMEOUT_S:.0f} s")
-    return problems

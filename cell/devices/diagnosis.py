@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import CellConfig, config_to_open
+from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
 from cell.devices.simulated import SimulatedCell, with_endpoints
 from cell.run.folder import CellLock
@@ -20,9 +21,6 @@ from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
 
 PINGS = 100
-
-Entry = tuple[str, str, Callable[[], Any], Callable[[Any], str]]
-"""Name, address, how to connect, and how to tell its state."""
 
 
 @dataclass
@@ -60,60 +58,58 @@ class Diagnosis:
         return asdict(self)
 
 
-def diagnose(path: Path | None, *, sim: str | None, seed: int, level: str, speed: float) -> list[Diagnosis]:
-    """Connect to each device in turn and ask it; moves nothing. Raises only for a wrong configuration or held cell."""
+def diagnose(
+    path: Path | None, only: Collection[str] = (), *, sim: str | None, seed: int, level: str, speed: float
+) -> list[Diagnosis]:
+    """Look at each device in turn, or at `only` those: nothing on them is set, started or ended.
+
+    Raises only for a wrong configuration, an unknown device, or devices that another process holds.
+    """
+    if unknown := [name for name in only if name not in DEVICES]:
+        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
     if sim not in (None, "all"):
         raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
     _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
-        return _diagnose(config)
+        return _diagnose(config, only)
     simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
     try:
-        return _diagnose(with_endpoints(config, simulated.endpoints))
+        return _diagnose(with_endpoints(config, simulated.endpoints), only)
     finally:
         simulated.close()
 
 
-def _diagnose(config: CellConfig) -> list[Diagnosis]:
+def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     clock = Clock(config.cell.time_scale)
-    with CellLock(config):
-        rows, arm = _open_and_ask(
-            "arm", config.arm.address, partial(assembly.connect_arm, config, clock, control=False), _arm_state
-        )
-        scan, target = config.scan_camera, config.target_camera
-        connect_camera = assembly.connect_camera
-        try:
-            others: tuple[Entry, ...] = (
-                ("rail", config.rail.url, partial(assembly.connect_rail, config, clock), _rail_state),
-                ("vehicle", config.vehicle.channel, partial(assembly.connect_vehicle, config, clock), _vehicle_state),
-                ("scan_camera", scan.address, partial(connect_camera, "scan_camera", scan, clock), _camera_state),
-                (
-                    "target_camera",
-                    target.address,
-                    partial(connect_camera, "target_camera", target, clock),
-                    _camera_state,
-                ),
-            )
-            for entry in others:
-                found, device = _open_and_ask(*entry)
-                rows += found
-                if device is not None:
-                    device.close()
-            rows += _switches(config, arm, clock)
-        finally:
-            if arm is not None:
-                arm.close()
+    wanted = [name for name in STATES if not only or name in only]
+    needed = assembly.connected_for(config, wanted)
+    rows: list[Diagnosis] = []
+    with CellLock(config, needed), ExitStack() as opened:
+        arm: Arm | None = None
+        for name in (name for name in STATES if name in needed):
+            record = config.device(name)
+            if config.make(name).on_arm and arm is None:
+                rows.append(Diagnosis(name, False, record.place, state="the arm that it hangs on is not connected"))
+                continue
+            connect = partial(assembly.connect_one, config, name, clock, arm=arm, look=True)
+            row, device = _open_and_ask(name, record.place, connect, STATES[name])
+            if name == "arm":
+                arm = device
+            if device is not None and not config.make(name).on_arm:
+                opened.callback(device.close)
+            if name in wanted:
+                rows.append(row)
     return rows
 
 
 def _open_and_ask(
     name: str, address: str, build: Callable[[], Any], state: Callable[[Any], str]
-) -> tuple[list[Diagnosis], Any]:
+) -> tuple[Diagnosis, Any]:
     try:
         device = build()
     except CellError as error:
-        return [Diagnosis(name, False, address, state=str(error))], None
-    return [_ask(name, address, device, state)], device
+        return Diagnosis(name, False, address, state=str(error)), None
+    return _ask(name, address, device, state), device
 
 
 def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -> Diagnosis:
@@ -129,20 +125,6 @@ def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -
         row.state = str(error)
     row.errors = dict(device.statistics.errors)
     return row
-
-
-def _switches(config: CellConfig, arm: Arm | None, clock: Clock) -> list[Diagnosis]:
-    outputs = {"laser": config.laser.output, "claw": config.claw.output}
-    if arm is None:
-        return [
-            Diagnosis(name, False, f"arm output {output}", state="the arm that switches it is not connected")
-            for name, output in outputs.items()
-        ]
-    laser, claw = assembly.connect_switches(config, arm, clock)
-    return [
-        _ask("laser", f"arm output {outputs['laser']}", laser, _laser_state),
-        _ask("claw", f"arm output {outputs['claw']}", claw, _claw_state),
-    ]
 
 
 def _arm_state(arm: Arm) -> str:
@@ -176,3 +158,15 @@ def _laser_state(laser: Laser) -> str:
 
 def _claw_state(claw: Claw) -> str:
     return "holds a part" if claw.holding else "empty"
+
+
+STATES: dict[str, Callable[[Any], str]] = {
+    "arm": _arm_state,
+    "rail": _rail_state,
+    "vehicle": _vehicle_state,
+    "scan_camera": _camera_state,
+    "target_camera": _camera_state,
+    "laser": _laser_state,
+    "claw": _claw_state,
+}
+"""The devices in the order in which they are asked, and how each tells its state in words."""

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
-import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.errors import CellError, ConfigError
+from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 from statemachine.runner import Event
-from statemachine.sequence import STEPS
 
 _FORM = re.compile(r"(?P<fault>[a-z_.]+)@(?P<step>[a-z_]+)(:(?P<percent>\d+(\.\d+)?)\s*%)?")
-TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -26,15 +22,17 @@ class Injection:
     fraction: float
 
     @classmethod
-    def parse(cls, text: str) -> Injection:
-        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known."""
+    def parse(cls, text: str, steps: Sequence[str]) -> Injection:
+        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known.
+
+        `steps` are the names of the job's steps.
+        """
         match = _FORM.fullmatch(text.strip())
         if match is None:
             raise ConfigError(f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"')
         fault, step, percent = match["fault"], match["step"], float(match["percent"] or 0.0)
         if fault not in FAULT_NAMES:
             raise ConfigError(f'"{text}": the simulated cell has no fault "{fault}"; known: {", ".join(FAULT_NAMES)}')
-        steps = [state.value for state in STEPS]
         if step not in steps:
             raise ConfigError(f'"{text}": there is no step "{step}"; the steps are {", ".join(steps)}')
         if percent > 100.0:
@@ -46,10 +44,10 @@ class Injection:
 
 
 class Injector:
-    """An observer of a run that causes each fault once, over the simulated cell's truth endpoint `address`."""
+    """An observer of a run that causes each fault once, by `cause(name)`."""
 
-    def __init__(self, address: str, injections: Sequence[Injection]) -> None:
-        self._address = address
+    def __init__(self, cause: Callable[[str], None], injections: Sequence[Injection]) -> None:
+        self._cause = cause
         self._waiting = list(injections)
 
     def __call__(self, event: Event) -> None:
@@ -67,15 +65,3 @@ class Injector:
             if injection.step == event.step and fraction >= injection.fraction:
                 self._waiting.remove(injection)
                 self._cause(injection.fault)
-
-    def _cause(self, fault: str) -> None:
-        host, port = self._address.rsplit(":", 1)
-        try:
-            with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
-                file.write(json.dumps({"op": "fault", "name": fault}).encode() + b"\n")
-                file.flush()
-                answer = json.loads(file.readline())
-        except (OSError, ValueError) as error:
-            raise CellError(f"the simulated cell at {self._address} did not take the fault {fault}: {error}") from error
-        if not answer["ok"]:
-            raise CellError(f"the simulated cell did not take the fault {fault}: {answer['error']}")

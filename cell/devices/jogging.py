@@ -6,15 +6,19 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur
+from cell.job import Job, load_job
 from cell.run.recorded_work import Hands
 from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
+from cell.steps.camera_poses import look_pose
 from cell.units import parse_quantity
+from cell.vision import parse_board
 from drivers.errors import ConfigError, LimitError
 
 if TYPE_CHECKING:
@@ -23,6 +27,8 @@ if TYPE_CHECKING:
 MAX_LENGTH_MM = 500.0
 MAX_ANGLE_DEG = 90.0
 JOG_SPEED = 0.05  # m/s
+NEEDED = {"rail": ("rail",), "arm": ("arm", "vehicle"), "vehicle": ("vehicle", "arm")}
+"""Which devices have to be connected to jog one: arm and vehicle move only while the other one is safe."""
 _USAGE = "rail +5mm · arm z -10mm · arm rx +2deg · arm j3 +5deg · vehicle +0.1m · vehicle +5deg"
 
 
@@ -60,8 +66,12 @@ def _amount(text: str, unit: str) -> float:
         raise ConfigError(f"jog by {error}; write it like: {_USAGE}") from error
 
 
-def jog(cell: Cell, wish: Jog) -> dict[str, str]:
-    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell."""
+def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
+    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell.
+
+    The vehicle is also jogged with the arm in the looking pose of `job`.
+    """
+    loaded, _ = load_job(job)
 
     def work(hands: Hands) -> dict[str, str]:
         match wish.device:
@@ -70,9 +80,17 @@ def jog(cell: Cell, wish: Jog) -> dict[str, str]:
             case "arm":
                 return _jog_arm(cell, wish)
             case _:
+                _name_look(cell, loaded)
                 return _jog_vehicle(cell, wish, hands.check)
 
     return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()})
+
+
+def _name_look(cell: Cell, job: Job) -> None:
+    """Where a run of `job` has the arm while it drives, by the camera's mounting as configured."""
+    mounting = cell.config.target_camera.flange_from_camera.se3()
+    look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
+    cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
@@ -87,6 +105,7 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 
 
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
+    cell.devices.vehicle.brake()
     mover = cell.mover(None)
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1
@@ -120,11 +139,16 @@ def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, 
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
     vehicle.enable()
     odometry = RelativeOdometry(vehicle)
+
+    def look() -> None:
+        check()
+        cell.whereabouts.count()
+
     try:
         if wish.axis == "yaw":
-            turn_to(vehicle, odometry, wish.amount, clock, check)
+            turn_to(vehicle, odometry, wish.amount, clock, look)
         else:
-            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, check)
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, look)
     finally:
         vehicle.brake()
     pose = odometry.pose()

@@ -13,12 +13,33 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any
+from typing import Any, Protocol
 
-from cell.config import CellConfig, default_toml
+from cell.config import DEVICES, CellConfig, default_toml
+from cell.devices.truth_link import ask_truth, cause_fault
 from drivers.errors import ConfigError, DeviceFault
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
+
+
+class Simulation(Protocol):
+    """A simulated cell, through whichever door its devices are reached."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """For journal and report: `simulated`, `seed`, `level` and `clock`, "wall" or "virtual"."""
+
+    def truth(self) -> dict[str, Any]:
+        """Everything true about the world now."""
+
+    def require_fault(self, name: str) -> None:
+        """`ConfigError` for a fault that it cannot have."""
+
+    def fault(self, name: str) -> None:
+        """Cause a fault by its name, one of `sim_backends.faults.FAULT_NAMES`."""
+
+    def close(self) -> None:
+        """End its world."""
 
 
 class SimulatedCell:
@@ -41,6 +62,22 @@ class SimulatedCell:
         except BaseException:
             self.close()
             raise
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Which world it is, for journal and report."""
+        return {"simulated": True, **{key: self.endpoints[key] for key in ("seed", "level")}, "clock": "wall"}
+
+    def truth(self) -> dict[str, Any]:
+        """Everything true about the world now; `CellError` when it does not answer."""
+        return ask_truth(self.endpoints["truth"]["address"])
+
+    def require_fault(self, name: str) -> None:
+        """Over its wires it can have every fault."""
+
+    def fault(self, name: str) -> None:
+        """Cause a fault by its name; `CellError` when that was not taken."""
+        cause_fault(self.endpoints["truth"]["address"], name)
 
     @property
     def pid(self) -> int:
@@ -93,21 +130,21 @@ class SimulatedCell:
 
 
 def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
-    """The configuration with every device's address replaced by a simulated one."""
-    return config.model_copy(
-        update={
-            "cell": config.cell.model_copy(
-                update={"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
-            ),
-            "arm": config.arm.model_copy(update={"address": endpoints["arm"]["address"]}),
-            "rail": config.rail.model_copy(update={"url": endpoints["rail"]["url"]}),
-            "vehicle": config.vehicle.model_copy(
-                update={"interface": endpoints["vehicle"]["interface"], "channel": endpoints["vehicle"]["channel"]}
-            ),
-            "scan_camera": config.scan_camera.model_copy(update={"address": endpoints["scan_camera"]["address"]}),
-            "target_camera": config.target_camera.model_copy(update={"address": endpoints["target_camera"]["address"]}),
-        }
-    )
+    """The configuration with every device's address replaced by that of its simulated peer.
+
+    Raises `ConfigError` when a device is of a make that has none.
+    """
+    section = {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+    changed: dict[str, Any] = {"cell": config.cell.model_copy(update=section)}
+    for name in DEVICES:
+        make = config.make(name)
+        if make.simulated is None:
+            raise ConfigError(
+                f'{name}.driver = "{make.name}": nothing simulates this make; for a simulated cell name one that is '
+                "simulated (the built-in ones are)"
+            )
+        changed[name] = make.simulated(config.device(name), endpoints.get(name, {}))
+    return config.model_copy(update=changed)
 
 
 def endpoint_toml(endpoints: dict[str, Any]) -> str:

@@ -32,9 +32,9 @@ from cell.report.panels import (
 )
 from cell.run.frames import FrameStore
 from cell.steps.drive_to_target import Arrival
-from cell.steps.laser_sweep import SweepRecord
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction
+from cell.steps.sweep_record import SweepRecord
 from cell.vision import BoardView
 from drivers.interfaces import Frame
 from statemachine.runner import RunResult

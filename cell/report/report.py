@@ -19,11 +19,11 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.report.bound import stated_bound
 from cell.report.evidence import last_frames, measured, refusal
-from cell.report.truth import Witness, ask_truth, expected_error, place_error, pose_error, sensor_error
-from cell.run.folder import REPORT, when, write_json
+from cell.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
+from cell.run.folder import REPORT, timeless, when, write_json
 from cell.run.frames import FrameStore
-from cell.steps.laser_sweep import SweepRecord
 from cell.steps.reconstruct import Reconstruction
+from cell.steps.sweep_record import SweepRecord
 from cell.version import release
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
@@ -83,10 +83,10 @@ def make_report(
     report["measured"] = measured(result, job, None, report["place_bound_95"])
     if frames.failure is not None:
         report["frames_missing"] = frames.failure
-    _write(folder, strict(report))
+    _write(folder, strict(timeless(report)))
     if witness is not None:
         try:
-            _add_truth(report, config, job, nominal, repeatability, result, witness)
+            _add_truth(report, job, nominal, repeatability, result, witness)
         except Exception as error:
             report["truth_missing"] = f"{type(error).__name__}: {error}"
     report["measured"] = measured(result, job, report["truth"], report["place_bound_95"])
@@ -97,7 +97,7 @@ def make_report(
         draw_run(folder / "picture.png", job, nominal, result, report, frames)
     except Exception as error:
         report["picture_missing"] = f"{type(error).__name__}: {error}"
-    report = strict(report)
+    report = strict(timeless(report))
     _write(folder, report)
     return report
 
@@ -188,7 +188,6 @@ def _configured_noise(config: CellConfig) -> dict[str, Any]:
 
 def _add_truth(
     report: dict[str, Any],
-    config: CellConfig,
     job: Job,
     nominal: NominalSurface,
     repeatability: Vector,
@@ -196,7 +195,7 @@ def _add_truth(
     witness: Witness,
 ) -> None:
     """The comparison with the simulated world; raises when that does not answer any more."""
-    now = ask_truth(config.cell.truth)
+    now = witness.ask()
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part", "collisions")}
     sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))

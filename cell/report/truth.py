@@ -1,9 +1,8 @@
-"""The simulated world's truth, asked for by the report alone: no step has the address of that endpoint."""
+"""The simulated world's truth, asked for by the report alone: no step has a way to it."""
 
 from __future__ import annotations
 
-import json
-import socket
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,38 +13,24 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
 from cell.report.bound import draws, part_points, placed_points, point_covariances, through
-from drivers.errors import CellError
 from drivers.interfaces import Vector
 from statemachine.runner import Event
 
 SENSOR_POINTS = 1000
-TIMEOUT_S = 5.0
-
-
-def ask_truth(address: str) -> dict[str, Any]:
-    """The whole truth of a simulated cell; raises `CellError` when its endpoint does not answer."""
-    host, port = address.rsplit(":", 1)
-    try:
-        with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
-            file.write(b'{"op": "truth"}\n')
-            file.flush()
-            truth: dict[str, Any] = json.loads(file.readline())["truth"]
-    except (OSError, ValueError, KeyError) as error:
-        raise CellError(f"the simulated cell's truth at {address} does not answer: {error}") from error
-    return truth
 
 
 class Witness:
     """Listens to a run and notes the truth right after the sweep, when the scanned surface was where it was scanned."""
 
-    def __init__(self, address: str) -> None:
-        self._address = address
+    def __init__(self, ask: Callable[[], dict[str, Any]]) -> None:
+        """`ask()` gives the whole truth; see `sim_backends.world.truth`."""
+        self.ask = ask
         self.at_sweep: dict[str, Any] | None = None
 
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""
         if event.kind == "step_done" and event.step == "laser_sweep":
-            self.at_sweep = ask_truth(self._address)
+            self.at_sweep = self.ask()
 
 
 def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:

@@ -11,11 +11,14 @@ import secrets
 import socket
 import struct
 import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.journal import JournalError, Record, read
 
@@ -82,7 +85,7 @@ def is_going(folder: Path) -> bool:
         run = read(folder).run
     except (JournalError, ValueError, TypeError):
         return False
-    return run.ended is None and _lives(run.info.get("pid"), run.started)
+    return run.ended is None and _lives(run.pid, run.started)
 
 
 def _lives(pid: object, since: float) -> bool:
@@ -98,18 +101,31 @@ def _lives(pid: object, since: float) -> bool:
     return words[0] != "Z" and begun < since + 1.0
 
 
-def awaited_word(folder: Path) -> str | None:
-    """What a person has to confirm before the run in `folder` goes on; None when it waits for nobody."""
+@dataclass(frozen=True)
+class Question:
+    """What a person has to confirm before a run goes on; each question of a run has a number of its own."""
+
+    number: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"question {self.number}: {self.reason}"
+
+
+def awaited_word(folder: Path) -> Question | None:
+    """What a person has to confirm now before the run in `folder` goes on; None when it waits for nobody."""
     try:
         return _awaited(read(folder))
     except JournalError as error:
         raise ConfigError(str(error)) from error
 
 
-def _awaited(record: Record) -> str | None:
+def _awaited(record: Record) -> Question | None:
     kinds = ("confirm_needed", "confirmed", "state")
     last = next((event for event in reversed(record.events) if event.kind in kinds), None)
-    return str(last.data["reason"]) if last is not None and last.kind == "confirm_needed" else None
+    if last is None or last.kind != "confirm_needed":
+        return None
+    return Question(int(last.data.get("number", 0)), str(last.data["reason"]))
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -154,7 +170,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
         raise CellError(f"{folder} holds a journal that is none of ours: {error}") from error
     run = record.run
     waits = _awaited(record)
-    going = "the run is still going on, or its process died" if waits is None else f"waits for a person: {waits}"
+    going = "the run is still going on, or its process died" if waits is None else f"waits for a person, {waits}"
     steps: dict[str, dict[str, Any]] = {}
     for row in record.steps:
         before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
@@ -173,6 +189,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
         "started": when(run.started),
         "ended": None if run.ended is None else when(run.ended),
         "wall_s": None if run.ended is None else round(run.ended - run.started, 2),
+        "pid": run.pid,
         "steps": list(steps.values()),
         **run.info,
     }
@@ -190,13 +207,33 @@ def run_row(folder: Path) -> dict[str, Any]:
         "run": folder.name,
         **{key: report.get(key) for key in keys},
         "kind": kind,
-        "duration_s": report.get("wall_s"),
+        "duration_s": wall_seconds(report),
     }
 
 
 def when(seconds: float) -> str:
-    """A time since the epoch as ISO 8601, local, with its offset."""
-    return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(seconds))
+    """A time since the epoch as ISO 8601 to the millisecond, local, with its offset."""
+    return datetime.fromtimestamp(seconds).astimezone().isoformat(timespec="milliseconds")
+
+
+def timeless(report: dict[str, Any]) -> dict[str, Any]:
+    """A report as it is written: on the virtual clock without what differs each time, durations on the wall and the
+    process. The same seed then gives the same report, but for the run's name and its dates."""
+    if report.get("clock") != "virtual":
+        return report
+    steps = [{**step, "wall_s": None} for step in report["steps"]] if "steps" in report else None
+    return {**report, "wall_s": None, "pid": None, **({} if steps is None else {"steps": steps})}
+
+
+def wall_seconds(report: Mapping[str, Any]) -> float | None:
+    """How long a run took on the wall, by its dates where the report does not say; None while it is not known."""
+    if report.get("wall_s") is not None:
+        return float(report["wall_s"])
+    try:
+        begun, ended = (datetime.fromisoformat(str(report[key])) for key in ("started", "ended"))
+    except (KeyError, ValueError):
+        return None
+    return (ended - begun).total_seconds()
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -217,21 +254,18 @@ def write_json(path: Path, data: Any) -> None:
 
 
 class CellLock:
-    """Held by the process that has the cell's devices open; the kernel drops it when that process ends.
+    """Held by the process that has devices of the cell open; the kernel drops it when that process ends.
 
     Each device's address is held by itself, whoever the users are, so that neither two cells nor two configurations
     share a device. A name in the kernel's abstract socket space has no owner, no rights and nothing to clean up.
     """
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> None:
+        """`only` these devices are held."""
         self._name = config.cell.name
-        self._addresses = {
-            "arm": config.arm.address,
-            "rail": _real(config.rail.url),
-            "vehicle": f"{config.vehicle.interface}:{_real(config.vehicle.channel)}",
-            "scan_camera": config.scan_camera.address,
-            "target_camera": config.target_camera.address,
-        }
+        # What hangs on the arm is held with the arm.
+        own = [name for name in DEVICES if name in only and not config.make(name).on_arm]
+        self._addresses = {name: config.device(name).held for name in own}
         self._held: list[socket.socket] = []
 
     def __enter__(self) -> CellLock:
@@ -259,11 +293,6 @@ class CellLock:
     ) -> None:
         while self._held:
             self._held.pop().close()
-
-
-def _real(address: str) -> str:
-    """A device file by the name of what it is, whichever link to it the configuration names."""
-    return os.path.realpath(address) if address.startswith("/") else address
 
 
 def _holder(name: str) -> str:

@@ -6,13 +6,13 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
 from cell.job import Job
@@ -24,9 +24,10 @@ from cell.run.folder import new_run, write_json
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
-from cell.run.work import JobWork
+from cell.steps.kinds import Kind
 from cell.steps.stored_sweep import StoredSweep
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import (
     Aborted,
     CalibrationStale,
@@ -37,10 +38,11 @@ from drivers.errors import (
     RefusedError,
 )
 from statemachine.cancel import CancelToken
+from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Failure, Outcome, Policy
+from statemachine.policy import Failure, Outcome
 from statemachine.runner import Event, Runner
-from statemachine.sequence import Sequence
+from statemachine.script import NO_SCRIPT, Script
 
 Observer = Callable[[Event], None]
 
@@ -52,18 +54,28 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended: `outcome` is placed, refused, faulted or aborted; `report` is what report.json holds."""
+    """How a run ended: `outcome` is placed (done, for a kind of job that places nothing), refused, faulted or aborted;
+    `report` is what report.json holds, `results` what each step made, by its name.
+
+    One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same.
+    """
 
     outcome: str
     reason: str
     folder: Path
     report: Mapping[str, Any]
-    interrupted: bool = False
+    results: Mapping[str, object] = field(default_factory=dict, repr=False)
+    control: RunControl = field(default_factory=RunControl, repr=False, compare=False)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has asked the program to end since the run began."""
+        return self.control.signal is not None
 
     @property
     def exit_code(self) -> int:
-        """0 placed, 130 interrupted, 1 otherwise."""
-        return 0 if self.outcome == "placed" else 130 if self.interrupted else 1
+        """130 interrupted, else 0 placed or done, 1 otherwise."""
+        return 130 if self.interrupted else 0 if self.outcome in ("placed", "done") else 1
 
     def __str__(self) -> str:
         return f"{self.outcome}: {self.reason}"
@@ -81,7 +93,8 @@ class JobRun:
     """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report.
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
-    faults or look at the truth. `earlier` is the sweep of a run that this one resumes.
+    faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
+    `truth` asks a simulated world.
     """
 
     run: Run[Any]
@@ -91,8 +104,11 @@ class JobRun:
     nominal: NominalSurface
     calibration: CellCalibration
     info: Mapping[str, Any]
+    kind: Kind
+    script: Script = NO_SCRIPT
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
+    truth: Callable[[], dict[str, Any]] | None = None
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -111,10 +127,11 @@ class JobRun:
 
     def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
         started = time.time()
-        witness = Witness(self.config.cell.truth) if self.config.cell.truth else None
+        begun = self.devices.clock.now()
+        witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames") as frames:
-            work = JobWork(
+            here = Workplace(
                 self.config,
                 self.job,
                 self.nominal,
@@ -126,9 +143,9 @@ class JobRun:
                 self.earlier,
             )
             runner = Runner(
-                sequence=Sequence(),
-                steps=work.steps(),
-                policy=replace(Policy(), simulated_person=self.config.cell.confirm == "simulated"),
+                sequence=self.kind.sequence(),
+                steps=self.kind.work(here),
+                policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"),
                 journal=journal,
                 clock=self.devices.clock,
                 classify=classify,
@@ -137,16 +154,20 @@ class JobRun:
                 recover=self._recover,
                 health=lambda: require_healthy(self.devices),
                 control=self.run.control,
+                script=self.script,
             )
             result = runner.run()
+        if result.outcome in (Outcome.PLACED, Outcome.DONE):
+            # The stop at the end of a good run keeps nobody from going on.
+            self.devices.gate.clear()
         if result.outcome is not Outcome.PLACED:
-            result = replace(result, reason=work.part.told(result.reason))
-        facts = {**self._facts(), "part": work.part.state.value}
+            result = replace(result, reason=here.part.told(result.reason))
+        cell_s = round(self.devices.clock.now() - begun, 3)
+        facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
         report = make_report(
-            folder, self.config, self.job, self.nominal, work.repeatability, result, facts, started, witness, frames,
+            folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
-        interrupted = self.run.control.signal is not None
-        return RunOutcome(report["outcome"], report["reason"], folder, report, interrupted)
+        return RunOutcome(report["outcome"], report["reason"], folder, report, result.results, self.run.control)
 
     def _facts(self) -> dict[str, Any]:
         return {
@@ -154,6 +175,7 @@ class JobRun:
             "pid": os.getpid(),
             "cell": self.config.cell.name,
             "job": self.job.job.name,
+            "job_kind": self.job.job.kind,
             **self.info,
             "speed": self.config.cell.time_scale,
             "configuration_hash": self.config.calibration_hash(),
@@ -171,8 +193,7 @@ class JobRun:
         self.devices.gate.enter(token)
         token.check()
         if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-            arm = self.devices.arm
-            self.devices.gate.begin(lambda: arm.recover(confirmed=confirmed), arm.stop)
+            self.devices.arm.recover(confirmed=confirmed)
         elif isinstance(error, DeviceError) and error.device == "vehicle":
             self.devices.vehicle.recover()
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
-from cell.run.folder import REPORT, new_run, when, write_json
+from cell.run.folder import REPORT, new_run, timeless, when, write_json
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
@@ -25,12 +25,13 @@ from drivers.errors import Aborted, CellError, Interrupted, RefusedError
 from drivers.interfaces import Frame
 from statemachine.journal import Journal, JournalError
 from statemachine.step import Event
-from statemachine.watch import Call
+from statemachine.waiting import waiting_on
 
-POLL_S = 0.05
 GRACE_S = 5.0
 """Wall seconds that stopped work has to end."""
-HEALTH_POLLS = 2
+REQUEST_POLLS, HEALTH_POLLS = 10, 5
+"""At every so many looks around: requests of other processes, the cell's health."""
+
 FRAMES = "frames"
 """Where in the run's folder the pictures are that its work looked at."""
 
@@ -72,7 +73,7 @@ class RecordedWork:
         Raises `Aborted` when the run was ended (`Interrupted` by a signal), `DeviceFault` when the stop was not
         confirmed, else what `work` raised; the cell is stopped first.
         """
-        started = time.time()
+        started, begun = time.time(), self.devices.clock.now()
         try:
             folder = new_run(self.root)
             facts = {"kind": self.kind, "pid": os.getpid(), **self.info}
@@ -95,57 +96,78 @@ class RecordedWork:
             report = {
                 "run": folder.name, "version": release(), "outcome": outcome, "reason": reason,
                 "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),
-                **facts,
+                "cell_s": round(self.devices.clock.now() - begun, 3), **facts,
             }  # fmt: skip
             if outcome != "done" and frames.recent:
                 report["last_frames"] = [f"{FRAMES}/{name}" for name in frames.recent]
             if frames.failure is not None:
                 report["frames_missing"] = frames.failure
             for action in (
-                lambda: journal.run_ended(outcome, reason), journal.close, lambda: write_json(folder / REPORT, report),
+                lambda: journal.run_ended(outcome, reason), journal.close,
+                lambda: write_json(folder / REPORT, timeless(report)),
             ):  # fmt: skip
                 _last(action, ended)
             self.run.folder = outer or folder
 
     def _watched(self, work: Callable[[Hands], Made], journal: Journal, frames: FrameStore) -> Made:
-        control = self.run.control
+        control, clock = self.run.control, self.devices.clock
+        waiting = waiting_on(clock)
         hands = Hands(
-            control.token.check, lambda: control.safe_point(control.token, self._say), self._progress, frames.keep
+            control.token.check,
+            lambda: control.safe_point(control.token, self._say, waiting.look),
+            self._progress,
+            frames.keep,
         )
         made: list[Made] = []
+        problems: list[str] = []
+        asked: str | None = None
+        ailing: Exception | None = None
+        stopped = False
+        polls = 0
 
         def begin() -> None:
             self.devices.gate.enter(control.token)
             control.token.check()
             made.append(work(hands))
 
-        key = journal.step_started(self.kind, 1)
-        begun = time.monotonic()
-        call = Call(self.kind, begin)
-        ailing: Exception | None = None
-        polls = 0
-        while not call.done.wait(POLL_S) and control.token.reason is None and ailing is None:
+        def stop(why: str) -> None:
+            nonlocal stopped
+            stopped = True
+            control.token.cancel(why)
+            problems.extend(self.devices.stop())
+
+        def cut() -> str | None:
+            nonlocal asked, ailing, polls
             polls += 1
             try:
-                control.obey(journal.take_requests())
+                if polls % REQUEST_POLLS == 0:
+                    control.obey(journal.take_requests())
                 if polls % HEALTH_POLLS == 0:
                     self.health(self.devices)
             # Whatever keeps it from being watched ends the work; it must not go on unseen.
             except Exception as found:
                 ailing = found
-        ended = control.token.reason
-        problems: list[str] = []
+            asked = control.token.reason
+            why = asked or (None if ailing is None else str(ailing))
+            if why is not None:
+                stop(why)
+            return why
+
+        key = journal.step_started(self.kind, 1)
+        begun = clock.now()
+        call = waiting.do(self.kind, begin, cut, GRACE_S)
         error = ailing or call.error
-        if ended is not None or error is not None:
-            control.token.cancel(str(error))
-            problems = self.devices.stop()
-            if not call.done.wait(GRACE_S):
-                problems.append(f"the {self.kind} was still busy {GRACE_S:g} s after the stop")
-        said = ended or (None if error is None else str(error))
-        _last(lambda: journal.step_ended(key, time.monotonic() - begun, error=said), error)
+        if not stopped:
+            asked = control.token.reason
+            if asked is not None or error is not None:
+                stop(asked or str(error))
+        if not call.done.is_set():
+            problems.append(f"the {self.kind} was still busy {GRACE_S:g} s after the stop")
+        said = asked or (None if error is None else str(error))
+        _last(lambda: journal.step_ended(key, clock.now() - begun, error=said), error)
         unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
-        if ended is not None:
-            text = f"{self.kind} {ended}" if control.signal is not None else f"{self.kind} ended: {ended}"
+        if asked is not None:
+            text = f"{self.kind} {asked}" if control.signal is not None else f"{self.kind} ended: {asked}"
             kind = Interrupted if control.signal is not None else Aborted
             raise kind(f"{text}; the cell was stopped{unconfirmed}")
         if error is not None and problems:

@@ -21,7 +21,7 @@ from cell.run.events import Detached, Subscription
 from drivers.errors import DeadlineError
 from statemachine.control import RunControl
 from statemachine.step import Event, Observer
-from statemachine.watch import Call, SignalInterrupt, SignalWatch
+from statemachine.watch import SignalInterrupt, SignalWatch, begin
 
 Result = TypeVar("Result")
 
@@ -48,7 +48,7 @@ class Run(Generic[Result]):
         self._past: deque[Event] = deque(maxlen=KEPT_EVENTS)
         self._observer = None if observer is None else Detached(observer)
         self._work = work
-        self._call = Call(f"run: {kind}", self._perform)
+        self._call = begin(f"run: {kind}", self._perform)
 
     def pause(self) -> None:
         """Hold the run at its next safe point: before its next free motion or its next step."""
@@ -88,7 +88,8 @@ class Run(Generic[Result]):
     def result(self, timeout: float | None = None) -> Result:
         """Wait for the end, at most `timeout` wall seconds (`DeadlineError`; the run goes on), and what it made.
 
-        Ctrl-C, SIGTERM and SIGHUP end the run meanwhile, if this is the main thread. Raises what the run raised.
+        Ctrl-C, SIGTERM and SIGHUP end the run meanwhile, if this is the main thread. Raises what the run raised, and
+        `SignalInterrupt` after a signal that came too late for the work to tell of it; a job's outcome does.
         """
         until = math.inf if timeout is None else time.monotonic() + timeout
         with SignalWatch() as signals:
@@ -97,9 +98,12 @@ class Run(Generic[Result]):
                     self.control.abort(signals.reason, signals.number)
                 if time.monotonic() > until:
                     raise DeadlineError(self.kind, f"has not ended within {timeout:g} s; it goes on")
-        # One that came as the run ended must not let the program go on to the next.
-        if signals.number is not None and self.control.signal is None:
-            raise SignalInterrupt(signals.number)
+        if signals.reason is not None and signals.number is not None:
+            late = self.control.signal is None
+            self.control.abort(signals.reason, signals.number)
+            # It must not let the program go on to the next.
+            if not self.control.over and (late or self._call.error is None):
+                raise SignalInterrupt(signals.number) from self._call.error
         if self._call.error is not None:
             raise self._call.error
         result: Result = self._call.result  # type: ignore[assignment]

@@ -10,12 +10,18 @@ import pinocchio as pin
 
 from cell.job import Job
 from cell.steps.approach import Planar, drive_line, turn_to
+from cell.steps.camera_poses import look_pose
+from cell.steps.moves import HOME
 from cell.steps.photograph import BoardFix
+from cell.steps.step import JobStep
 from cell.steps.way import BACK_UP, Way
 from cell.steps.whereabouts import Whereabouts, next_step
+from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
 from drivers.clock import Clock
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vehicle
+from statemachine.policy import Step
+from statemachine.runner import StepContext
 
 MAX_TRIES = 5
 SETTLE_S = 0.3
@@ -137,3 +143,42 @@ def drive_to_target(
             "vehicle turned off its target", math.degrees(error.yaw), "deg", most=math.degrees(approach.tolerance_angle)
         ),
     ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]})
+
+
+def _at(here: Workplace, context: StepContext) -> Arrival:
+    """The arm to its looking pose first, with the vehicle braked."""
+    context.progress(0.0, "arm to the looking pose")
+    if not here.devices.claw.holding:
+        raise RefusedError(
+            f"the claw holds no part: put the part of job {here.job.job.name} into it, or see whether it was "
+            "placed already"
+        )
+    vehicle = here.devices.vehicle
+    if trouble := vehicle.state().trouble:
+        context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
+    vehicle.enable()
+    vehicle.brake()
+    if not here.whereabouts.anchored:
+        here.mover.to_joints(HOME)
+    here.whereabouts.enter(here.job)
+    camera = here.calibration.target.flange_from_camera
+    look = look_pose(here.config, here.job, here.board, camera)
+    here.mover.to(look, "the looking pose")
+    here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
+    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    vehicle.enable()
+    return drive_to_target(
+        here.job,
+        here.config.arm.vehicle_from_base.se3(),
+        vehicle,
+        here.whereabouts,
+        here.photograph,
+        here.devices.clock,
+        context.check,
+        context.progress,
+        lambda text: context.note(text=text),
+        context.safe_point,
+    )
+
+
+STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, Arrival)

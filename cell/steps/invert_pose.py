@@ -10,7 +10,11 @@ from cell.inversion import invert_pose as register
 from cell.job import Job
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction
+from cell.steps.step import JobStep
+from cell.steps.workplace import Workplace
 from drivers.interfaces import Vector
+from statemachine.policy import Step
+from statemachine.runner import StepContext
 
 
 def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface, kinematic: Vector) -> PlacePose:
@@ -35,3 +39,10 @@ def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalS
         calibration=scan.by_calibration,
         sweeps=scan.by_poses,
     )
+
+
+def _at(here: Workplace, context: StepContext) -> PlacePose:
+    return invert_pose(context.made(Reconstruction), context.made(BoardFix), here.job, here.nominal, here.kinematic)
+
+
+STEP = JobStep(Step("invert_pose", 60.0, on_wall=True), _at, PlacePose, needs=(BoardFix, Reconstruction))

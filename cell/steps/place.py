@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
+from cell.inversion import PlacePose
 from cell.job import Job
 from cell.steps.moves import HOME, Mover
+from cell.steps.part import PartProgress, PartState
+from cell.steps.step import JobStep
+from cell.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw
+from statemachine.policy import OnFailure, Step
+from statemachine.runner import StepContext
 
 TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
 """What may come closer than the collision margin on the way down and up."""
@@ -21,35 +26,6 @@ TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
 
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
-
-
-class PartState(Enum):
-    """Where the part is, as far as the claw's commands and its feedback tell."""
-
-    HELD = "held"
-    UNKNOWN = "unknown"
-    RELEASED = "released"
-
-
-@dataclass(eq=False)
-class PartProgress:
-    """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
-
-    `where` is base_from_part at the release.
-    """
-
-    state: PartState = PartState.HELD
-    where: pin.SE3 | None = None
-
-    def told(self, reason: str) -> str:
-        """A run's reason, not to be read without what has become of the part."""
-        if self.state is PartState.HELD or self.where is None:
-            return reason
-        x, y, z = 1e3 * self.where.translation
-        at = f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the arm base"
-        if self.state is PartState.RELEASED:
-            return f"the part is already down {at} and is not to be placed again, only the retreat failed: {reason}"
-        return f"the claw was told to release the part {at}, look whether it did: {reason}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +120,21 @@ def place(
     progress(0.95, "folding the arm")
     mover.to_joints(HOME)
     return PlaceResult(reached, contact, off)
+
+
+def _at(here: Workplace, context: StepContext) -> PlaceResult:
+    return place(
+        here.job,
+        context.made(PlacePose).base_from_surface,
+        here.mover,
+        here.devices.arm,
+        here.devices.claw,
+        here.part,
+        context.check,
+        context.progress,
+        lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
+    )
+
+
+# A part that may have touched the surface is not placed a second time by itself.
+STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(PlacePose,))

@@ -22,8 +22,12 @@ from cell.reconstruction import (
 )
 from cell.reconstruction.cloud import Array, Indices
 from cell.reconstruction.seams import Motions
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.step import JobStep
+from cell.steps.sweep_record import SweepRecord
+from cell.steps.workplace import Workplace
 from drivers.errors import RefusedError
+from statemachine.policy import Step
+from statemachine.runner import StepContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,3 +87,17 @@ def reconstruct(
     seams = tuple(find_seams(cloud, by_both))
     write_cloud(path, cloud)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
+
+
+def _at(here: Workplace, context: StepContext) -> Reconstruction:
+    return reconstruct(
+        context.made(SweepRecord),
+        here.calibration.scan,
+        here.job.scan.largest_hole,
+        here.folder / "cloud.ply",
+        here.config.arm.vehicle_from_base.se3().inverse(),
+        here.config.vehicle.lean_sigma,
+    )
+
+
+STEP = JobStep(Step("reconstruct", 60.0, on_wall=True), _at, Reconstruction, needs=(SweepRecord,))

@@ -18,9 +18,9 @@ import pinocchio as pin
 from cell.geometry.poses import difference, from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
-from cell.steps.laser_sweep import SweepRecord
 from cell.steps.photograph import BoardFix
 from cell.steps.swath import Collector, Swath
+from cell.steps.sweep_record import SweepRecord
 from drivers.camera.folder import read_image
 from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame, Vector

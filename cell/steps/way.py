@@ -1,7 +1,7 @@
 """Whether a way of the vehicle may be driven: how far on odometry alone, and how close to the station.
 
 Everything is seen from above, in the place frame. The way is the one that the line law would drive without errors; the
-room that it needs grows with the distance since the vehicle was last seen.
+room that it needs grows with how far the vehicle has gone, and turned on the spot, since it was last seen.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ MARGIN = 0.05
 """What stays between vehicle and station, m, when the vehicle has just been seen."""
 DRIFT = 0.05
 """More of it for each metre on odometry alone."""
+TURN_DRIFT = 0.075
+"""What the heading may be off by, rad, for each radian turned on the spot on odometry alone: twice the 1-sigma slip of
+a harsh simulated cell, which the wheels of a skid-steered vehicle have most of where it turns."""
 ROOM_BEYOND = 0.25
 """How much further than the job's way to its staging pose the vehicle may go on odometry alone, m."""
 BACK_UP = 0.45
@@ -45,20 +48,21 @@ class Way:
             body.name: _outline(body, pin.SE3.Identity()) for body in station_bodies(pin.SE3.Identity(), board)
         }
         self._vehicle = _outline(vehicle_bodies()[0], vehicle_from_base)
+        self._reach = float(np.linalg.norm(self._vehicle, axis=1).max())
         start, staging = Planar.of(job.approach.start.se3()), Planar.of(job.approach.staging.se3())
         self.longest = max(math.hypot(staging.x - start.x, staging.y - start.y), 2 * BACK_UP) + ROOM_BEYOND
 
     def require_line(self, goal: Planar) -> None:
         """Raise `RefusedError` unless the vehicle may drive along the goal's line to `goal` on odometry."""
-        pose, length = self._whereabouts.pose(), self._whereabouts.way
-        self._require_room(pose, length)
+        pose, length, turned = self._whereabouts.pose(), self._whereabouts.way, self._whereabouts.turned
+        self._require_room(pose, length, turned)
         for _ in range(round(_LONGEST_S / _STEP_S)):
             speed, rate = line_command(pose, goal, self._job.approach.speed)
             if speed == 0.0:
                 break
             pose = pose * Planar(speed * _STEP_S, 0.0, rate * _STEP_S)
             length += abs(speed) * _STEP_S
-            self._require_room(pose, length)
+            self._require_room(pose, length, turned)
         if length > self.longest:
             raise RefusedError(
                 f"the vehicle would go {length:.2f} m on odometry alone since it was last seen, allowed "
@@ -67,15 +71,17 @@ class Way:
 
     def require_turn(self, yaw: float) -> None:
         """Raise `RefusedError` unless the vehicle may turn on the spot to `yaw`."""
-        pose, length = self._whereabouts.pose(), self._whereabouts.way
+        pose, length, turned = self._whereabouts.pose(), self._whereabouts.way, self._whereabouts.turned
         turn = wrap(yaw - pose.yaw)
         for share in np.linspace(0.0, 1.0, 2 + int(abs(turn) / _STEP_TURN)):
-            self._require_room(Planar(pose.x, pose.y, pose.yaw + float(share) * turn), length)
+            part = float(share) * turn
+            self._require_room(Planar(pose.x, pose.y, pose.yaw + part), length, turned + abs(part))
 
-    def _require_room(self, pose: Planar, length: float) -> None:
+    def _require_room(self, pose: Planar, length: float, turned: float) -> None:
         c, s = math.cos(pose.yaw), math.sin(pose.yaw)
         corners = self._vehicle @ np.array([[c, s], [-s, c]]) + np.array([pose.x, pose.y])
-        needed = MARGIN + DRIFT * length
+        # A wrong heading swings the corners, and leads aside on the way after it.
+        needed = MARGIN + DRIFT * length + TURN_DRIFT * turned * (self._reach + length)
         for name, outline in self._station.items():
             room = distance(corners, outline)
             if room < needed:

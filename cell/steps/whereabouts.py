@@ -18,6 +18,9 @@ from drivers.interfaces import Vehicle, VehicleState
 PLAUSIBLE = 0.10
 """A sighting this far, m, from what odometry says is worth a note."""
 PLAUSIBLE_ANGLE = math.radians(5)
+TIGHT = 0.3
+"""Turns about a point nearer than this, m, count as on the spot: about half the track, the wheels go against each
+other and scrub. Wider ones are part of the way."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class _Anchor:
 class Whereabouts:
     """The vehicle's pose in the place frame as far as it is known. One for each connected vehicle, used by one thread.
 
-    `way` is how far it has gone, m, since it was seen or said.
+    `way` is how far it has gone, m, and `turned` how far it has turned on the spot, rad, either way, since it was seen
+    or said: what odometry may be off by grows with both.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -41,7 +45,7 @@ class Whereabouts:
         self._board: BoardSection | None = None
         self._unknown = "this program has just connected to it"
         self._last = Planar(0.0, 0.0, 0.0)
-        self.way = 0.0
+        self.way = self.turned = 0.0
 
     @property
     def anchored(self) -> bool:
@@ -96,15 +100,28 @@ class Whereabouts:
             self._lose(state.interruption)
         if self._anchor is None or self._anchor.pose is None:
             raise RefusedError(f"where the vehicle stands is not known: {self._unknown}")
+        return self._anchor.pose * self._anchor.reading.inverse() * self._count(state)
+
+    def count(self) -> None:
+        """Count what it has gone since the last look; for those who drive it by other means than `pose`, all the time.
+
+        A way there and back is none between two looks.
+        """
+        self._count(self._vehicle.state())
+
+    def _count(self, state: VehicleState) -> Planar:
         now = _reading(state)
-        self.way += math.hypot(now.x - self._last.x, now.y - self._last.y)
+        way, turn = math.hypot(now.x - self._last.x, now.y - self._last.y), abs(wrap(now.yaw - self._last.yaw))
+        self.way += way
+        if way < TIGHT * turn:
+            self.turned += turn
         self._last = now
-        return self._anchor.pose * self._anchor.reading.inverse() * now
+        return now
 
     def _hold(self, pose: Planar | None) -> None:
         state = self._vehicle.state()
         self._anchor = _Anchor(pose, _reading(state), state.interruptions)
-        self._last, self.way = self._anchor.reading, 0.0
+        self._last, self.way, self.turned = self._anchor.reading, 0.0, 0.0
 
     def _lose(self, why: str) -> None:
         self._anchor, self._unknown = None, why

@@ -31,6 +31,10 @@ class TmclRail:
     step, a power of two up to 256. `reference_mode` is the module's axis parameter 193 (5: home switch in negative
     direction, turning round at the left limit switch). The module's serial number, if any, is its user variable 0.
     A module that was homed under the same settings, and not reset since, stays homed.
+
+    With `control=False` the module is only looked at: nothing on it is set, started or ended, by `close` neither, and a
+    motion that runs on it runs on. Everything but reading is then an `InterlockError`.
+
     Raises `NotConnectedError` or `DeadlineError` when no module answers, `ConfigError` on impossible parameters.
     """
 
@@ -50,6 +54,7 @@ class TmclRail:
         clock: Clock,
         baud: int = 9600,
         reference_mode: int = 5,
+        control: bool = True,
     ) -> None:
         positive = {"lead": lead, "steps per turn": steps_per_turn, "speed": max_speed, "acceleration": acceleration}
         _check_parameters(name, microsteps, travel, positive)
@@ -62,6 +67,7 @@ class TmclRail:
         self._acceleration = acceleration
         self._microsteps = microsteps
         self._reference_mode = reference_mode
+        self._control = control
         self._homing = False
         self._motion: RailMotion | None = None
         self._motion_issued = 0
@@ -72,8 +78,9 @@ class TmclRail:
         self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode))
         try:
             self._link.firmware()
-            self._zero.meet(microsteps.bit_length() - 1, reference_mode)
-            self._set_up()
+            self._zero.meet(microsteps.bit_length() - 1, reference_mode, mark=control)
+            if control:
+                self._set_up()
         except CellError:
             self._link.close()
             raise
@@ -179,19 +186,25 @@ class TmclRail:
 
     def stop(self) -> None:
         """Stop the motor now; every motion and every command still waiting ends with `Aborted`."""
+        self._require_control()
         self._homing = False
         self._link.stop()
 
     def close(self) -> None:
-        """Stop the motor and close the port."""
+        """Stop the motor, unless it is only looked at, and close the port."""
         if self._link.closed:
             return
         try:
-            self.stop()
+            if self._control:
+                self.stop()
         finally:
             self._link.close()
             if self._motion is not None:
                 self._motion.join(2.0)
+
+    def _require_control(self) -> None:
+        if not self._control:
+            raise InterlockError(self.name, "was opened to be looked at only; nothing was sent. Open it for control")
 
     def _pulses(self, value: float) -> int:
         return max(1, round(value * self._counts))
@@ -207,6 +220,7 @@ class TmclRail:
 
     def _free(self) -> int:
         """The count of stops to issue a motion under; `InterlockError` while another motion runs."""
+        self._require_control()
         issued = self._link.stops
         if self._motion is not None and not self._motion.done:
             if self._link.stops != self._motion_issued:

@@ -38,23 +38,25 @@ class ZeroMark:
         self.found_here = False
         """Whether this program saw the search end; what an earlier one found may be long ago."""
 
-    def meet(self, microstep_resolution: int, reference_mode: int) -> None:
+    def meet(self, microstep_resolution: int, reference_mode: int, *, mark: bool = True) -> None:
         """On connecting, before anything is set: take the mark away unless it is this program's and nothing speaks
-        against it that happened while nobody watched: another resolution, a stall, a limit switch."""
+        against it that happened while nobody watched: another resolution, a stall, a limit switch.
+
+        Without `mark` the module is left as it is; its zero is not trusted here all the same.
+        """
         link = self._link
-        if link.user_variable(MARK_VARIABLE) != self._value:
+        if link.user_variable(MARK_VARIABLE) == self._value:
+            switches = (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH) if reference_mode in _HOME_SWITCH_MODES else ()
+            self._seen = not (
+                link.get(Axis.MICROSTEP_RESOLUTION) != microstep_resolution
+                or link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG
+                or any(link.get(switch) for switch in switches)
+            )
+            if not self._seen:
+                _log.warning("%s: stalled, at a limit switch or set up anew since its homing; not homed", link.name)
+        if mark and not self._seen:
             link.set_user_variable(MARK_VARIABLE, _NONE)
-            return
-        switches = (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH) if reference_mode in _HOME_SWITCH_MODES else ()
-        if (
-            link.get(Axis.MICROSTEP_RESOLUTION) != microstep_resolution
-            or link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG
-            or any(link.get(switch) for switch in switches)
-        ):
-            _log.warning("%s: stalled, at a limit switch or set up anew since its homing; not homed", link.name)
-            link.set_user_variable(MARK_VARIABLE, _NONE)
-            return
-        self._seen = True
+        self._distrusted = not mark and not self._seen
 
     def searching(self, *, issued: int) -> None:
         """A reference search begins: no zero until it has been found."""

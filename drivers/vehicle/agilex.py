@@ -58,7 +58,9 @@ class AgilexVehicle:
         self._max_speed = max_speed
         self._max_yaw_rate = max_yaw_rate
         self._clock = clock
-        self._feedback = Feedback(name, clock, track=track, max_speed=max_speed, statistics=self.statistics)
+        self._feedback = Feedback(
+            name, clock, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate, statistics=self.statistics
+        )
         self._command = threading.Lock()
         self._velocity = (0.0, 0.0)
         self._renewed = -math.inf

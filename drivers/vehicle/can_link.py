@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from importlib.resources import as_file, files
@@ -38,7 +39,7 @@ def load_database() -> Database:
 
 class CanLink:
     """An open CAN bus; `receive` is called in the receive thread with each known message's name and signal values,
-    and `idle` with the seconds on the wall for which it has waited in vain.
+    and `idle` with the seconds on the wall for which it has waited before each frame, whoever sent that.
 
     `wanted` names the messages that are decoded; others are ignored. Raises `NotConnectedError` when the bus cannot be
     opened, `ConfigError` when python-can has no such interface.
@@ -172,10 +173,11 @@ class CanLink:
     def _run(self) -> None:
         while not self._closing.is_set() and self._failure is None:
             try:
+                begun = time.monotonic()
                 frame = self._bus.recv(RECEIVE_TIMEOUT_S)
-                if frame is None:
-                    self._idle(RECEIVE_TIMEOUT_S)
-                else:
+                # Also while others talk on the bus. A thread that was not run did not wait any longer.
+                self._idle(min(time.monotonic() - begun, RECEIVE_TIMEOUT_S))
+                if frame is not None:
                     self._handle(frame)
             except (ValueError, IndexError):
                 self._statistics.count("malformed")

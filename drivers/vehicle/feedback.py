@@ -33,6 +33,7 @@ _FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
 _JUMP_M = 0.05
+"""What a side may count from one reading to the next besides what it can have driven: readings come in bursts."""
 _STILL = 0.002
 """Reported speeds up to this, m/s and rad/s, count as standstill: two steps of the protocol."""
 
@@ -45,10 +46,19 @@ def patience(clock: Clock, seconds: float) -> float:
 class Feedback:
     """The newest messages by name, each with its host time; filled by the receive thread through `take`."""
 
-    def __init__(self, name: str, clock: Clock, *, track: float, max_speed: float, statistics: LinkStatistics) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        *,
+        track: float,
+        max_speed: float,
+        max_yaw_rate: float,
+        statistics: LinkStatistics,
+    ) -> None:
         self._name = name
         self._clock = clock
-        self._max_speed = max_speed
+        self._side_speed = max_speed + 0.5 * track * max_yaw_rate
         self._statistics = statistics
         self._odometry = PlanarOdometry(track)
         self._news = threading.Condition(threading.RLock())
@@ -78,7 +88,7 @@ class Feedback:
             self._news.notify_all()
 
     def idle(self, seconds: float) -> None:
-        """The receiver has waited for `seconds` on the wall and nothing came."""
+        """The receiver has waited for `seconds` on the wall; what came then may have been another's."""
         with self._news:
             self._quiet += seconds
 
@@ -98,8 +108,10 @@ class Feedback:
             self._disturbed, self._rest = "", None
 
     def _count(self, now: float, left: int, right: int) -> None:
-        gap = now - self._newest["Odometry"][0] if "Odometry" in self._newest else 0.0
-        if not self._odometry.update(left, right, _JUMP_M + 2.0 * self._max_speed * gap):
+        before = self._newest["Odometry"][0] if "Odometry" in self._newest else now
+        # It has driven no longer than since its last reading, and only until it came to rest after its last command.
+        driven = max(0.0, min(now, self._commanded + REST_AFTER_S) - before)
+        if not self._odometry.update(left, right, _JUMP_M + self._side_speed * driven):
             self._statistics.count("odometry_restarted")
             self.interrupt("its odometers jumped, so it was restarted")
         if now - self._commanded < REST_AFTER_S:

@@ -291,11 +291,11 @@ def test_a_recovery_ends_the_old_program_before_it_unlocks_even_if_its_process_h
     bench.ask("protective_stop")
     with pytest.raises(DeviceFault, match="a person confirms"):
         arm.recover()
-    os.kill(arm._session.link.pid, signal.SIGCONT)
     assert soon(lambda: not bench.ask("show")["moving"])
     bench.ask("clear")
     dashboard(bench, "play")
     assert stands_still(bench)
+    os.kill(arm._session.link.pid, signal.SIGCONT)
     arm.recover()
 
 

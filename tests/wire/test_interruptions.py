@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from cell.run.folder import list_runs, read_report, run_row
 from cell.run.resumption import UnfinishedRun
 from cell.steps.stored_sweep import FILE
+from drivers.clock import Clock
 from drivers.errors import ConfigError
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
 
@@ -70,6 +73,41 @@ def test_a_fault_that_a_program_may_not_clear_ends_the_run_safe_and_names_the_de
     assert not end["arm"]["moving"]
     assert not end["rail_moving"]
     assert end["part"]["held"], "whatever fails before the release, the part stays in the claw"
+
+
+@pytest.mark.parametrize(
+    ("moment", "number"), [("the report is made", signal.SIGTERM), ("the cell is closed", signal.SIGINT)]
+)
+def test_a_signal_after_the_part_was_placed_ends_the_program_as_interrupted_and_the_report_stays_true(
+    place: Path, moment: str, number: signal.Signals
+) -> None:
+    before = set(list_runs(place / "runs"))
+    with started("dry-run", "--seed", "3", folder=place) as run:
+        assert run.stdout is not None
+        if moment == "the report is made":
+            wait_for_end(place, before)
+            shown = ""
+        else:
+            shown = run.stdout.readline()
+        run.send_signal(number)
+        rest, error = run.communicate(timeout=60)
+    assert run.returncode == 130, error
+    assert (shown + rest).startswith("placed  ")
+    assert "interrupted after the part had been placed" in error
+    (folder,) = set(list_runs(place / "runs")) - before
+    report = read_report(folder)
+    assert report["outcome"] == "placed"
+    assert report["end_state"]["vehicle"]["braked"]
+
+
+def wait_for_end(folder: Path, before: set[Path]) -> None:
+    """Wait until a run that was not there before has placed."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if any(run_row(run)["outcome"] == "placed" for run in set(list_runs(folder / "runs")) - before):
+            return
+        Clock().sleep(0.01)
+    raise AssertionError("no run placed")
 
 
 def test_an_arm_whose_states_all_come_late_does_not_sweep(place: Path) -> None:

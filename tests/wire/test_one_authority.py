@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cell import Cell, RunOutcome
-from cell.report.truth import ask_truth
+from cell.devices.truth_link import ask_truth
 from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
 from cell.run.folder import is_going, list_runs, read_report
 from cell.run.run import Run
@@ -86,12 +86,13 @@ def test_a_protective_stop_waits_for_a_person_a_pause_holds_and_the_part_is_plac
         assert joints(made) == pytest.approx(before, abs=1e-4), f"held at {held}"
         run.go_on()
         asked = until(run, lambda event: isinstance(event, ConfirmNeeded))
-        assert "protective stop" in asked.reason  # type: ignore[attr-defined]
+        assert isinstance(asked, ConfirmNeeded)
+        assert "protective stop" in asked.reason
         before = joints(made)
         Clock().sleep(1.0)
         assert ask_truth(made.config.cell.truth)["arm"]["safety"] == "protective_stop"
         assert joints(made) == pytest.approx(before, abs=1e-4)
-        assert cell("confirm", "--by", "Ann", folder=place).returncode == 0
+        assert cell("confirm", "--question", str(asked.number), "--by", "Ann", folder=place).returncode == 0
         result = run.result(120.0)
         assert result.outcome == "placed", result.reason
         (fault,) = [event for event in run.events() if isinstance(event, FaultMet)]

@@ -50,7 +50,9 @@ class Bench:
         return self.model.carriage(host_time + self.world.now() - self.clock.now())
 
 
-def connect(url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1) -> TmclRail:
+def connect(
+    url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1, control: bool = True
+) -> TmclRail:
     return TmclRail(
         "rail",
         url,
@@ -62,6 +64,7 @@ def connect(url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), ad
         acceleration=ACCELERATION,
         address=address,
         motor=0,
+        control=control,
         clock=clock,
     )
 
@@ -608,3 +611,31 @@ def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(mo
         rail.move_to(0.05).wait(10.0)
     assert not rail.state().homed
     rail.close()
+
+
+@pytest.mark.wire
+def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(4, 0, round(0.09 / 0.002 * 200 * 256)))
+    before = homed.model.settings
+    looking = connect(homed.peer.url, homed.clock, control=False)
+    state = looking.state()
+    assert state.moving
+    assert state.homed
+    for command in (looking.home, lambda: looking.move_to(0.01), looking.stop):
+        with pytest.raises(InterlockError, match="looked at only"):
+            command()
+    looking.close()
+    assert homed.model.settings == before
+    homed.clock.sleep(4.0)
+    assert homed.carriage() == pytest.approx(0.09, abs=1e-5)
+
+
+@pytest.mark.wire
+def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 140, 7))
+    looking = connect(homed.peer.url, homed.clock, control=False)
+    assert not looking.state().homed
+    looking.close()
+    assert homed.model.settings.microsteps == 7

@@ -10,7 +10,7 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.aiming import Aim
 from cell.calibration.store import nominal_camera
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
 from cell.steps.moves import HOME, Mover
@@ -74,7 +74,7 @@ def collect_scan(
             continue
         aim.learn(seen, from_ur(devices.arm.state().flange), rail.state().position)
         camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
-        with devices.laser.lit():
+        with devices.interlocks.purpose("calibration"), devices.laser.lit():
             lit = camera.grab()
         keep(f"{what}-stripe", lit)
         stripe = extract(lit.image)
@@ -133,7 +133,6 @@ def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
     except DeviceFault as fault:
         if fault.device != devices.arm.name or not fault.recoverable:
             raise
-        devices.gate.require()
         devices.arm.recover()
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
 

@@ -47,12 +47,17 @@ def zhang(
         matrix, dist = nominal.matrix, np.array(nominal.dist, dtype=np.float64)
     objects = [v.object_points.astype(np.float32) for v in views]
     pixels = [v.pixels.astype(np.float32).reshape(-1, 1, 2) for v in views]
+    threads = cv2.getNumThreads()
+    # On several threads it adds up in whatever order they come, so that the last digits differ from time to time.
+    cv2.setNumThreads(1)
     try:
         result = cv2.calibrateCameraExtended(objects, pixels, size, matrix, dist, flags=flags)
     except cv2.error as error:
         raise RefusedError(
             f"the {len(views)} views do not determine a camera: {error.err}; tilt the board more"
         ) from error
+    finally:
+        cv2.setNumThreads(threads)
     matrix = np.asarray(result[1], dtype=np.float64)
     dist = np.asarray(result[2], dtype=np.float64).ravel()[:5]
     per_view = np.asarray(result[7], dtype=np.float64).ravel()

@@ -18,7 +18,7 @@ from cell.calibration.collect.boards import PHOTO_RATE, Check, Keep, Progress, l
 from cell.calibration.store import CellCalibration
 from cell.calibration.verify.looks import CheckObservations
 from cell.config import CellConfig
-from cell.devices.assembly import Devices
+from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from cell.report.truth import TIMEOUT_S
+from cell.devices.truth_link import TIMEOUT_S
 from cell.run.folder import is_going, list_runs
+from cell.steps.kinds import PLACE
 from drivers.clock import Clock
 from drivers.errors import CellError
 from statemachine.journal import JournalError, read, request
-from statemachine.sequence import STEPS
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ JOGS = {
     "jog rail": ("jog", "rail", "+80mm"),
     "jog vehicle": ("jog", "vehicle", "-0.4m"),
 }
-WORK = (*(step.value for step in STEPS), "calibration", "verification", *JOGS)
+WORK = (*PLACE.names, "calibration", "verification", *JOGS)
 """What is ended: the six steps of a job, and the runs that are no job."""
 _LASTS_S = {
     "drive_to_target": 14.0, "board_photo": 4.0, "laser_sweep": 10.0, "reconstruct": 2.0, "invert_pose": 2.0,

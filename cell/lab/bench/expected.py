@@ -28,7 +28,7 @@ from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction import Cloud, calibration_motions, flange_motions
 from cell.reconstruction.build import ScanGeometry
 from cell.report.bound import part_points
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.sweep_record import SweepRecord
 from drivers.interfaces import Vector
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 

@@ -1,8 +1,7 @@
-"""One simulated cell from its calibration to the placed part, in lock step, by the product's own steps."""
+"""One simulated cell from its calibration to the placed part, on the virtual clock, by the product's own runner."""
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -16,23 +15,22 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
+from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import Job
-from cell.lab.bench.lockstep import LockstepCell
-from cell.lab.bench.lockstep_arm import LockstepArm
-from cell.lab.bench.lockstep_camera import LockstepCamera, Shot
 from cell.run.frames import FrameStore
-from cell.run.job_run import classify
-from cell.run.work import JobWork
-from cell.steps.laser_sweep import SweepRecord
+from cell.run.job_run import JobRun, classify
+from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.run import Run
+from cell.steps.kinds import PLACE
 from cell.steps.moves import Mover
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
-from sim_backends.world.truth import truth
-from statemachine.policy import Policy
-from statemachine.runner import StepContext
-from statemachine.sequence import State
+from sim_backends.direct.camera import Shot
+from statemachine.step import Event
 
 Progress = Callable[[float, str], None]
 
@@ -84,74 +82,94 @@ def run_whole_job(
 ) -> JobRecord:
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
-    Refusals and faults end it as they end a run, without the runner's repetitions. `calibrated` is a record of the same
-    cell, whose calibration is used again.
+    `calibrated` is a record of the same cell, whose calibration is used again.
     """
-    tell = progress or (lambda fraction, text: None)
+    cell = VirtualCell(config, seed, level, Path(job.surface.mesh).stem)
     record = JobRecord(seed, level)
-    cell = LockstepCell(config, seed, level, Path(job.surface.mesh).stem)
+    whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:
+        with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
+            Run("job", lambda run: whole.perform(run, Path(folder), calibrated)).result()
+    except CellError as error:
+        failure = classify(error)
+        record.outcome, record.reason = failure.outcome.value, failure.reason
+    record.at_end = cell.truth()
+    before = [] if calibrated is None or calibrated.rests is None else list(calibrated.rests)
+    record.rests = np.array([*before, *cell.arm.rests])
+    return record
+
+
+@dataclass(frozen=True, eq=False)
+class _WholeJob:
+    """Calibration and job of one cell, as the supervisor has them done."""
+
+    cell: VirtualCell
+    config: CellConfig
+    job: Job
+    nominal: NominalSurface
+    record: JobRecord
+    tell: Progress
+
+    def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None) -> None:
+        """Fill the record; runs go to `folder`."""
+        record, devices = self.record, self.cell.devices
         if calibrated is not None:
             record.calibration, record.observations = calibrated.calibration, calibrated.observations
         else:
             with _Timed(record, "calibrate"):
-                record.calibration = _calibrate(
-                    cell, config, job, record, lambda f, t: tell(0.6 * f, f"calibrate: {t}")
-                )
-        with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
-            _steps(cell, config, job, nominal, record, Path(folder), tell)
-    except CellError as error:
-        failure = classify(error)
-        record.outcome, record.reason = failure.outcome.value, failure.reason
-    record.at_end = truth(cell.world)
-    arm = cell.devices.arm
-    assert isinstance(arm, LockstepArm)
-    before = [] if calibrated is None or calibrated.rests is None else list(calibrated.rests)
-    record.rests = np.array([*before, *arm.rests])
-    return record
+                work = RecordedWork(run, "calibration", devices, folder, self.cell.facts)
+                record.calibration = work.perform(self._calibrate)
+        assert record.calibration is not None
+        whereabouts = Whereabouts(devices.vehicle)
+        whereabouts.say_at_start()
+        record.kinematic = Workplace(
+            self.config, self.job, self.nominal, record.calibration, devices, NoFrames(), folder, whereabouts
+        ).kinematic
+        job_run = JobRun(
+            run,
+            self.config,
+            devices,
+            self.job,
+            self.nominal,
+            record.calibration,
+            self.cell.facts,
+            PLACE,
+            inline=(self._follow,),
+            truth=self.cell.truth,
+        )
+        with _Timed(record, "job"):
+            ended = job_run.perform(folder, whereabouts)
+        record.results = dict(ended.results)
+        if ended.outcome != "placed":
+            record.outcome, record.reason = ended.outcome, ended.reason
+        if "laser_sweep" in record.results:
+            record.shots = _shots(self.cell, record.results["laser_sweep"])
+
+    def _calibrate(self, hands: Hands) -> CellCalibration:
+        mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, hands.safe_point)
+        self.cell.devices.vehicle.brake()
+        devices, tell = self.cell.devices, self.tell
+        given, keep = (self.config, devices, mover, hands.check), NoFrames().keep
+        scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
+        target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
+        self.record.observations = (scan, target)
+        tell(0.48, "calibrate: solving")
+        named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
+        identities = {device.name: device.identity().serial for device in named}
+        return CellCalibration.solve(scan, target, identities, self.config)
+
+    def _follow(self, event: Event) -> None:
+        """What the run comes to."""
+        names = PLACE.names
+        if event.kind == "step_started" and event.step in names:
+            self.record.stage = str(event.step)
+            self.tell(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))
+        if event.kind == "step_done" and event.step == "laser_sweep":
+            self.record.at_sweep = self.cell.truth()
 
 
-def _calibrate(cell: LockstepCell, config: CellConfig, job: Job, record: JobRecord, tell: Progress) -> CellCalibration:
-    mover = Mover(cell.devices.arm, cell.clock, config, job)
-    cell.devices.vehicle.brake()
-    keep = NoFrames().keep
-    scan = collect_scan(config, cell.devices, mover, _never, lambda f, t: tell(0.6 * f, t), keep)
-    target = collect_target(config, cell.devices, mover, _never, lambda f, t: tell(0.6 + 0.2 * f, t), keep)
-    record.observations = (scan, target)
-    tell(0.8, "solving")
-    return CellCalibration.solve(scan, target, cell.identities(), config)
-
-
-def _steps(
-    cell: LockstepCell,
-    config: CellConfig,
-    job: Job,
-    nominal: NominalSurface,
-    record: JobRecord,
-    folder: Path,
-    tell: Progress,
-) -> None:
-    assert record.calibration is not None
-    whereabouts = Whereabouts(cell.devices.vehicle)
-    whereabouts.say_at_start()
-    work = JobWork(config, job, nominal, record.calibration, cell.devices, NoFrames(), folder, whereabouts)
-    record.kinematic = work.kinematic
-    policy = Policy()
-    for k, (name, step) in enumerate(work.steps().items()):
-        record.stage = name
-        tell(0.6 + 0.4 * k / 6, name)
-        context = StepContext(policy.of(State(name)), 1, math.inf, dict(record.results), cell.clock, _ignore)
-        with _Timed(record, name):
-            record.results[name] = step(context)
-        if name == "laser_sweep":
-            record.at_sweep = truth(cell.world)
-            record.shots = _shots(cell, record.results[name])
-
-
-def _shots(cell: LockstepCell, sweep: SweepRecord) -> list[Shot]:
-    camera = cell.devices.scan_camera
-    assert isinstance(camera, LockstepCamera)
-    return [camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
+def _shots(cell: VirtualCell, sweep: SweepRecord) -> list[Shot]:
+    return [cell.scan_camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
 
 
 class _Timed:
@@ -165,11 +183,3 @@ class _Timed:
 
     def __exit__(self, *_: object) -> None:
         self._record.wall_s[self._stage] = round(time.monotonic() - self._begun, 3)
-
-
-def _never() -> None:
-    """Nobody asks a campaign's cell to stop."""
-
-
-def _ignore(event: object) -> None:
-    """Nobody watches the steps."""

@@ -1,0 +1,234 @@
+"""The makes that come with the cell: their records in `cell.toml` and how each is connected.
+
+Drivers are imported when a device is connected: reading a configuration needs none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
+
+from pydantic import model_validator
+
+from cell.addresses import Endpoint, Host, Port, checked_can
+from cell.device_config import (
+    ArmConfig,
+    CameraConfig,
+    ClawConfig,
+    DeviceConfig,
+    LaserConfig,
+    RailConfig,
+    VehicleConfig,
+    real_path,
+)
+from cell.devices.make import AnyMake, Make, Surroundings
+from cell.units import quantity, whole
+
+if TYPE_CHECKING:
+    from drivers.arm.ur import UrArm
+    from drivers.camera.stream import StreamCamera
+    from drivers.rail.tmcl import TmclRail
+    from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
+    from drivers.vehicle.agilex import AgilexVehicle
+
+MODULE_COUNTS = 2**31 - 1
+"""Microsteps to which the rail's module counts, positions and microsteps per second alike."""
+
+Connector = Annotated[int, whole(0, 17, meaning=": 0-7 standard, 8-15 configurable, 16-17 tool")]
+
+
+class TmclRailConfig(RailConfig):
+    """A stepper rail on a TMCL module on a serial line."""
+
+    ADDRESS: ClassVar[str] = "url"
+
+    driver: Literal["tmcl"] = "tmcl"
+    url: Annotated[str, Port]
+    address: Annotated[int, whole(1, 255)] = 1
+    motor: Annotated[int, whole(0, 5)] = 0
+    steps_per_turn: Annotated[int, whole(20, 2000)]
+    microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
+
+    @model_validator(mode="after")
+    def _countable(self) -> Self:
+        low, high = self.travel
+        counts = self.steps_per_turn * self.microsteps / self.lead
+        for name, value in (
+            ("travel", max(-low, high)),
+            ("max_speed", self.max_speed),
+            ("acceleration", self.acceleration),
+        ):
+            if value * counts > MODULE_COUNTS:
+                raise ValueError(
+                    f"{name} would be {value * counts:.3g} microsteps with this lead, steps_per_turn and microsteps; "
+                    f"the module counts to {MODULE_COUNTS}. Use fewer microsteps"
+                )
+        return self
+
+
+class UrArmConfig(ArmConfig):
+    """An arm of Universal Robots' e-series."""
+
+    driver: Literal["ur"] = "ur"
+    address: Annotated[str, Host]
+
+
+class AgilexVehicleConfig(VehicleConfig):
+    """A carrier that speaks AgileX protocol v2 on CAN."""
+
+    ADDRESS: ClassVar[str] = "channel"
+
+    driver: Literal["agilex"] = "agilex"
+    interface: str
+    channel: str
+    bitrate: Annotated[float, quantity("kbit/s", 10, 1000)]
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        checked_can(self.interface, self.channel, self.bitrate)
+        return self
+
+    @property
+    def place(self) -> str:
+        """The channel, without the speed of a serial line behind it."""
+        return self.channel.partition("@")[0]
+
+    @property
+    def held(self) -> str:
+        """Interface and channel: two interfaces may count their channels alike."""
+        return f"{self.interface}:{real_path(self.place)}"
+
+
+class StreamCameraConfig(CameraConfig):
+    """A camera on the frame stream protocol."""
+
+    driver: Literal["stream"] = "stream"
+    address: Annotated[str, Endpoint]
+
+
+class OnArm(DeviceConfig):
+    """A device that an output of the arm switches."""
+
+    ADDRESS: ClassVar[str] = "output"
+
+    output: Connector
+
+    @property
+    def place(self) -> str:
+        """The arm's output."""
+        return f"arm output {self.output}"
+
+
+class ArmOutputLaserConfig(LaserConfig, OnArm):
+    """A laser that an output of the arm switches."""
+
+    driver: Literal["arm_output"] = "arm_output"
+
+
+class ArmOutputClawConfig(ClawConfig, OnArm):
+    """A claw that an output of the arm closes; an input of the arm shows a held part."""
+
+    driver: Literal["arm_output"] = "arm_output"
+    feedback: Connector
+
+
+def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
+    from drivers.rail.tmcl import TmclRail
+
+    return TmclRail(
+        name,
+        config.url,
+        lead=config.lead,
+        steps_per_turn=config.steps_per_turn,
+        microsteps=config.microsteps,
+        travel=config.travel,
+        max_speed=config.max_speed,
+        acceleration=config.acceleration,
+        address=config.address,
+        motor=config.motor,
+        control=not around.look,
+        clock=around.clock,
+    )
+
+
+def _arm(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
+    from drivers.arm.limits import ArmLimits
+    from drivers.arm.ur import UrArm
+
+    return UrArm(
+        name,
+        config.address,
+        clock=around.clock,
+        limits=ArmLimits(
+            joint_speeds=(config.max_joint_speed,) * 6,
+            joint_acceleration=config.max_joint_acceleration,
+            linear_speed=config.max_tool_speed,
+        ),
+        payload=(config.payload, config.payload_centre),
+        safe_off_outputs=around.safe_off_outputs,
+        forward=around.forward,
+        control=not around.look,
+    )
+
+
+def _vehicle(name: str, config: AgilexVehicleConfig, around: Surroundings) -> AgilexVehicle:
+    from drivers.vehicle.agilex import AgilexVehicle
+
+    return AgilexVehicle(
+        name,
+        config.interface,
+        config.channel,
+        bitrate=round(config.bitrate),
+        track=config.track,
+        max_speed=config.max_speed,
+        max_yaw_rate=config.max_yaw_rate,
+        clock=around.clock,
+    )
+
+
+def _camera(name: str, config: StreamCameraConfig, around: Surroundings) -> StreamCamera:
+    from drivers.camera.stream import StreamCamera
+
+    return StreamCamera(name, config.address, shape=(config.height, config.width), clock=around.clock)
+
+
+def _laser(name: str, config: ArmOutputLaserConfig, around: Surroundings) -> ArmSwitchedLaser:
+    from drivers.switches import ArmSwitchedLaser
+
+    return ArmSwitchedLaser(name, around.require_arm(), config.output)
+
+
+def _claw(name: str, config: ArmOutputClawConfig, around: Surroundings) -> ArmSwitchedClaw:
+    from drivers.switches import ArmSwitchedClaw
+
+    return ArmSwitchedClaw(name, around.require_arm(), config.output, config.feedback, clock=around.clock)
+
+
+Record = TypeVar("Record", bound=DeviceConfig)
+
+
+def _with(*keys: str) -> Callable[[Record, Mapping[str, Any]], Record]:
+    """A record whose `keys` are those of the simulated peer."""
+
+    def simulated(record: Record, endpoint: Mapping[str, Any]) -> Record:
+        return record.model_copy(update={key: endpoint[key] for key in keys})
+
+    return simulated
+
+
+_OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
+
+BUILT_IN: tuple[AnyMake, ...] = (
+    Make(
+        "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
+        simulated=_with("url"),
+    ),
+    Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
+    Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
+    Make("camera", "stream", StreamCameraConfig, _camera, _OPTICS, simulated=_with("address")),
+    Make(
+        "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),
+        simulated=_with(), on_arm=True,
+    ),
+    Make("claw", "arm_output", ArmOutputClawConfig, _claw, simulated=_with(), on_arm=True),
+)  # fmt: skip

@@ -1,0 +1,82 @@
+"""A simulated cell in this process, on a virtual clock: the world's models behind the drivers' interfaces, no wires.
+
+Puts together what `sim_backends.direct` leaves open: the configuration's values, and the product's own logic that is to
+be proven there as well. Everything above the devices' interfaces is the product, unchanged.
+"""
+
+from __future__ import annotations
+
+from cell.config import CellConfig
+from cell.device_config import of_make
+from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
+from cell.devices.built_in import TmclRailConfig
+from cell.devices.devices import Devices
+from drivers.arm.faults import fault
+from drivers.arm.limits import ArmLimits
+from drivers.clock_map import ClockMap, Latch
+from drivers.errors import ConfigError
+from drivers.rail.timing import EvenMotion
+from drivers.vehicle.faults import system_trouble, vehicle_error
+from drivers.vehicle.odometry import PlanarOdometry
+from sim_backends.direct import faults
+from sim_backends.direct.cell import DirectCell
+from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+
+
+class VirtualCell(DirectCell):
+    """The cell of one seed and level, and its devices behind the gate as the product takes them."""
+
+    def __init__(self, config: CellConfig, seed: int, level: str = "nominal", surface: str = "pot") -> None:
+        """Raises `ConfigError` for an unknown level or surface."""
+        try:
+            super().__init__(setup_of(config), seed, level, surface)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
+        laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
+        self.devices: Devices = behind_gate(
+            config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
+        )
+
+    def require_fault(self, name: str) -> None:
+        """Raise `ConfigError` for a fault that only a wire can have."""
+        try:
+            faults.require(name)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    def close(self) -> None:
+        """The world ends with this object."""
+
+
+def setup_of(config: CellConfig) -> Setup:
+    """What the devices are given: the configuration's values and the drivers' logic."""
+    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
+    return Setup(
+        ArmSetup(
+            ArmLimits(
+                joint_speeds=(arm.max_joint_speed,) * 6,
+                joint_acceleration=arm.max_joint_acceleration,
+                linear_speed=arm.max_tool_speed,
+            ),
+            fault,
+            safe_off_outputs(config),
+        ),
+        RailSetup(
+            rail.lead,
+            rail.steps_per_turn,
+            rail.microsteps,
+            rail.travel,
+            rail.max_speed,
+            rail.acceleration,
+            EvenMotion.of,
+        ),
+        VehicleSetup(
+            vehicle.max_speed,
+            vehicle.max_yaw_rate,
+            PlanarOdometry(vehicle.track),
+            lambda bits: system_trouble(bits, commanded=True),
+            lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+        ),
+        CameraSetup(ClockMap, Latch),
+    )

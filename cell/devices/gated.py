@@ -1,0 +1,161 @@
+"""The devices behind the gate: each holds a device of any make and lets begin only what the gate lets begin.
+
+Reading, stopping and closing always pass. What a make offers beyond its interface is asked of the bare device (`bare`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+from cell.devices.gate import Gate, Gated
+from cell.devices.interlocks import Command
+from drivers.clock_map import Latch
+from drivers.interfaces import (
+    Arm,
+    ArmMotion,
+    ArmState,
+    Claw,
+    Motion,
+    Rail,
+    RailState,
+    Sweep,
+    Vector,
+    Vehicle,
+    VehicleState,
+)
+
+
+class GatedArm(Gated[Arm]):
+    """The arm, its motions and its recovery begun through a gate."""
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        """See `Arm.state`."""
+        return self.bare.state(max_age)
+
+    def record(self) -> AbstractContextManager[list[ArmState]]:
+        """See `Arm.record`."""
+        return self.bare.record()
+
+    def latch_clock(self) -> Latch:
+        """See `Arm.latch_clock`."""
+        return self.bare.latch_clock()
+
+    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
+        """See `Arm.move_joints`."""
+        command = Command("arm", "move_joints", {"joints": joints})
+        return self._move(command, lambda: self.bare.move_joints(joints, speed, acceleration))
+
+    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
+        """See `Arm.move_linear`."""
+        command = Command("arm", "move_linear", {"flange": flange})
+        return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
+
+    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
+        """See `Arm.follow`."""
+        command = Command("arm", "follow", {"joints": joints, "force_limit": force_limit})
+        return self._move(command, lambda: self.bare.follow(times, joints, force_limit))
+
+    def _move(self, command: Command, start: Callable[[], ArmMotion]) -> ArmMotion:
+        motion = self.gate.begin(command, start, self.bare.stop)
+        self.gate.interlocks.situation.last = motion
+        return motion
+
+    def zero_force(self) -> None:
+        """See `Arm.zero_force`."""
+        self.bare.zero_force()
+
+    def set_payload(self, mass: float, centre: Vector) -> None:
+        """See `Arm.set_payload`."""
+        self.bare.set_payload(mass, centre)
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """See `Arm.set_digital_output`."""
+        self.gate.interlocks.require(Command("arm", "set_digital_output", {"index": index, "value": value}))
+        self.bare.set_digital_output(index, value)
+
+    def digital_input(self, index: int) -> bool:
+        """See `Arm.digital_input`."""
+        return self.bare.digital_input(index)
+
+    def recover(self, *, confirmed: bool = False) -> None:
+        """See `Arm.recover`."""
+        self.gate.begin(Command("arm", "recover"), lambda: self.bare.recover(confirmed=confirmed), self.bare.stop)
+
+
+class GatedRail(Gated[Rail]):
+    """The rail, its motions begun through a gate."""
+
+    def __init__(self, bare: Rail, gate: Gate) -> None:
+        super().__init__(bare, gate)
+        self.travel = bare.travel
+
+    def state(self) -> RailState:
+        """See `Rail.state`."""
+        return self.bare.state()
+
+    def home(self) -> Motion:
+        """See `Rail.home`."""
+        return self.gate.begin(Command("rail", "home"), self.bare.home, self.bare.stop)
+
+    def move_to(self, position: float, speed: float | None = None) -> Motion:
+        """See `Rail.move_to`."""
+        command = Command("rail", "move_to", {"position": position})
+        return self.gate.begin(command, lambda: self.bare.move_to(position, speed), self.bare.stop)
+
+    def sweep(self, start: float, stop: float, speed: float) -> Sweep:
+        """See `Rail.sweep`."""
+        command = Command("rail", "sweep", {"start": start, "stop": stop})
+        return self.gate.begin(command, lambda: self.bare.sweep(start, stop, speed), self.bare.stop)
+
+    def sweep_start(self, start: float, stop: float, speed: float) -> float:
+        """See `Rail.sweep_start`."""
+        return self.bare.sweep_start(start, stop, speed)
+
+
+class GatedVehicle(Gated[Vehicle]):
+    """The vehicle, taken into command and driven through a gate."""
+
+    def state(self, max_age: float = 0.2) -> VehicleState:
+        """See `Vehicle.state`."""
+        return self.bare.state(max_age)
+
+    def check(self) -> None:
+        """See `Vehicle.check`."""
+        self.bare.check()
+
+    def enable(self) -> None:
+        """See `Vehicle.enable`."""
+        self.gate.begin(Command("vehicle", "enable"), self.bare.enable, self.bare.brake)
+
+    def recover(self) -> None:
+        """See `Vehicle.recover`."""
+        self.gate.begin(Command("vehicle", "recover"), self.bare.recover, self.bare.brake)
+
+    def drive(self, speed: float, yaw_rate: float) -> None:
+        """See `Vehicle.drive`."""
+        command = Command("vehicle", "drive", {"speed": speed, "yaw_rate": yaw_rate})
+        self.gate.begin(command, lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
+
+    def brake(self) -> None:
+        """See `Vehicle.brake`."""
+        self.bare.brake()
+
+
+class GatedClaw(Gated[Claw]):
+    """The claw, closed and opened through a gate; what it did is not undone, because that could drop the part."""
+
+    def grip(self, timeout: float = 2.0) -> None:
+        """See `Claw.grip`."""
+        self.gate.require(Command("claw", "grip"))
+        self.bare.grip(timeout)
+
+    def release(self, timeout: float = 2.0) -> None:
+        """See `Claw.release`."""
+        self.gate.require(Command("claw", "release"))
+        self.bare.release(timeout)
+
+    @property
+    def holding(self) -> bool:
+        """See `Claw.holding`."""
+        return self.bare.holding

@@ -1,0 +1,112 @@
+"""Kinds of jobs: which steps a job consists of, in their order. A job chooses one with `job.kind`.
+
+A step is one file with a `JobStep`; a kind is one line that lists steps. Kinds of other packages come by entry points
+of the group `assembly_cell.kinds`, each a `Kind`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import entry_points
+
+from cell.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct
+from cell.steps.step import JobStep
+from cell.steps.workplace import Workplace
+from drivers.errors import ConfigError
+from statemachine.policy import Policy
+from statemachine.runner import StepContext
+from statemachine.sequence import Sequence, State
+
+GROUP = "assembly_cell.kinds"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of job. Raises ValueError when two steps have one name, or one needs what no earlier one makes."""
+
+    name: str
+    steps: tuple[JobStep, ...]
+
+    def __post_init__(self) -> None:
+        self.sequence()
+        made: set[type] = set()
+        for step in self.steps:
+            if missing := [need.__name__ for need in step.needs if need not in made]:
+                raise ValueError(f"step {step.name} needs {', '.join(missing)}, which no step before it makes")
+            made.add(step.makes)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its steps, in their order."""
+        return tuple(step.name for step in self.steps)
+
+    def sequence(self) -> Sequence:
+        """A sequence at its start; it ends placed only where a step places."""
+        places = any(step.makes is place.PlaceResult for step in self.steps)
+        return Sequence(self.names, State.PLACED if places else State.DONE)
+
+    def policy(self, *, simulated_person: bool = False) -> Policy:
+        """How each step is watched."""
+        return Policy(tuple(step.policy for step in self.steps), simulated_person=simulated_person)
+
+    def work(self, here: Workplace) -> dict[str, Callable[[StepContext], object]]:
+        """What the runner calls, by the steps' names; each attempt enters the gate anew."""
+        return {step.name: partial(_enter, here, step) for step in self.steps}
+
+    def require_steps(self, names: Iterable[str]) -> None:
+        """`ConfigError` when one of these names is no step of this kind."""
+        if unknown := [name for name in names if name not in self.names]:
+            raise ConfigError(f"there is no step {', '.join(unknown)}; the steps are {', '.join(self.names)}")
+
+    def until(self, name: str | None) -> Kind:
+        """This kind up to the step of that name; all of it without one. `ConfigError` when there is no such step."""
+        if name is None:
+            return self
+        self.require_steps([name])
+        return replace(self, steps=self.steps[: self.names.index(name) + 1])
+
+    def with_step(self, step: JobStep, after: str, name: str) -> Kind:
+        """The kind `name`: this one with one more step, after the one of the name `after`."""
+        at = self.names.index(after) + 1
+        return replace(self, name=name, steps=(*self.steps[:at], step, *self.steps[at:]))
+
+
+def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
+    here.devices.gate.enter(context.token)
+    context.check()
+    here.devices.interlocks.work_with(here.calibration.configuration)
+    here.mover.hold = context.safe_point
+    here.frames.begin()
+    return step.work(here, context)
+
+
+PLACE = Kind(
+    "place",
+    (
+        drive_to_target.STEP,
+        board_photo.STEP,
+        laser_sweep.STEP,
+        reconstruct.STEP,
+        invert_pose.STEP,
+        place.STEP,
+    ),
+)  # fmt: skip
+
+
+def find_kind(name: str) -> Kind:
+    """The kind of this name; `ConfigError` that lists what is installed, or says what is wrong with a foreign one."""
+    if name == PLACE.name:
+        return PLACE
+    found = {entry.name: entry for entry in entry_points(group=GROUP) if entry.name != PLACE.name}
+    if name not in found:
+        known = ", ".join(sorted((PLACE.name, *found)))
+        raise ConfigError(f'job.kind "{name}": there is no such kind of job; installed: {known}')
+    try:
+        kind = found[name].load()
+    except Exception as error:
+        raise ConfigError(f'job.kind "{name}": {found[name].value} cannot be used: {error}') from error
+    if not isinstance(kind, Kind):
+        raise ConfigError(f'job.kind "{name}": {found[name].value} is a {type(kind).__name__}, no kind of job')
+    return kind

@@ -1,0 +1,44 @@
+"""What the laser sweep brought: one swath after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pinocchio as pin
+
+from cell.steps.swath import Swath
+from cell.vision import StripeProfile
+from drivers.interfaces import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class SweepRecord:
+    """What the sweeps brought, in their order; at least one."""
+
+    swaths: tuple[Swath, ...]
+
+    @property
+    def base_from_flange(self) -> pin.SE3:
+        """Where the flange was half-way through the first sweep."""
+        return self.swaths[0].base_from_flange
+
+    @property
+    def middle(self) -> Frame:
+        """The frame from the middle of the first sweep."""
+        return self.swaths[0].middle
+
+    @property
+    def middle_profile(self) -> StripeProfile:
+        """The stripe in `middle`."""
+        return self.swaths[0].middle_profile
+
+    def summary(self) -> dict[str, object]:
+        """Figures for the journal."""
+        return {
+            "sweeps": len(self.swaths),
+            "profiles": sum(len(swath.lines) for swath in self.swaths),
+            "lost_frames": sum(swath.lost for swath in self.swaths),
+            "points": sum(swath.points for swath in self.swaths),
+            "residual_um": [round(1e6 * swath.residual, 2) for swath in self.swaths],
+            "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
+        }

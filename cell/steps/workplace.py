@@ -1,0 +1,98 @@
+"""Where a job is done: one cell's configuration, calibration and devices, the job's surface, and the run's folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cell.calibration.store import CellCalibration
+from cell.config import CellConfig
+from cell.devices.devices import Devices
+from cell.inversion import NominalSurface
+from cell.job import Job
+from cell.run.frames import FrameStore
+from cell.steps.moves import Mover
+from cell.steps.part import PartProgress
+from cell.steps.photograph import BoardFix, photograph
+from cell.steps.whereabouts import Whereabouts
+from cell.vision import BoardSpec, parse_board
+from drivers.interfaces import Vector
+
+if TYPE_CHECKING:
+    from cell.steps.stored_sweep import StoredSweep
+
+CHANCE_SCATTER = 1.3
+"""Found over configured scatter of the arm that the few views of a calibration show by chance."""
+PHOTO_RATE_HZ = 10.0
+"""Frame rate while the station's board is photographed."""
+
+
+@dataclass(eq=False)
+class Workplace:
+    """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
+
+    `whereabouts` is kept over retries and runs: the vehicle may stand anywhere when a step is done again.
+    """
+
+    config: CellConfig
+    job: Job
+    nominal: NominalSurface
+    calibration: CellCalibration
+    devices: Devices
+    frames: FrameStore
+    folder: Path
+    whereabouts: Whereabouts
+    earlier: StoredSweep | None = None
+    part: PartProgress = field(default_factory=PartProgress)
+    _photographs: int = field(default=0, init=False)
+
+    @cached_property
+    def mover(self) -> Mover:
+        """Planned moves of the arm with the job's part in the claw."""
+        return Mover(self.devices.arm, self.devices.clock, self.config, self.job)
+
+    @cached_property
+    def board(self) -> BoardSpec:
+        """The station's board."""
+        return parse_board(self.job.board.spec)
+
+    @property
+    def repeatability(self) -> Vector:
+        """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""
+        arm = self.config.arm
+        return self._scatter**2 * np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+
+    @property
+    def kinematic(self) -> Vector:
+        """Covariance (6, 6) of a measured place in the base that the arm realises when it goes there, m² and rad²."""
+        arm = self.config.arm
+        return self._scatter**2 * np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+
+    @property
+    def _scatter(self) -> float:
+        """How many times as much as configured the arm scattered in the calibration; 1 where chance explains it."""
+        arm, found = self.config.arm, self.calibration.scan.reference
+        if found is None:
+            return 1.0
+        ratio = max(found.arm_translation / arm.repeatability, found.arm_rotation / arm.repeatability_angle)
+        return ratio if ratio > CHANCE_SCATTER else 1.0
+
+    def photograph(self, count: int = 1) -> BoardFix:
+        """The station's board from `count` photographs by the target camera; see `cell.steps.photograph`."""
+        # Numbered, since a camera may count its frames anew: a later photograph must not take an earlier one's place.
+        self._photographs += 1
+        what = f"board-{self._photographs:02d}"
+        return photograph(
+            self.devices.arm,
+            self.devices.target_camera,
+            self.calibration.target,
+            self.board,
+            self.job.photo,
+            self.repeatability,
+            count,
+            lambda frame: self.frames.keep(what, frame),
+        )

@@ -1,0 +1,233 @@
+"""The arm in this process: trajectories are streamed into the model as a driver on a wire streams them.
+
+A protective stop waits for a person's word, an emergency stop for the power; what an arm may be asked is checked by the
+limits that it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from drivers.errors import Aborted, DeviceFault, InterlockError
+from drivers.interfaces import ArmSafety, ArmState, Identity, Latch, LinkStatistics, Vector
+from sim_backends.direct.arm_motion import AT_REST, STILL_TICK_S, TICK_S, ArmMove, Streamed
+from sim_backends.direct.clock import VirtualClock
+from sim_backends.direct.product import ArmSetup, within
+from sim_backends.models.arm import ArmModel, Power, Safety
+from sim_backends.models.arm_kinematics import matrix_from_pose, pose_from_matrix
+from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+
+_BRAKING = 4.0
+_FIRST_POINT = 0.02
+_LATCH_S = 0.0005
+"""A round trip."""
+_FORCE_SAMPLES, _FORCE_SAMPLE_S = 10, 0.006
+_OUTPUTS = 18
+_MOST_FORCE = 500.0
+_SAFETY = {
+    Safety.NORMAL: ArmSafety.NORMAL,
+    Safety.PROTECTIVE_STOP: ArmSafety.PROTECTIVE_STOP,
+    Safety.SAFEGUARD_STOP: ArmSafety.SAFEGUARD_STOP,
+    Safety.EMERGENCY_STOP: ArmSafety.EMERGENCY_STOP,
+}
+
+
+class DirectArm:
+    """The arm `model`; see `drivers.interfaces.Arm` for the promises."""
+
+    def __init__(self, name: str, model: ArmModel, clock: VirtualClock, setup: ArmSetup) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self.model = model
+        self.clock = clock
+        self.rests: list[Vector] = []
+        """Joint angles (6,), rad, at the end of each motion so far."""
+        self._setup = setup
+        self._motion: ArmMove | None = None
+        self.late = 0.0
+        """By how many seconds each state comes later than the controller measured it."""
+        self._recorded: list[ArmState] | None = None
+        self._stops = 0
+
+    def identity(self) -> Identity:
+        """The model's own plate."""
+        return Identity(self.model.params.model, self.model.params.serial, "virtual", "in this process")
+
+    def ping(self) -> float:
+        """No wire: 0 s."""
+        return 0.0
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        """What the encoders, the force sensor and the inputs show now."""
+        model = self.model
+        speeds = model.drive.qd.copy()
+        return ArmState(
+            stamp=self.clock.now() + self.late,
+            joints=model.drive.q.copy(),
+            joint_speeds=speeds,
+            flange=pose_from_matrix(model.reported_flange()),
+            wrench=model.felt.copy(),
+            safety=_SAFETY[model.safety],
+            moving=bool(np.abs(speeds).max() >= AT_REST),
+            digital_inputs=model.digital_inputs,
+            digital_outputs=model.digital_outputs,
+            device_time=self.clock.now(),
+        )
+
+    @contextmanager
+    def record(self) -> Iterator[list[ArmState]]:
+        """The states at each tick while the context is open; the device's clock is the world's."""
+        self._recorded = []
+        try:
+            yield self._recorded
+        finally:
+            self._recorded = None
+
+    def latch_clock(self) -> Latch:
+        """The world's clock, told as late as the states are."""
+        asked = self.clock.now()
+        self.clock.sleep(_LATCH_S + self.late)
+        return Latch(asked, asked + 0.5 * _LATCH_S, self.clock.now())
+
+    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
+        """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
+        joints = self._setup.limits.check_joints(self.name, joints)
+        self._setup.limits.check_joint_move(self.name, speed, acceleration)
+        self._require_free()
+        return self._begin(ArmMove(self, JointMove(joints, speed, acceleration)))
+
+    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMove:
+        """Straight in space to the flange pose (x, y, z, rx, ry, rz) at `speed` m/s."""
+        target = matrix_from_pose(self._setup.limits.check_pose(self.name, flange))
+        self._setup.limits.check_linear_move(self.name, speed, acceleration)
+        self._require_free()
+        return self._begin(ArmMove(self, LinearMove(target, speed, acceleration)))
+
+    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMove:
+        """Stream a joint trajectory; see `drivers.interfaces.Arm`."""
+        times, joints = self._setup.limits.check_trajectory(self.name, times, joints)
+        if force_limit is not None:
+            within(self.name, "force limit", force_limit, 1e-9, _MOST_FORCE, "N")
+        gap = float(np.abs(joints[0] - self.model.drive.q).max())
+        if gap > _FIRST_POINT:
+            raise InterlockError(
+                self.name,
+                f"the trajectory begins {gap:.3f} rad away from where the arm stands, allowed up to {_FIRST_POINT} "
+                "rad; nothing was sent. Move to its first point first.",
+            )
+        self._require_free()
+        before = self._mean_force() if force_limit is not None else np.zeros(3)
+        return self._begin(Streamed(self, times, joints, force_limit, before))
+
+    def zero_force(self) -> None:
+        """Take the present wrench as zero."""
+        self.model.zero_force()
+
+    def set_payload(self, mass: float, centre: Vector) -> None:
+        """Tell the model what it carries."""
+        mass, offset = self._setup.limits.check_payload(self.name, mass, centre)
+        self.model.payload = (mass, np.array(offset))
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """Set an output and let a tick pass, in which the world follows it."""
+        within(self.name, "digital output", index, 0, _OUTPUTS - 1, "")
+        self.model.write_digital_outputs(1 << index, int(value) << index)
+        self.clock.sleep(TICK_S)
+
+    def digital_input(self, index: int) -> bool:
+        """What is wired to input `index`."""
+        within(self.name, "digital input", index, 0, _OUTPUTS - 1, "")
+        return bool(self.model.digital_inputs >> index & 1)
+
+    def recover(self, *, confirmed: bool = False) -> None:
+        """Unlock a protective stop that a person has `confirmed`, which takes its time; the safe outputs go off.
+
+        Ended by `stop()`, with `Aborted`.
+        """
+        stops = self._stops
+        for index in self._setup.safe_off:
+            self.set_digital_output(index, False)
+        if self.model.safety is Safety.PROTECTIVE_STOP:
+            if not confirmed:
+                raise self.fault("arm.protective_stop", "nobody has confirmed that it may be unlocked")
+            self.clock.sleep(self.model.params.unlock_delay)
+            if self._stops != stops:
+                raise Aborted(f"{self.name}: stopped while it was recovered")
+            self.model.unlock()
+        if (found := self.trouble()) is not None:
+            raise found
+        self._motion = None
+
+    def stop(self) -> None:
+        """Brake now, and wait until the arm stands."""
+        self._stops += 1
+        self.end_motion(Aborted(f"{self.name}: stopped before the end of its motion"))
+        self.model.start(Stop(_BRAKING))
+        while self.model.moving:
+            self.clock.sleep(TICK_S)
+
+    def close(self) -> None:
+        """Stop; the safe outputs go off."""
+        self.stop()
+        for index in self._setup.safe_off:
+            self.set_digital_output(index, False)
+
+    def fault(self, code: str, text: str) -> DeviceFault:
+        """The fault of a code, in the driver's words."""
+        return self._setup.fault(self.name, code, text)
+
+    def trouble(self) -> DeviceFault | None:
+        """What keeps a program from moving the arm now, or None."""
+        if self.model.safety is not Safety.NORMAL:
+            return self.fault(f"arm.{self.model.safety.name.lower()}", self.model.fault_text)
+        if self.model.power is not Power.RUNNING:
+            return self.fault("arm.not_powered", f"its power is {self.model.power.name.lower()}")
+        return None
+
+    def end_motion(self, error: Aborted) -> None:
+        """End the motion that is under way, if any, with an error."""
+        if self._motion is not None and not self._motion.done:
+            self._motion.fail(error)
+
+    # --- ticking ---
+
+    @property
+    def tick_s(self) -> float:
+        """Fine while it moves, finest while it feels for contact."""
+        if self._motion is None or self._motion.done:
+            return STILL_TICK_S if self.model.idle and not self.model.moving else TICK_S
+        return self._motion.tick_s
+
+    def before_tick(self, t: float) -> None:
+        """Stream the target of time `t`."""
+        if self._motion is not None and not self._motion.done:
+            self._motion.before_tick(t)
+
+    def after_tick(self, t: float) -> None:
+        """See whether the motion has ended."""
+        if self._recorded is not None:
+            self._recorded.append(self.state())
+        if self._motion is not None and not self._motion.done:
+            self._motion.after_tick(t)
+
+    def _require_free(self) -> None:
+        if (found := self.trouble()) is not None:
+            raise found
+        if self._motion is not None and not self._motion.done:
+            raise InterlockError(self.name, "a motion is still under way; nothing was sent. Wait for it or stop it.")
+
+    def _begin(self, motion: ArmMove) -> ArmMove:
+        self._require_free()
+        self.model.start(motion.motion)
+        self._motion = motion
+        return motion
+
+    def _mean_force(self) -> Vector:
+        samples = []
+        for _ in range(_FORCE_SAMPLES):
+            self.clock.sleep(_FORCE_SAMPLE_S)
+            samples.append(self.model.felt[:3])
+        return np.asarray(np.mean(samples, axis=0))

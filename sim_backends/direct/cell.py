@@ -1,0 +1,74 @@
+"""A simulated cell in this process: one seeded world, its clock, and its devices behind the drivers' interfaces.
+
+Time moves when somebody waits: a sleep, a motion's `wait`, a picture's exposure. So the product runs on it unchanged,
+as fast as the machine computes, and the same for the same seed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from sim_backends.clock import SteppedClock
+from sim_backends.direct import faults
+from sim_backends.direct.arm import DirectArm
+from sim_backends.direct.camera import DirectCamera
+from sim_backends.direct.clock import VirtualClock
+from sim_backends.direct.product import Setup
+from sim_backends.direct.rail import DirectRail
+from sim_backends.direct.vehicle import DirectVehicle
+from sim_backends.world.scene import stream
+from sim_backends.world.truth import truth
+from sim_backends.world.world import World
+
+LONGEST_TICK_S = 0.05
+"""Between two ticks of models at rest."""
+
+
+class Ticking(Protocol):
+    """A device whose commands have to be renewed, or judged, as time goes by."""
+
+    @property
+    def tick_s(self) -> float:
+        """Longest time between two ticks that what it does now allows, s."""
+
+    def before_tick(self, t: float) -> None:
+        """Command the model for the time up to `t`."""
+
+    def after_tick(self, t: float) -> None:
+        """See what became of it at `t`."""
+
+
+class DirectCell:
+    """The world of one seed and level, with its devices."""
+
+    def __init__(self, setup: Setup, seed: int, level: str = "nominal", surface: str = "pot") -> None:
+        """Raises ValueError for an unknown level or surface."""
+        self._time = SteppedClock()
+        self.world = World(seed, level, surface=surface, clock=self._time)
+        self.clock = VirtualClock(self._time, self._tick)
+        wire = stream(seed, "lockstep.wire")
+        self.arm = DirectArm("arm", self.world.arm, self.clock, setup.arm)
+        self.rail = DirectRail("rail", self.world.rail, self.clock, setup.rail, wire)
+        self.vehicle = DirectVehicle("vehicle", self.world.vehicle, self.clock, setup.vehicle)
+        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup.camera, wire)
+        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire)
+        self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
+
+    def truth(self) -> dict[str, Any]:
+        """Everything true about the world now; see `sim_backends.world.truth`."""
+        return truth(self.world)
+
+    def fault(self, name: str) -> None:
+        """Cause the fault `name`, one of `faults.NAMES`; ValueError for one that is not, or needs a wire."""
+        faults.cause(self, name)
+
+    def _tick(self, until: float) -> None:
+        """Let the world's time pass by one tick, as fine as what moves needs, at most up to `until` s."""
+        t = min(until, self._time.now() + min(LONGEST_TICK_S, *(device.tick_s for device in self._ticking)))
+        for device in self._ticking:
+            device.before_tick(t)
+        self._time.step_to(t)
+        self.world.arm.tick(t)
+        self.world.vehicle.tick(t)
+        for device in self._ticking:
+            device.after_tick(t)

@@ -1,0 +1,151 @@
+"""What the devices in this process are given from outside: settings, and logic of the product's own drivers.
+
+Nothing here knows a driver. Logic that is worth proving on the virtual clock as well, because results rest on it, comes
+from whoever puts the cell together: the fit of a sweep, the comparison of clocks, odometry, the arm's limits, and the
+words of faults. What is only a protocol's business is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from drivers.errors import DeviceFault, LimitError
+from drivers.interfaces import Vector
+
+
+class EvenMotion(Protocol):
+    """The line through the readings of a sweep; see `Sweep` in `drivers.interfaces` for the figures."""
+
+    @property
+    def velocity(self) -> float:
+        """In m/s."""
+
+    @property
+    def time_bound(self) -> float:
+        """In s."""
+
+    @property
+    def unevenness(self) -> float:
+        """In m."""
+
+    def position_at(self, time: float) -> float:
+        """Position in m at a host time in s."""
+
+    def time_at(self, position: float) -> float:
+        """Host time in s at a position in m."""
+
+
+class ClockMap(Protocol):
+    """The way from a device's clock to the host's, from latches (host before, device, host after), s."""
+
+    def add(self, latches: Iterable[Any]) -> None:
+        """Take the latches of one moment."""
+
+    def host_time(self, device: float) -> float:
+        """Host time in s for a device's time in s."""
+
+    @property
+    def uncertainty(self) -> float:
+        """Bound in s on the error of `host_time`."""
+
+
+class Odometry(Protocol):
+    """Where the vehicle is by its wheels' counters: x, y in m and yaw in rad from where it stood first."""
+
+    x: float
+    y: float
+    yaw: float
+
+    def update(self, left: int, right: int, farthest: float) -> bool:
+        """Take both counters in mm; a jump of more than `farthest` m is not counted."""
+
+
+class ArmLimits(Protocol):
+    """What the arm may be asked; each check raises `LimitError` and gives back what it was given."""
+
+    def check_joints(self, device: str, joints: Vector) -> Vector:
+        """Joint angles (6,), rad."""
+
+    def check_pose(self, device: str, flange: Vector) -> Vector:
+        """Flange pose (6,)."""
+
+    def check_joint_move(self, device: str, speed: float, acceleration: float) -> None:
+        """Speed in rad/s and acceleration in rad/s² of the leading joint."""
+
+    def check_linear_move(self, device: str, speed: float, acceleration: float) -> None:
+        """Speed in m/s and acceleration in m/s² of the flange."""
+
+    def check_payload(self, device: str, mass: float, centre: Vector) -> tuple[float, tuple[float, float, float]]:
+        """Mass in kg and centre of gravity (3,), m."""
+
+    def check_trajectory(self, device: str, times: Vector, joints: Vector) -> tuple[Vector, Vector]:
+        """Times (n,), s, and joints (n, 6), rad."""
+
+
+@dataclass(frozen=True)
+class ArmSetup:
+    """The arm's limits, the words of its faults (device, code, text), and the outputs that are off after a recovery."""
+
+    limits: ArmLimits
+    fault: Callable[[str, str, str], DeviceFault]
+    safe_off: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RailSetup:
+    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each."""
+
+    lead: float
+    steps_per_turn: int
+    microsteps: int
+    travel: tuple[float, float]
+    max_speed: float
+    acceleration: float
+    even: Callable[[Vector, Vector, Vector], EvenMotion]
+
+
+@dataclass(frozen=True)
+class VehicleSetup:
+    """Limits in m/s and rad/s; `trouble` tells error bits in words, `error` makes a fault of them.
+
+    `error` takes the device's name, its error bits, their words, and whether it was driven lately.
+    """
+
+    max_speed: float
+    max_yaw_rate: float
+    odometry: Odometry
+    trouble: Callable[[int], tuple[str, ...]]
+    error: Callable[[str, int, tuple[str, ...], bool], DeviceFault]
+
+
+@dataclass(frozen=True)
+class CameraSetup:
+    """`clock_map` makes an empty map for one camera, `latch` what is added to it."""
+
+    clock_map: Callable[[], ClockMap]
+    latch: Callable[[float, float, float], Any]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Everything that the devices are given."""
+
+    arm: ArmSetup
+    rail: RailSetup
+    vehicle: VehicleSetup
+    camera: CameraSetup
+
+
+def within(device: str, what: str, value: float, low: float, high: float, unit: str) -> float:
+    """`value` if it lies between `low` and `high`, else `LimitError`; lengths are shown in mm, angles as they are."""
+    number = float(value)
+    if low <= number <= high:
+        return number
+    scale, shown = (1e3, f"m{unit}") if unit.startswith("m") else (1.0, unit)
+    raise LimitError(
+        device,
+        f"{what} {number * scale:.6g} {shown} is outside {low * scale:.6g} {shown} to {high * scale:.6g} {shown}; "
+        f"nothing was sent. Choose a {what} in this range.",
+    )

@@ -1,0 +1,80 @@
+"""`cell confirm` answers one question: the one that was named, or the one that it has just shown."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+
+from cell.cli import main
+from cell.cli.display import ProgressDisplay
+from cell.run.folder import new_run
+from statemachine.journal import Journal, Request
+from statemachine.step import Event
+
+
+@pytest.fixture
+def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Journal:
+    """The journal of a run that goes on in the present folder and waits for a word on its second question."""
+    monkeypatch.chdir(tmp_path)
+    folder = new_run(tmp_path / "runs")
+    journal = Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    journal.event("confirm_needed", "laser_sweep", {"reason": "stopped in the sweep", "code": "x", "number": 1})
+    journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "stopped in the sweep"})
+    journal.event("confirm_needed", "place", {"reason": "stopped while placing", "code": "x", "number": 2})
+    return journal
+
+
+class Terminal(io.StringIO):
+    """What a person types."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def confirm(monkeypatch: pytest.MonkeyPatch, *words: str, typed: str | None = None) -> int:
+    monkeypatch.setattr("sys.argv", ["cell", "confirm", "--by", "Bob", *words])
+    monkeypatch.setattr("sys.stdin", io.StringIO() if typed is None else Terminal(typed))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(
+    waiting: Journal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert confirm(monkeypatch, "--question", "1") == 2
+    said = capsys.readouterr().err
+    assert "does not wait for question 1 but for question 2: stopped while placing" in said
+    assert waiting.take_requests() == []
+    assert confirm(monkeypatch, "--question", "2") == 0
+    assert waiting.take_requests() == [Request("confirm", "Bob", 2)]
+
+
+def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_answered(
+    waiting: Journal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert confirm(monkeypatch) == 0
+    assert "question 2: stopped while placing" in capsys.readouterr().out
+    assert waiting.take_requests() == [Request("confirm", "Bob", 2)]
+
+
+@pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])
+def test_a_person_at_a_terminal_is_asked_whether_it_is_the_one_that_was_meant(
+    waiting: Journal, monkeypatch: pytest.MonkeyPatch, typed: str, code: int
+) -> None:
+    assert confirm(monkeypatch, typed=typed) == code
+    assert len(waiting.take_requests()) == (1 if code == 0 else 0)
+
+
+def test_who_watches_a_run_sees_the_number_and_what_to_type(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    display = ProgressDisplay()
+    display(Event("confirm_needed", "place", {"reason": "the arm has stopped", "code": "x", "number": 2}))
+    said = capsys.readouterr().err
+    assert "question 2: the arm has stopped" in said
+    assert "cell confirm --question 2" in said

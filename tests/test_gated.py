@@ -1,0 +1,61 @@
+"""Devices of any make behind the gate: once it is shut nothing begins; looking, stopping and closing still work."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.config import load_config
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
+from cell.steps.moves import HOME
+from drivers.errors import Aborted
+from statemachine.cancel import CancelToken
+
+CONFIG = load_config(None)
+
+
+@pytest.fixture(scope="module")
+def devices() -> Devices:
+    return VirtualCell(CONFIG, seed=4, level="ideal").devices
+
+
+def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) -> None:
+    devices.gate.enter(CancelToken())
+    devices.rail.home().wait(60.0)
+    devices.rail.move_to(0.02).wait(30.0)
+    assert devices.rail.state().position == pytest.approx(0.02, abs=1e-6)
+    devices.vehicle.brake()
+    with devices.interlocks.purpose("test"), devices.laser.lit():
+        assert devices.laser.is_on
+    assert not devices.laser.is_on
+
+
+def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:
+    arm, rail, vehicle = devices.arm, devices.rail, devices.vehicle
+    devices.gate.enter(CancelToken())
+    joints = arm.state().joints
+    assert devices.stop() == []
+    for begin in (
+        lambda: arm.move_joints(HOME, 0.3, 1.0),
+        lambda: arm.move_linear(arm.state().flange, 0.1, 0.5),
+        lambda: arm.follow(np.array([0.0, 1.0]), np.array([joints, HOME])),
+        arm.recover,
+        rail.home,
+        lambda: rail.move_to(0.01),
+        lambda: rail.sweep(0.02, 0.03, 0.015),
+        vehicle.enable,
+        vehicle.recover,
+        lambda: vehicle.drive(0.1, 0.0),
+        devices.laser.lit().__enter__,
+        devices.claw.grip,
+        devices.claw.release,
+    ):
+        with pytest.raises(Aborted, match="the cell was stopped"):
+            begin()
+    np.testing.assert_array_equal(arm.state().joints, joints)
+    assert vehicle.state().braked
+    assert rail.state().homed
+    assert not devices.laser.is_on
+    assert [device.identity().model for device in devices]
+    assert devices.stop() == devices.close() == []

@@ -1,0 +1,149 @@
+"""Makes of devices: `driver` chooses one, packages bring more, and what is wrong with one harms no other."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cell.config import CellConfig, default_toml, load_config
+from cell.devices.assembly import connect_one
+from cell.devices.built_in import BUILT_IN, TmclRailConfig
+from cell.devices.make import KINDS
+from cell.devices.makes import installed
+from cell.devices.simulated import with_endpoints
+from drivers.clock import Clock
+from drivers.errors import ConfigError
+from drivers.interfaces import Rail
+from tests.packages import RAIL, install, with_acme_rail
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where packages are installed: a folder on this program's path, outside the repository."""
+    folder = tmp_path / "site"
+    install(folder, "acme-rail", "1.2", "rail.acme = acme_rail:MAKE", acme_rail=RAIL)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.delitem(sys.modules, "acme_rail", raising=False)
+    return folder
+
+
+def loaded(folder: Path, **changes: str) -> CellConfig:
+    path = folder / "acme.toml"
+    path.write_text(with_acme_rail(default_toml(), **changes))
+    return load_config(path)
+
+
+def test_every_kind_has_a_built_in_make_which_is_taken_when_none_is_named(tmp_path: Path) -> None:
+    assert {make.kind for make in BUILT_IN} == set(KINDS)
+    path = tmp_path / "cell.toml"
+    path.write_text("\n".join(line for line in default_toml().splitlines() if not line.startswith("driver")))
+    config = load_config(path)
+    assert isinstance(config.rail, TmclRailConfig)
+    assert config == load_config(None)
+
+
+def test_a_calibration_made_before_there_were_makes_still_fits() -> None:
+    assert load_config(None).calibration_hash() == "3bf8e26c4fda6b11"
+
+
+def test_a_package_outside_brings_a_make_that_a_configuration_can_name(site: Path, tmp_path: Path) -> None:
+    config = loaded(tmp_path)
+    rail: Rail = connect_one(config, "rail", Clock())
+    assert rail.identity().model == "Acme belt rail"
+    rail.home().wait(1.0)
+    rail.move_to(0.02).wait(1.0)
+    assert rail.state().position == 0.02
+    assert config.model_dump(mode="json")["rail"]["port"] == "/dev/acme0"
+    assert [row.source for row in installed() if row.make == "acme"] == ["acme-rail 1.2"]
+
+
+def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path: Path) -> None:
+    own = loaded(tmp_path).calibration_hash()
+    assert own != load_config(None).calibration_hash()
+    assert loaded(tmp_path, port="/dev/acme1").calibration_hash() == own
+    assert loaded(tmp_path, belt="3 mm").calibration_hash() != own
+
+
+def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"rail\.belt: .*1 to 10 mm"):
+        loaded(tmp_path, belt="30 mm")
+    with pytest.raises(ConfigError, match=r'rail\.port and vehicle\.channel are both "/dev/ttyUSB0"'):
+        loaded(tmp_path, port="/dev/ttyUSB0")
+
+
+def test_a_make_that_nothing_simulates_is_refused_in_a_simulated_cell(site: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r'rail\.driver = "acme": nothing simulates this make'):
+        with_endpoints(loaded(tmp_path), {"speed": 1.0, "truth": {"address": "127.0.0.1:1"}, "arm": {"address": "x"}})
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("import not_there", "ModuleNotFoundError: No module named 'not_there'"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("MAKE = 7", "is no Make but of type int"),
+        (RAIL.replace('"rail", "acme"', '"rail", "other"'), 'says that it is "rail.other"'),
+        (RAIL.replace("(RailConfig)", "(__import__('pydantic').BaseModel)"), "does not derive from RailConfig"),
+        (RAIL.replace('{"belt"}', '{"chain"}'), "its record has no chain"),
+    ],
+    ids=["import", "exit", "no make", "another name", "another record", "unknown key"],
+)
+def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
+    site: Path, tmp_path: Path, module: str, words: str
+) -> None:
+    (site / "acme_rail.py").write_text(module)
+    rows = {(row.kind, row.make): row for row in installed()}
+    assert rows["rail", "acme"].state.startswith("broken: ")
+    assert words in rows["rail", "acme"].state
+    assert all(rows[make.kind, make.name].ok for make in BUILT_IN)
+    assert load_config(None).rail.driver == "tmcl"
+    with pytest.raises(ConfigError) as caught:
+        loaded(tmp_path)
+    assert "rail.driver" in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_a_package_cannot_take_the_name_of_a_built_in_make(site: Path) -> None:
+    install(site, "evil-rail", "6.6", "rail.tmcl = evil_rail:MAKE", evil_rail="raise SystemExit('was imported')")
+    found = [row for row in installed() if row.make == "tmcl"]
+    assert [(row.source, row.state.partition(":")[0]) for row in found] == [
+        ("built in", "ok"),
+        ("evil-rail 6.6", "refused"),
+    ]
+    assert type(load_config(None).rail) is TmclRailConfig
+
+
+def test_of_two_packages_with_one_name_neither_is_taken(site: Path, tmp_path: Path) -> None:
+    install(site, "other-rail", "0.1", "rail.acme = other_rail:MAKE", other_rail=RAIL)
+    assert {row.source: row.state for row in installed() if row.make == "acme"} == {
+        "acme-rail 1.2": "refused: other-rail 0.1 brings a make of this name as well",
+        "other-rail 0.1": "refused: acme-rail 1.2 brings a make of this name as well",
+    }
+    with pytest.raises(ConfigError, match=r"other-rail 0\.1 brings a make of this name as well"):
+        loaded(tmp_path)
+
+
+def test_an_unknown_driver_is_refused_with_what_is_installed(site: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(default_toml().replace('driver = "tmcl"', 'driver = "plc"'))
+    with pytest.raises(ConfigError, match=r'rail\.driver: "plc" is not one of "tmcl" or "acme"'):
+        load_config(path)
+
+
+def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_path: Path) -> None:
+    install(site, "lost", "0.0.1", "camera = lost:MAKE\nsonar.ping = lost:MAKE", lost="")
+    path = os.pathsep.join((str(site), *sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", "from cell.cli import main; main()", "devices", "--json"],
+        env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)
+    assert {"kind": "rail", "make": "acme", "source": "acme-rail 1.2", "state": "ok"} in rows
+    assert {"kind": "rail", "make": "tmcl", "source": "built in", "state": "ok"} in rows
+    assert [row["state"].partition(":")[0] for row in rows if row["source"] == "lost 0.0.1"] == ["refused", "refused"]

@@ -1,0 +1,184 @@
+"""The vehicle's driver with the simulated vehicle's own frames, on a bus inside this process: what must never fail."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import can
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import DeadlineError, DeviceFault, InterlockError
+from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
+from drivers.vehicle.feedback import QUIET_S
+from sim_backends.clock import WorldClock
+from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.peers.agilex import AgilexPeer
+from sim_backends.peers.slcan import CanFrame
+
+RATE = 4.0
+TRACK = 0.583
+
+
+class InnerBus:
+    """What the simulated vehicle's peer is on instead of its adapters: a virtual bus of python-can.
+
+    `frames` keeps what the driver has sent, by identifier. With `talking` False the vehicle's frames are lost.
+    """
+
+    def __init__(self, channel: str, receive: Callable[[CanFrame], None]) -> None:
+        self.talking = True
+        self.frames: list[tuple[int, bytes]] = []
+        self._receive = receive
+        self._bus = can.Bus(channel=channel, interface="virtual")
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def send(self, frames: list[CanFrame]) -> None:
+        for frame in frames if self.talking else ():
+            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            if (message := self._bus.recv(0.05)) is not None:
+                self.frames.append((message.arbitration_id, bytes(message.data)))
+                self._receive(CanFrame(message.arbitration_id, bytes(message.data)))
+
+
+class OnInnerBus(AgilexPeer):
+    """The simulated vehicle's peer with its timing and its encoding, on a bus inside this process."""
+
+    def __init__(self, model: VehicleModel, clock: WorldClock, channel: str) -> None:
+        super().__init__(model, clock)
+        self._bus.stop()
+        self.inner = InnerBus(channel, self._receive)
+        self._bus = self.inner  # type: ignore[assignment]
+
+
+class Bench:
+    """The driver and the vehicle's truth, at `RATE` times the wall."""
+
+    def __init__(self, channel: str) -> None:
+        self.channel = channel
+        self.world, self.clock = WorldClock(RATE), Clock(RATE)
+        params = VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK)
+        self.peer = OnInnerBus(VehicleModel(params, np.random.default_rng(5)), self.world, channel)
+        self.bus = self.peer.inner
+        self.peer.start()
+        self.vehicle = AgilexVehicle(
+            "vehicle", "virtual", channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
+        )
+
+    def speed(self) -> float:
+        """True wheel speed, m/s."""
+        return self.peer.model.feedback(self.world.now()).speed
+
+    def braked(self) -> bool:
+        """Whether the vehicle's brake is locked in truth."""
+        return self.peer.model.feedback(self.world.now()).braked
+
+    def until(self, happened: Callable[[], bool], timeout: float = 3.0) -> None:
+        """Wait for something, at most `timeout` wall seconds."""
+        end = time.monotonic() + timeout
+        while not happened():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+    def drive_until_fast(self) -> None:
+        """Drive on until it goes at 0.3 m/s."""
+        end = time.monotonic() + 3.0
+        while self.speed() < 0.295:
+            assert time.monotonic() < end
+            self.vehicle.drive(0.3, 0.0)
+            time.sleep(0.01)
+
+
+@contextmanager
+def at_bench(channel: str) -> Iterator[Bench]:
+    made = Bench(channel)
+    try:
+        yield made
+    finally:
+        made.bus.talking = True
+        made.vehicle.close()
+        made.peer.stop()
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    with at_bench(request.node.name) as made:
+        made.vehicle.enable()
+        yield made
+
+
+def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
+    bench.drive_until_fast()
+    bench.vehicle.brake()
+    bench.until(bench.braked)
+    assert bench.speed() == 0.0
+    bench.bus.frames.clear()
+    with pytest.raises(InterlockError, match="the brake is locked"):
+        bench.vehicle.drive(0.2, 0.0)
+    time.sleep(0.1)
+    sent = [data for number, data in bench.bus.frames if number == 0x111]
+    assert sent, "standing still is commanded on"
+    assert set(sent) == {bytes(8)}
+
+
+def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
+    bench.drive_until_fast()
+    bench.clock.sleep(DEAD_MAN_S + 0.6)
+    bench.bus.frames.clear()
+    time.sleep(0.1)
+    assert {data for number, data in bench.bus.frames if number == 0x111} == {bytes(8)}
+    bench.until(lambda: bench.speed() == 0.0)
+
+
+def test_silence_ends_driving_and_an_old_reading_is_none(bench: Bench) -> None:
+    bench.drive_until_fast()
+    bench.bus.talking = False
+    with pytest.raises(DeviceFault, match="no feedback") as caught:
+        for _ in range(300):
+            bench.vehicle.drive(0.3, 0.0)
+            time.sleep(0.01)
+    assert caught.value.code == "vehicle.silent"
+    with pytest.raises(DeadlineError, match="old, allowed"):
+        bench.vehicle.state()
+
+
+def test_a_restart_is_noticed_although_another_node_keeps_talking(bench: Bench) -> None:
+    """Its counters come back where they were, so that only its silence tells; the bus itself is never silent."""
+    before = bench.vehicle.state().interruptions
+    with can.Bus(channel=bench.channel, interface="virtual") as other:
+        bench.bus.talking = False
+        end = time.monotonic() + QUIET_S + 0.3
+        while time.monotonic() < end:
+            other.send(can.Message(arbitration_id=0x7AB, data=[1, 2, 3], is_extended_id=False))
+            time.sleep(0.02)
+        with pytest.raises(DeviceFault, match="no feedback"):
+            bench.vehicle.check()
+        bench.bus.talking = True
+        bench.until(lambda: heard(bench.vehicle))
+    state = bench.vehicle.state()
+    assert state.interruptions == before + 1
+    assert state.interruption.startswith("nothing was heard of it for 2")
+
+
+def heard(vehicle: AgilexVehicle) -> bool:
+    try:
+        vehicle.state()
+    except DeadlineError:
+        return False
+    return True

@@ -1,0 +1,318 @@
+"""The whole product through the door without wires: one thread, no waiting, and the same seed gives the same bytes."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+import threading
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cell import Cell
+from cell.calibration.store import save_calibration
+from cell.cli import main
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from cell.devices.stopping import stop_cell
+from cell.job import job_path
+from cell.lab.bench.whole_job import JobRecord
+from cell.run.events import ConfirmNeeded, Held, RunEvent, StepStarted
+from cell.run.job_run import RunOutcome, classify
+from cell.run.run import Run
+from cell.steps.moves import HOME
+from drivers.errors import ConfigError
+from statemachine.control import RunControl
+from statemachine.journal import Journal, request
+from statemachine.policy import Policy, Step
+from statemachine.runner import Runner, RunResult, StepContext
+from statemachine.sequence import STEPS, Sequence
+
+SEED = 2
+STOP = "arm.protective_stop@laser_sweep:40%"
+
+
+@pytest.fixture(autouse=True)
+def folder(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A calibrated cell's folder, with the job `pot` swept twice as fast as shipped."""
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    text = job_path("pot").read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
+    assert tomllib.loads(text)["scan"]["speed"] == "30 mm/s"
+    (tmp_path / "pot.toml").write_text(text, encoding="utf-8")
+    shutil.copy(job_path("pot").parent / "pot.stl", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@contextmanager
+def opened(**options: Any) -> Iterator[Cell]:
+    with Cell.open(sim="all", seed=SEED, clock="virtual", **options) as cell:
+        yield cell
+
+
+def done(inject: tuple[str, ...] = (), **options: Any) -> RunOutcome:
+    with opened(**options) as cell:
+        return cell.run("pot.toml", inject=inject)
+
+
+def require_safe(report: dict[str, Any]) -> None:
+    """By the world's truth, not by what the devices said."""
+    end = report["end_state"]
+    assert not end["laser_on"]
+    assert not end["rail_moving"]
+    assert not end["arm"]["moving"]
+    assert end["vehicle"]["braked"] and end["vehicle"]["stopped"]
+    assert end["collisions"] == []
+
+
+def plain_report(folder: Path) -> str:
+    """The bytes of the report without the run's name and its dates."""
+    text = (folder / "report.json").read_text(encoding="utf-8")
+    return re.sub(r'"(run|started|ended|at|calibration_date)": "[^"]*"', r'"\1": ""', text)
+
+
+def plain_journal(folder: Path) -> list[Any]:
+    """All rows of the journal without the run's id, its process and all times."""
+    base = sqlite3.connect(folder / "journal.sqlite")
+    try:
+        runs = base.execute("SELECT info, outcome, reason FROM runs").fetchall()
+        steps = base.execute("SELECT id, name, attempt, state, duration_s, result, error FROM steps").fetchall()
+        events = base.execute("SELECT id, kind, step, data FROM events").fetchall()
+        asked = base.execute("SELECT id, kind, reason FROM requests").fetchall()
+    finally:
+        base.close()
+    return [runs, steps, events, asked]
+
+
+def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -> None:
+    first, second = (done((STOP,), confirm="simulated") for _ in range(2))
+    assert first.outcome == "placed"
+    assert plain_report(first.folder) == plain_report(second.folder)
+    assert plain_journal(first.folder) == plain_journal(second.folder)
+    frames = [sorted((run.folder / "frames").iterdir()) for run in (first, second)]
+    assert [path.name for path in frames[0]] == [path.name for path in frames[1]]
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(*frames, strict=True))
+    report = dict(first.report)
+    require_safe(report)
+    (fault,) = report["faults"]
+    assert (fault["code"], fault["remedy"]) == (
+        "arm.protective_stop",
+        "confirmed by the simulated person, recovered",
+    )
+    assert (report["clock"], report["wall_s"], report["pid"]) == ("virtual", None, None)
+    assert report["truth"]["error_mm"]["d"]["mean"] < 3 * report["truth"]["bound_mm"]
+
+
+def test_it_takes_the_course_of_another_seed_otherwise() -> None:
+    with opened() as cell:
+        here = cell.simulated
+        assert here is not None
+        with Cell.open(sim="all", seed=SEED + 1, clock="virtual") as other:
+            there = other.simulated
+            assert there is not None
+            assert here.truth()["poses"]["world_from_surface"] != there.truth()["poses"]["world_from_surface"]
+
+
+def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
+    outcome = done(("rail.reset@laser_sweep:40%",))
+    assert outcome.outcome == "placed"
+    sweep = outcome.report["steps"][2]
+    assert (sweep["name"], sweep["retries"]) == ("laser_sweep", 1)
+    assert [(fault["code"], fault["remedy"]) for fault in outcome.report["faults"]] == [("rail.reset", "recovered")]
+
+
+@pytest.mark.parametrize(
+    ("inject", "code"),
+    [
+        ("vehicle.emergency_stop@drive_to_target:40%", "vehicle.emergency_stop"),
+        ("vehicle.motor_fault@drive_to_target:40%", "vehicle.error"),
+        ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
+        ("target_camera.silent@drive_to_target", "DeadlineError"),
+    ],
+)
+def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe(inject: str, code: str) -> None:
+    outcome = done((inject,))
+    assert (outcome.outcome, outcome.report["code"]) == ("faulted", code)
+    require_safe(dict(outcome.report))
+
+
+@pytest.mark.parametrize("name", ["rail.drop_reply", "rail.late_reply", "can.bus_off"])
+def test_a_fault_of_a_wire_is_refused_where_there_is_none(name: str) -> None:
+    with opened() as cell, pytest.raises(ConfigError, match=r"fault of the wire.*use --clock wall"):
+        cell.start("pot.toml", inject=[f"{name}@laser_sweep"])
+
+
+def upto(run: Run[RunOutcome], kind: type[RunEvent], step: str | None = None) -> RunEvent:
+    """The first event of this kind, of this step if given."""
+    return next(event for event in run.events() if isinstance(event, kind) and step in (None, event.step))
+
+
+def test_a_protective_stop_waits_for_a_persons_word() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
+        needed = upto(run, ConfirmNeeded)
+        assert isinstance(needed, ConfirmNeeded)
+        before = cell.devices.clock.now()
+        assert run.confirm("the test", needed.number)
+        outcome = run.result(60.0)
+        # Nobody waited on the cell's clock meanwhile: the maker's 5 s before a stop can be unlocked came after it.
+        assert cell.devices.clock.now() > before + 5.0
+    assert outcome.outcome == "placed"
+    assert outcome.report["faults"][0]["remedy"] == "confirmed by the test, recovered"
+
+
+def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
+        upto(run, ConfirmNeeded)
+        before = cell.devices.clock.now()
+        assert not threading.Event().wait(0.2)
+        assert cell.devices.clock.now() == before
+        run.abort("enough waited")
+        outcome = run.result(60.0)
+    assert (outcome.outcome, outcome.reason) == ("aborted", "enough waited")
+
+
+def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
+    text = (folder / "pot.toml").read_text(encoding="utf-8")
+    assert 'tolerance = "0.6 mm"' in text
+    (folder / "pot.toml").write_text(text.replace('tolerance = "0.6 mm"', 'tolerance = "0.05 mm"'), encoding="utf-8")
+    outcome = done()
+    assert outcome.outcome == "refused"
+    assert outcome.report["refusal"]["step"] == "invert_pose"
+    require_safe(dict(outcome.report))
+
+
+@pytest.mark.parametrize("way", ["handle", "journal", "stop", "close"])
+def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str) -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml")
+        upto(run, StepStarted, "drive_to_target" if way in ("journal", "close") else "laser_sweep")
+        assert run.folder is not None
+        match way:
+            case "handle":
+                run.abort("by its handle")
+            case "journal":
+                request(run.folder, "abort", "by the journal")
+            case "stop":
+                cell.stop()
+            case "close":
+                cell.close()
+        outcome = run.result(60.0)
+    assert outcome.outcome == "aborted"
+    require_safe(dict(outcome.report))
+
+
+def test_a_paused_run_stands_until_it_goes_on() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml")
+        upto(run, StepStarted)
+        run.pause()
+        upto(run, Held)
+        before = cell.devices.clock.now()
+        assert not threading.Event().wait(0.1)
+        assert cell.devices.clock.now() == before
+        # Held, it still hears other processes.
+        assert run.folder is not None
+        request(run.folder, "go-on", "by the journal")
+        run.events()
+        assert run.result(60.0).outcome == "placed"
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """The exit code of a command."""
+    monkeypatch.setattr("sys.argv", ["cell", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_an_aborted_run_is_resumed_through_the_same_door(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml")
+        upto(run, StepStarted, "board_photo")
+        run.abort("to be resumed")
+        aborted = run.result(60.0)
+    assert command(monkeypatch, "resume", aborted.folder.name, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["outcome"], report["clock"], report["resumed_from"]) == ("placed", "virtual", aborted.folder.name)
+
+
+def test_the_command_line_says_what_time_passed_here_and_there(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    virtual = ("dry-run", "-j", "pot.toml", "--clock", "virtual", "--seed", str(SEED))
+    assert command(monkeypatch, *virtual) == 0
+    assert re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", capsys.readouterr().out)
+    assert command(monkeypatch, *virtual, "--speed", "2") == 2
+
+
+# --- the runner in line, on single steps ---
+
+
+def run_steps(cell: VirtualCell, folder: Path, first: Any, policy: Policy | None = None) -> RunResult:
+    """Run a job whose first step is `first` and whose others do nothing."""
+    folder.mkdir()
+    work: dict[str, Any] = {step.value: lambda context: None for step in STEPS}
+    work[STEPS[0].value] = first
+    journal = Journal(folder, "here")
+    try:
+        return Runner(
+            sequence=Sequence(),
+            steps=work,
+            policy=policy or Policy(),
+            journal=journal,
+            clock=cell.clock,
+            classify=classify,
+            safe_stop=lambda reason: stop_cell(cell.devices),
+            control=RunControl(),
+        ).run()
+    finally:
+        journal.close()
+
+
+def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(folder: Path) -> None:
+    cell = VirtualCell(load_config(None), SEED)
+    threads: list[str] = []
+
+    def slow(context: StepContext) -> None:
+        threads.append(threading.current_thread().name)
+        cell.devices.gate.enter(context.token)
+        cell.devices.arm.move_joints(HOME + np.array([3.0, 0, 0, 0, 0, 0]), 0.05, 0.5).wait(600.0)
+
+    policy = Policy().with_step(Step(STEPS[0].value, 2.0, on_failure=Policy().of(STEPS[5]).on_failure))
+    result = run_steps(cell, folder / "late", slow, policy)
+    assert (result.outcome.value, result.code) == ("faulted", "step.deadline")
+    assert threads == [threading.current_thread().name]
+    assert not cell.world.arm.moving
+    # Two seconds of its own, then the arm's braking and the safe stops.
+    assert 2.0 <= cell.clock.now() < 5.0
+
+
+def test_a_step_that_catches_its_end_and_goes_on_is_told_again(folder: Path) -> None:
+    cell = VirtualCell(load_config(None), SEED)
+    told: list[str] = []
+
+    def stubborn(context: StepContext) -> None:
+        for _ in range(3):
+            try:
+                cell.clock.sleep(100.0)
+            except RuntimeError as error:
+                told.append(str(error))
+
+    policy = Policy().with_step(Step(STEPS[0].value, 2.0, on_failure=Policy().of(STEPS[5]).on_failure))
+    result = run_steps(cell, folder / "stubborn", stubborn, policy)
+    assert result.code == "step.deadline"
+    assert len(told) == 3
+    assert cell.clock.now() < 2.0 + 3 * Policy().grace_s + 2.0
