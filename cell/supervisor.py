@@ -505,8 +505,9 @@ class Cell:
         def work(hands: Hands) -> tuple[Observations, CellCalibration]:
             mover = self.mover(part_of, hands.safe_point)
             self.devices.vehicle.brake()
-            scan = collect_scan(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 * f, t))
-            target = collect_target(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 + 0.3 * f, t))
+            given = self.config, self.devices, mover, hands.check
+            scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
+            target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
             tell(0.96, "solving")
             observations = gathered(scan, target, self._identities(), self.config)
             return observations, solve_observations(observations).calibration
@@ -533,7 +534,9 @@ class Cell:
                 self.devices.interlocks.work_with(calibration.configuration)
                 self.devices.vehicle.brake()
                 mover = self.mover(loaded, hands.safe_point)
-                seen = collect_verification(self.config, self.devices, mover, calibration, hands.check, tell)
+                seen = collect_verification(
+                    self.config, self.devices, mover, calibration, hands.check, tell, hands.keep
+                )
                 return Verification.of(calibration, loaded, seen)
 
             made = self._recorded(run, "verification", work)
