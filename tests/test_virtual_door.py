@@ -33,7 +33,8 @@ from statemachine.control import RunControl
 from statemachine.journal import Journal, request
 from statemachine.policy import OnFailure, Policy, Step
 from statemachine.runner import Runner, RunResult, StepContext
-from statemachine.sequence import Sequence
+from statemachine.sequence import Sequence, State
+from statemachine.step import StepCall
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -261,18 +262,15 @@ def test_the_command_line_says_what_time_passed_here_and_there(
 # --- the runner in line, on single steps ---
 
 
-POLICY = Policy((Step("work", 2.0, on_failure=OnFailure.STOP), Step("rest", 2.0)))
-
-
-def run_steps(cell: VirtualCell, folder: Path, first: Any) -> RunResult:
-    """Run a job of two steps, `first`, which has two seconds, and one that does nothing."""
+def run_step(cell: VirtualCell, folder: Path, first: StepCall) -> RunResult:
+    """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
     folder.mkdir()
     journal = Journal(folder, "here")
     try:
         return Runner(
-            sequence=Sequence(("work", "rest")),
-            steps={"work": first, "rest": lambda context: None},
-            policy=POLICY,
+            sequence=Sequence(("first", "second"), State.DONE),
+            steps={"first": first, "second": lambda context: None},
+            policy=Policy((Step("first", 2.0, on_failure=OnFailure.STOP), Step("second", 2.0))),
             journal=journal,
             clock=cell.clock,
             classify=classify,
@@ -293,7 +291,7 @@ def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(
         cell.devices.gate.enter(context.token)
         cell.devices.arm.move_joints(HOME + np.array([3.0, 0, 0, 0, 0, 0]), 0.05, 0.5).wait(600.0)
 
-    result = run_steps(cell, folder / "late", slow)
+    result = run_step(cell, folder / "late", slow)
     assert (result.outcome.value, result.code) == ("faulted", "step.deadline")
     assert threads == [threading.current_thread().name]
     assert not cell.world.arm.moving
@@ -312,7 +310,7 @@ def test_a_step_that_catches_its_end_and_goes_on_is_told_again(folder: Path) -> 
             except RuntimeError as error:
                 told.append(str(error))
 
-    result = run_steps(cell, folder / "stubborn", stubborn)
+    result = run_step(cell, folder / "stubborn", stubborn)
     assert result.code == "step.deadline"
     assert len(told) == 3
-    assert cell.clock.now() < 2.0 + 3 * POLICY.grace_s + 2.0
+    assert cell.clock.now() < 2.0 + 3 * Policy(()).grace_s + 2.0
