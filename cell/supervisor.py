@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Collection, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
@@ -43,6 +43,7 @@ from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.run.folder import CellLock, find_run
 from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.maintenance import recorded_maintenance
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.run import Run
@@ -217,6 +218,39 @@ class Cell:
             run.abort("stopped with Cell.stop()")
         stop_cell(self.devices)
 
+    def clear_stop(self, by: str) -> None:
+        """A person, `by` name, has seen that the cell may move again after a stop: direct commands pass again.
+
+        A new run needs no such word. `ConfigError` when nobody is named.
+        """
+        if not by.strip():
+            raise ConfigError("clear_stop needs the name of the person who has looked at the cell")
+        log.warning("the stop was cleared by %s", by)
+        self.devices.gate.clear()
+
+    @contextmanager
+    def maintenance(self, reason: str, lift: Sequence[str]) -> Iterator[None]:
+        """Inside this context the interlocks named in `lift` do not hold (docs/interlocks.md lists them).
+
+        On a person's responsibility, and recorded: in the log of the run that is going on, else as a run of its own;
+        runs that are begun meanwhile say so in their report. `ConfigError` without a reason, or for a name that is
+        none or that nobody can lift.
+        """
+        if not reason.strip() or not lift:
+            raise ConfigError("maintenance needs a reason, and the names of the interlocks to lift")
+        with ExitStack() as over:
+            over.enter_context(self.devices.interlocks.lifted(lift))
+            text = f"maintenance ({reason}): lifted {', '.join(lift)}"
+            if (run := self.current) is not None:
+                run.tell(Event("note", None, {"text": text}))
+            else:
+                over.enter_context(recorded_maintenance(self.runs_folder, self._facts(), reason, lift))
+            log.warning("%s", text)
+            try:
+                yield
+            finally:
+                log.warning("maintenance (%s) is over: %s hold again", reason, ", ".join(lift))
+
     def close(self) -> None:
         """End the run that is going on, stop and disconnect everything, let go of the cell.
 
@@ -286,12 +320,20 @@ class Cell:
     def _recorded(
         self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
     ) -> Made:
-        facts = {"cell": self.config.cell.name, **self._world(), **(info or {})}
+        facts = {**self._facts(), **(info or {})}
         health = require_no_emergency_stop if kind == "jog" else require_healthy
         return RecordedWork(run, kind, self.devices, self.runs_folder, facts, health).perform(work)
 
+    def _facts(self) -> dict[str, Any]:
+        return {"cell": self.config.cell.name, **self._world()}
+
     def _world(self) -> dict[str, Any]:
-        """Whether this cell is simulated, and which world."""
+        """Whether this cell is simulated, and which world; and the interlocks that do not hold, if any."""
+        if lifted := sorted(self.devices.interlocks.names_lifted):
+            return {**self._simulation(), "interlocks_lifted": lifted}
+        return self._simulation()
+
+    def _simulation(self) -> dict[str, Any]:
         if self.simulated is None:
             return {"simulated": False, "seed": None, "level": None, "clock": "wall"}
         return self.simulated.facts
@@ -465,8 +507,9 @@ class Cell:
         def work(hands: Hands) -> tuple[Observations, CellCalibration]:
             mover = self.mover(part_of, hands.safe_point)
             self.devices.vehicle.brake()
-            scan = collect_scan(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 * f, t))
-            target = collect_target(self.config, self.devices, mover, hands.check, lambda f, t: tell(0.65 + 0.3 * f, t))
+            given = self.config, self.devices, mover, hands.check
+            scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
+            target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
             tell(0.96, "solving")
             observations = gathered(scan, target, self._identities(), self.config)
             return observations, solve_observations(observations).calibration
@@ -490,9 +533,12 @@ class Cell:
                 run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
 
             def work(hands: Hands) -> Verification:
+                self.devices.interlocks.work_with(calibration.configuration)
                 self.devices.vehicle.brake()
                 mover = self.mover(loaded, hands.safe_point)
-                seen = collect_verification(self.config, self.devices, mover, calibration, hands.check, tell)
+                seen = collect_verification(
+                    self.config, self.devices, mover, calibration, hands.check, tell, hands.keep
+                )
                 return Verification.of(calibration, loaded, seen)
 
             made = self._recorded(run, "verification", work)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 
 class Clock:
@@ -39,3 +41,24 @@ class Clock:
     def wall(self, seconds: float) -> float:
         """The seconds on the wall that `seconds` of this clock take, for time-outs of blocking system calls."""
         return seconds / self.rate
+
+    @contextmanager
+    def alarm(self, seconds: float, ring: Callable[[], float | None]) -> Iterator[None]:
+        """Inside this context call `ring()` after `seconds`, whatever this thread does meanwhile.
+
+        `ring` gives in how many seconds to call it again, or None; it is called by another thread.
+        """
+        over = threading.Event()
+
+        def watch() -> None:
+            left: float | None = seconds
+            while left is not None and not self.wait(over, left):
+                left = ring()
+
+        watcher = threading.Thread(target=watch, name="alarm", daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watcher.join()

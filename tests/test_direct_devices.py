@@ -28,7 +28,7 @@ Run = dict[str, Any]
 @pytest.fixture(scope="module")
 def cell() -> VirtualCell:
     made = VirtualCell(CONFIG, seed=4, level="ideal")
-    made.devices.rail.home().wait(60.0)
+    made.rail.home().wait(60.0)
     return made
 
 
@@ -48,7 +48,7 @@ def test_waiting_lets_just_that_much_time_pass(cell):
 
 
 def test_a_rail_move_takes_the_time_of_its_trapezoid(cell):
-    rail = cell.devices.rail
+    rail = cell.rail
     rail.move_to(0.010).wait(30.0)
     begun = cell.clock.now()
     rail.move_to(0.090).wait(30.0)
@@ -58,7 +58,7 @@ def test_a_rail_move_takes_the_time_of_its_trapezoid(cell):
 
 
 def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):
-    rail = cell.devices.rail
+    rail = cell.rail
     with pytest.raises(InterlockError):
         rail.sweep(0.02, 0.03, 0.015)
     rail.move_to(rail.sweep_start(0.02, 0.03, 0.015)).wait(30.0)
@@ -72,7 +72,7 @@ def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):
 
 
 def test_the_arm_arrives_where_it_was_sent(cell):
-    arm = cell.devices.arm
+    arm = cell.arm
     start = arm.state().joints
     end = start + np.array([0.1, -0.05, 0.05, 0.0, 0.1, 0.2])
     times = np.linspace(0.0, 2.0, 101)
@@ -86,7 +86,7 @@ def test_the_arm_arrives_where_it_was_sent(cell):
 
 
 def test_the_vehicle_counts_the_way_that_it_drove(cell):
-    vehicle = cell.devices.vehicle
+    vehicle = cell.vehicle
     vehicle.enable()
     before, there = vehicle.state(), cell.world.vehicle.planar(cell.clock.now())
     for _ in range(25):
@@ -119,7 +119,7 @@ def test_frames_follow_each_other_in_world_time(cell):
 
 def test_the_laser_is_seen_only_while_it_is_lit(cell):
     lit_before = cell.world.laser.at(cell.clock.now())
-    with cell.devices.laser.lit():
+    with cell.devices.laser.bare.lit():
         lit = cell.world.laser.at(cell.clock.now())
     assert (lit_before, lit, cell.world.laser.at(cell.clock.now())) == (False, True, False)
 

@@ -3,34 +3,44 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import pytest
 
 from cell.devices.gate import Gate
-from drivers.errors import Aborted
+from cell.devices.interlocks import Command, Interlocks, Situation
+from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken
+
+MOVE = Command("rail", "move_to", {"position": 0.0})
+
+
+def open_gate() -> Gate:
+    """A gate without devices and rules."""
+    nothing = Situation(None, None, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "")
+    return Gate(Interlocks(nothing, ()))
 
 
 def test_work_that_entered_before_a_stop_begins_nothing_after_it() -> None:
-    gate, begun = Gate(), []
+    gate, begun = open_gate(), []
     gate.enter(CancelToken())
-    assert gate.begin(lambda: 7, lambda: None) == 7
+    assert gate.begin(MOVE, lambda: 7, lambda: None) == 7
     gate.shut()
     with pytest.raises(Aborted):
-        gate.begin(lambda: begun.append("motion"), lambda: None)
+        gate.begin(MOVE, lambda: begun.append("motion"), lambda: None)
     assert begun == []
 
 
 def test_a_stop_that_comes_while_something_begins_undoes_it() -> None:
-    gate, undone = Gate(), []
+    gate, undone = open_gate(), []
     gate.enter(CancelToken())
     with pytest.raises(Aborted):
-        gate.begin(gate.shut, lambda: undone.append("stopped"))
+        gate.begin(MOVE, gate.shut, lambda: undone.append("stopped"))
     assert undone == ["stopped"]
 
 
 def test_new_work_may_enter_and_an_abandoned_thread_stays_barred() -> None:
-    gate = Gate()
+    gate = open_gate()
     entered, go_on, outcome = threading.Event(), threading.Event(), []
 
     def abandoned() -> None:
@@ -54,28 +64,51 @@ def test_new_work_may_enter_and_an_abandoned_thread_stays_barred() -> None:
     assert outcome == ["barred"]
 
 
-def test_a_thread_that_never_entered_is_not_barred() -> None:
-    gate = Gate()
+def test_a_thread_that_never_entered_is_barred_by_a_stop_until_a_run_begins_or_a_person_clears_it() -> None:
+    gate, said = open_gate(), []
+
+    def script() -> None:
+        try:
+            gate.require(MOVE)
+            said.append("passed")
+        except InterlockError as error:
+            said.append(str(error))
+
+    def in_a_thread(work: Callable[[], object]) -> None:
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join(5)
+
+    in_a_thread(script)
     gate.shut()
-    gate.require()
+    in_a_thread(script)
+    in_a_thread(lambda: gate.enter(CancelToken()))
+    in_a_thread(script)
+    gate.shut()
+    in_a_thread(script)
+    gate.clear()
+    in_a_thread(script)
+    assert [text if text == "passed" else "after_a_stop" in text for text in said] == [
+        "passed", True, "passed", True, "passed",
+    ]  # fmt: skip
 
 
 def test_work_whose_run_is_to_end_begins_nothing_even_before_anything_was_stopped() -> None:
-    gate, begun = Gate(), []
+    gate, begun = open_gate(), []
     run = CancelToken()
     step = CancelToken(run)
     gate.enter(step)
     gate.require()
     run.cancel("enough")
     with pytest.raises(Aborted, match="enough"):
-        gate.begin(lambda: begun.append("motion"), lambda: None)
+        gate.begin(MOVE, lambda: begun.append("motion"), lambda: None)
     assert begun == []
 
 
 def test_a_run_that_is_cancelled_while_something_begins_has_it_undone() -> None:
-    gate, undone = Gate(), []
+    gate, undone = open_gate(), []
     token = CancelToken()
     gate.enter(token)
     with pytest.raises(Aborted):
-        gate.begin(lambda: token.cancel("enough"), lambda: undone.append("stopped"))
+        gate.begin(MOVE, lambda: token.cancel("enough"), lambda: undone.append("stopped"))
     assert undone == ["stopped"]

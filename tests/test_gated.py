@@ -25,7 +25,8 @@ def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) ->
     devices.rail.home().wait(60.0)
     devices.rail.move_to(0.02).wait(30.0)
     assert devices.rail.state().position == pytest.approx(0.02, abs=1e-6)
-    with devices.laser.lit():
+    devices.vehicle.brake()
+    with devices.interlocks.purpose("test"), devices.laser.lit():
         assert devices.laser.is_on
     assert not devices.laser.is_on
 

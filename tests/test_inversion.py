@@ -213,7 +213,7 @@ def test_the_pose_is_found_from_twenty_degrees_and_eight_millimetres_away(height
         assert np.linalg.norm(error[3:]) < 1.5e-3
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("height", [freeform, seat])
 def test_at_least_99_of_100_starts_lead_to_the_true_pose(height: Height) -> None:
     rng = np.random.default_rng(11)

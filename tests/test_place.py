@@ -45,7 +45,9 @@ class Site:
         target = JOB.approach.target.se3()
         world.vehicle._x, world.vehicle._y = target.translation[:2]
         self.cell.clock.sleep(0.1)
-        self.arm = self.cell.arm
+        self.cell.devices.vehicle.brake()
+        self.cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+        self.arm = self.cell.devices.arm
         self.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
         world_from_base = world.world_from_base(self.cell.clock.now())
         self.base_from_surface = from_matrix(inverse(world_from_base) @ world.scene.world_from_surface)
@@ -147,7 +149,7 @@ def test_a_part_that_meets_nothing_is_not_released() -> None:
 
 def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
     site = Site()
-    site.cell.devices.claw.release()
+    site.cell.devices.claw.bare.release()
     site.heights.clear()
     with pytest.raises(RefusedError, match="does not hold the part any more before the descent"):
         site.place()
@@ -157,7 +159,7 @@ def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
 
 def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
     site = Site()
-    site.cell.devices.claw.release()
+    site.cell.devices.claw.bare.release()
     here = Workplace(
         CONFIG,
         JOB,

@@ -44,6 +44,8 @@ def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0)
     """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     devices = cell.devices
+    devices.vehicle.brake()
+    devices.interlocks.work_with(CONFIG.calibration_hash())
     devices.rail.home().wait(60.0)
     cell.rail.late = late
     cell.scan_camera.late = camera_late

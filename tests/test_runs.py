@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import CellConfig, load_config
+from cell import Cell
+from cell.config import CellConfig, default_toml, load_config
 from cell.run.folder import (
     CellLock,
     Question,
@@ -58,6 +59,21 @@ def test_two_configurations_that_share_one_device_are_not_open_at_once(config: C
         # What it had taken before it met the rail is free again.
         with pytest.raises(InterlockError, match="the rail at"):
             CellLock(other).__enter__()
+
+
+def test_a_cell_that_another_holds_is_not_opened(config: CellConfig, tmp_path: Path) -> None:
+    own = config.arm.address
+    text = default_toml()
+    for wanted, given in (
+        ('address = "192.0.2.10"', f'address = "{own}"'),
+        ('url = "/dev/ttyACM0"', f'url = "{config.rail.url}"'),
+    ):
+        assert wanted in text
+        text = text.replace(wanted, given)
+    (tmp_path / "cell.toml").write_text(text.replace("192.0.2.", "127.3.0."))
+    held = load_config(tmp_path / "cell.toml")
+    with CellLock(held), pytest.raises(InterlockError, match="is held by process"):
+        Cell.open(tmp_path / "cell.toml")
 
 
 def test_another_user_finds_the_cell_held(config: CellConfig) -> None:

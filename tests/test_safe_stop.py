@@ -10,6 +10,7 @@ import pytest
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.devices.stopping import stop_cell
+from cell.steps.moves import HOME
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken
 
@@ -29,13 +30,16 @@ def stays(cell: VirtualCell, value: Callable[[], object]) -> bool:
 
 
 def test_the_laser_goes_off(cell: VirtualCell) -> None:
-    cell.devices.arm.set_digital_output(CONFIG.laser.output, True)
+    # A switch without an owner: what goes off is what the stop switches off.
+    cell.arm.set_digital_output(CONFIG.laser.output, True)
     assert cell.devices.laser.is_on
     stop_cell(cell.devices)
     assert not cell.world.arm.digital_outputs >> CONFIG.laser.output & 1
 
 
 def test_the_vehicle_stands_and_its_brake_is_locked(cell: VirtualCell) -> None:
+    cell.devices.vehicle.brake()
+    cell.devices.arm.move_joints(HOME, 0.5, 1.0).wait(60.0)
     cell.devices.vehicle.enable()
     cell.devices.vehicle.drive(-0.2, 0.1)
     cell.clock.sleep(0.4)
@@ -57,6 +61,7 @@ def test_the_rail_stands(cell: VirtualCell) -> None:
 
 
 def test_the_arm_stands(cell: VirtualCell) -> None:
+    cell.devices.vehicle.brake()
     away = cell.devices.arm.state().joints + np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
     cell.devices.arm.move_joints(away, 0.3, 1.0)
     cell.clock.sleep(0.4)

@@ -291,6 +291,7 @@ def run_step(cell: VirtualCell, folder: Path, first: StepCall) -> RunResult:
 
 def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(folder: Path) -> None:
     cell = VirtualCell(load_config(None), SEED)
+    cell.devices.vehicle.brake()
     threads: list[str] = []
 
     def slow(context: StepContext) -> None:

@@ -30,7 +30,7 @@ class Site:
 
     def __init__(self, seed: int = 2, level: str = "nominal") -> None:
         self.cell = VirtualCell(CONFIG, seed, level)
-        self.vehicle = self.cell.devices.vehicle
+        self.vehicle = self.cell.vehicle
         self.whereabouts = Whereabouts(self.vehicle)
         self.notes: list[str] = []
 

@@ -8,6 +8,7 @@ import typer
 
 from cell.cli.options import (
     ConfigOption,
+    JobOption,
     JsonOption,
     Level,
     LevelOption,
@@ -36,6 +37,7 @@ def jog(
         list[str], typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg.")
     ],
     config: ConfigOption = None,
+    job: JobOption = "pot",
     sim: SimOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
@@ -48,7 +50,7 @@ def jog(
 
     wish = parse_jog(device, motion)
     with Cell.open(config, sim=sim, seed=seed, level=level.value, only=NEEDED[wish.device]) as cell:
-        result = perform(cell, wish)
+        result = perform(cell, wish, job)
     if json:
         print_json(result)
     else:

@@ -7,13 +7,18 @@ from contextlib import ExitStack
 from typing import Any
 
 from cell.config import DEVICES, CellConfig
-from cell.devices.built_in import ArmOutputLaserConfig
+from cell.devices.built_in import ArmOutputLaserConfig, OnArm
 from cell.devices.devices import Devices
 from cell.devices.gate import Gate
-from cell.devices.gated import GatedArm, GatedClaw, GatedLaser, GatedRail, GatedVehicle
+from cell.devices.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
+from cell.devices.gated_laser import GatedLaser
+from cell.devices.interlocks import Interlocks, Situation
 from cell.devices.make import Surroundings
+from cell.devices.rules import RULES
+from cell.devices.ways import Ways
 from cell.geometry.poses import to_ur
 from cell.motion.kinematics import ArmKinematics
+from cell.steps.moves import HOME
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vehicle
 
@@ -28,7 +33,7 @@ def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devic
             if not config.make(name).on_arm:
                 opened.callback(made[name].close)
         opened.pop_all()
-    return behind_gate(clock, **made)
+    return behind_gate(config, clock, **made)
 
 
 def connected_for(config: CellConfig, wanted: Collection[str]) -> list[str]:
@@ -56,6 +61,7 @@ def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
 
 
 def behind_gate(
+    config: CellConfig,
     clock: Clock,
     arm: Arm | None = None,
     rail: Rail | None = None,
@@ -66,7 +72,20 @@ def behind_gate(
     claw: Claw | None = None,
 ) -> Devices:
     """These devices, of whatever make, with everything that moves, shines or grips behind one gate."""
-    gate = Gate()
+    ways = Ways(config)
+    switched = (config.laser, "laser"), (config.claw, "claw")
+    situation = Situation(
+        arm,
+        vehicle,
+        laser,
+        claw,
+        {record.output: owner for record, owner in switched if isinstance(record, OnArm)},
+        ways.clear,
+        ways.kinematics.fk,
+        {"HOME": HOME},
+        config.calibration_hash(),
+    )
+    gate = Gate(Interlocks(situation, RULES))
     return Devices(
         clock,
         gate,
@@ -75,6 +94,6 @@ def behind_gate(
         vehicle=None if vehicle is None else GatedVehicle(vehicle, gate),
         scan_camera=scan_camera,
         target_camera=target_camera,
-        laser=None if laser is None else GatedLaser(laser, gate),
+        laser=None if laser is None else GatedLaser(laser, gate, clock),
         claw=None if claw is None else GatedClaw(claw, gate),
     )

@@ -106,7 +106,9 @@ class StreamCameraConfig(CameraConfig):
     address: Annotated[str, Endpoint]
 
 
-class _OnArm(DeviceConfig):
+class OnArm(DeviceConfig):
+    """A device that an output of the arm switches."""
+
     ADDRESS: ClassVar[str] = "output"
 
     output: Connector
@@ -117,13 +119,13 @@ class _OnArm(DeviceConfig):
         return f"arm output {self.output}"
 
 
-class ArmOutputLaserConfig(LaserConfig, _OnArm):
+class ArmOutputLaserConfig(LaserConfig, OnArm):
     """A laser that an output of the arm switches."""
 
     driver: Literal["arm_output"] = "arm_output"
 
 
-class ArmOutputClawConfig(ClawConfig, _OnArm):
+class ArmOutputClawConfig(ClawConfig, OnArm):
     """A claw that an output of the arm closes; an input of the arm shows a held part."""
 
     driver: Literal["arm_output"] = "arm_output"

@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from cell.devices.gate import Gate
+from cell.devices.gated_laser import GatedLaser
+from cell.devices.interlocks import Interlocks
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
+from drivers.interfaces import Arm, Camera, Claw, Device, Rail, Vehicle
 from statemachine.waiting import waiting_on
 
 SAFE_STOP_TIMEOUT_S = 5.0
@@ -30,7 +32,7 @@ class Devices:
         vehicle: Vehicle | None = None,
         scan_camera: Camera | None = None,
         target_camera: Camera | None = None,
-        laser: Laser | None = None,
+        laser: GatedLaser | None = None,
         claw: Claw | None = None,
     ) -> None:
         self.clock = clock
@@ -42,6 +44,11 @@ class Devices:
         self._target_camera = target_camera
         self._laser = laser
         self._claw = claw
+
+    @property
+    def interlocks(self) -> Interlocks:
+        """What each command to them has to pass."""
+        return self.gate.interlocks
 
     @property
     def arm(self) -> Arm:
@@ -69,7 +76,7 @@ class Devices:
         return _there("target_camera", self._target_camera)
 
     @property
-    def laser(self) -> Laser:
+    def laser(self) -> GatedLaser:
         """The laser."""
         return _there("laser", self._laser)
 

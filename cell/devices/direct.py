@@ -35,7 +35,7 @@ class VirtualCell(DirectCell):
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
         self.devices: Devices = behind_gate(
-            self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
+            config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
         )
 
     def require_fault(self, name: str) -> None:

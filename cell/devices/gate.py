@@ -2,55 +2,110 @@
 
 A stop ends what moves, but a step that plans or settles at that moment would begin its next motion after it. Work
 therefore enters the gate with its cancel token: once that is cancelled, or the cell was stopped, it begins nothing
-any more, in whatever thread it still goes on. The devices behind the gate are in `cell.devices.gated`.
+any more, in whatever thread it still goes on. Then the interlocks are asked whether the command is safe now. The
+devices behind the gate are in `cell.devices.gated`.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Generic, TypeVar
 
-from drivers.errors import Aborted
+from cell.devices.interlocks import Command, Interlocks
+from drivers.errors import Aborted, InterlockError
+from drivers.interfaces import Device, Identity
 from statemachine.cancel import CancelToken
 
 Made = TypeVar("Made")
+Bare = TypeVar("Bare", bound=Device)
 
 
 class Gate:
-    """Counts the stops; each thread that works remembers the count at which it entered, and its token."""
+    """Counts the stops; each thread that works remembers the count at which it entered, and its token.
 
-    def __init__(self) -> None:
+    Threads that never entered, such as a script's own, are let through until the first stop; after it a new run has to
+    begin, or a person has to `clear` it.
+    """
+
+    def __init__(self, interlocks: Interlocks) -> None:
+        self.interlocks = interlocks
         self._stops = 0
+        self._cleared = 0
         self._entered = threading.local()
 
     def enter(self, token: CancelToken) -> None:
         """Begin new work in this thread, which `token` ends."""
+        self._cleared = self._stops
         self._entered.stops = self._stops
         self._entered.token = token
+
+    def leave(self) -> None:
+        """This thread's work has ended; it is now as one that never entered."""
+        self._entered.stops = self._entered.token = None
+
+    def clear(self) -> None:
+        """The stops so far keep no one any more but the work that they ended."""
+        self._cleared = self._stops
 
     def shut(self) -> None:
         """Bar all work that has entered so far. Comes before the devices are stopped."""
         self._stops += 1
 
-    def require(self) -> None:
-        """Raise `Aborted` when this thread's work is to end or the cell was stopped since it entered.
+    def require(self, command: Command | None = None) -> None:
+        """Raise when nothing may be begun by this thread, or when an interlock stands against the command.
 
-        A thread that never entered is not barred.
+        `Aborted` when this thread's work is to end or the cell was stopped since it entered; `InterlockError` when it
+        never entered and nobody has cleared a stop, or when the command is not safe now.
         """
         token: CancelToken | None = getattr(self._entered, "token", None)
         if token is not None and token.reason is not None:
             raise Aborted(f"{token.reason}; nothing new is begun")
-        if getattr(self._entered, "stops", self._stops) != self._stops:
+        stops: int | None = getattr(self._entered, "stops", None)
+        if stops is not None and stops != self._stops:
             raise Aborted("the cell was stopped; nothing new is begun")
+        if stops is None and self._cleared != self._stops:
+            raise InterlockError(
+                "cell",
+                "was stopped, and nothing begins after that by itself (interlock after_a_stop). See that it is safe, "
+                "then begin a run, or say so with clear_stop(by)",
+            )
+        if command is not None:
+            self.interlocks.require(command)
 
-    def begin(self, start: Callable[[], Made], undo: Callable[[], None]) -> Made:
-        """`start()`, unless the cell was stopped; undone at once when it is stopped meanwhile."""
-        self.require()
+    def begin(self, command: Command, start: Callable[[], Made], undo: Callable[[], None]) -> Made:
+        """`start()`, if the command may pass; undone at once when the cell is stopped meanwhile."""
+        self.require(command)
         made = start()
         try:
             self.require()
-        except Aborted:
+        except (Aborted, InterlockError):
             undo()
             raise
         return made
+
+
+class Gated(Generic[Bare]):
+    """What all devices behind the gate share: `bare` is the device, `gate` what its commands pass."""
+
+    def __init__(self, bare: Bare, gate: Gate) -> None:
+        self.bare = bare
+        self.gate = gate
+        self.name = bare.name
+        self.statistics = bare.statistics
+
+    def identity(self) -> Identity:
+        """See `Device.identity`."""
+        return self.bare.identity()
+
+    def ping(self) -> float:
+        """See `Device.ping`."""
+        return self.bare.ping()
+
+    def stop(self) -> None:
+        """See `Device.stop`."""
+        self.bare.stop()
+
+    def close(self) -> None:
+        """See `Device.close`."""
+        self.bare.close()

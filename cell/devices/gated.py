@@ -5,20 +5,17 @@ Reading, stopping and closing always pass. What a make offers beyond its interfa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Generic, TypeVar
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
-from cell.devices.gate import Gate
+from cell.devices.gate import Gate, Gated
+from cell.devices.interlocks import Command
 from drivers.clock_map import Latch
 from drivers.interfaces import (
     Arm,
     ArmMotion,
     ArmState,
     Claw,
-    Device,
-    Identity,
-    Laser,
     Motion,
     Rail,
     RailState,
@@ -27,34 +24,6 @@ from drivers.interfaces import (
     Vehicle,
     VehicleState,
 )
-
-Bare = TypeVar("Bare", bound=Device)
-
-
-class Gated(Generic[Bare]):
-    """What all of them share: `bare` is the device, `gate` what its commands pass."""
-
-    def __init__(self, bare: Bare, gate: Gate) -> None:
-        self.bare = bare
-        self.gate = gate
-        self.name = bare.name
-        self.statistics = bare.statistics
-
-    def identity(self) -> Identity:
-        """See `Device.identity`."""
-        return self.bare.identity()
-
-    def ping(self) -> float:
-        """See `Device.ping`."""
-        return self.bare.ping()
-
-    def stop(self) -> None:
-        """See `Device.stop`."""
-        self.bare.stop()
-
-    def close(self) -> None:
-        """See `Device.close`."""
-        self.bare.close()
 
 
 class GatedArm(Gated[Arm]):
@@ -74,15 +43,23 @@ class GatedArm(Gated[Arm]):
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_joints`."""
-        return self.gate.begin(lambda: self.bare.move_joints(joints, speed, acceleration), self.bare.stop)
+        command = Command("arm", "move_joints", {"joints": joints})
+        return self._move(command, lambda: self.bare.move_joints(joints, speed, acceleration))
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_linear`."""
-        return self.gate.begin(lambda: self.bare.move_linear(flange, speed, acceleration), self.bare.stop)
+        command = Command("arm", "move_linear", {"flange": flange})
+        return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
 
     def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
         """See `Arm.follow`."""
-        return self.gate.begin(lambda: self.bare.follow(times, joints, force_limit), self.bare.stop)
+        command = Command("arm", "follow", {"joints": joints, "force_limit": force_limit})
+        return self._move(command, lambda: self.bare.follow(times, joints, force_limit))
+
+    def _move(self, command: Command, start: Callable[[], ArmMotion]) -> ArmMotion:
+        motion = self.gate.begin(command, start, self.bare.stop)
+        self.gate.interlocks.situation.last = motion
+        return motion
 
     def zero_force(self) -> None:
         """See `Arm.zero_force`."""
@@ -94,6 +71,7 @@ class GatedArm(Gated[Arm]):
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """See `Arm.set_digital_output`."""
+        self.gate.interlocks.require(Command("arm", "set_digital_output", {"index": index, "value": value}))
         self.bare.set_digital_output(index, value)
 
     def digital_input(self, index: int) -> bool:
@@ -102,7 +80,7 @@ class GatedArm(Gated[Arm]):
 
     def recover(self, *, confirmed: bool = False) -> None:
         """See `Arm.recover`."""
-        self.gate.begin(lambda: self.bare.recover(confirmed=confirmed), self.bare.stop)
+        self.gate.begin(Command("arm", "recover"), lambda: self.bare.recover(confirmed=confirmed), self.bare.stop)
 
 
 class GatedRail(Gated[Rail]):
@@ -118,15 +96,17 @@ class GatedRail(Gated[Rail]):
 
     def home(self) -> Motion:
         """See `Rail.home`."""
-        return self.gate.begin(self.bare.home, self.bare.stop)
+        return self.gate.begin(Command("rail", "home"), self.bare.home, self.bare.stop)
 
     def move_to(self, position: float, speed: float | None = None) -> Motion:
         """See `Rail.move_to`."""
-        return self.gate.begin(lambda: self.bare.move_to(position, speed), self.bare.stop)
+        command = Command("rail", "move_to", {"position": position})
+        return self.gate.begin(command, lambda: self.bare.move_to(position, speed), self.bare.stop)
 
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """See `Rail.sweep`."""
-        return self.gate.begin(lambda: self.bare.sweep(start, stop, speed), self.bare.stop)
+        command = Command("rail", "sweep", {"start": start, "stop": stop})
+        return self.gate.begin(command, lambda: self.bare.sweep(start, stop, speed), self.bare.stop)
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """See `Rail.sweep_start`."""
@@ -146,36 +126,20 @@ class GatedVehicle(Gated[Vehicle]):
 
     def enable(self) -> None:
         """See `Vehicle.enable`."""
-        self.gate.begin(self.bare.enable, self.bare.brake)
+        self.gate.begin(Command("vehicle", "enable"), self.bare.enable, self.bare.brake)
 
     def recover(self) -> None:
         """See `Vehicle.recover`."""
-        self.gate.begin(self.bare.recover, self.bare.brake)
+        self.gate.begin(Command("vehicle", "recover"), self.bare.recover, self.bare.brake)
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """See `Vehicle.drive`."""
-        self.gate.begin(lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
+        command = Command("vehicle", "drive", {"speed": speed, "yaw_rate": yaw_rate})
+        self.gate.begin(command, lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
 
     def brake(self) -> None:
         """See `Vehicle.brake`."""
         self.bare.brake()
-
-
-class GatedLaser(Gated[Laser]):
-    """The laser, lit through a gate."""
-
-    @contextmanager
-    def lit(self) -> Iterator[None]:
-        """See `Laser.lit`."""
-        self.gate.require()
-        with self.bare.lit():
-            self.gate.require()
-            yield
-
-    @property
-    def is_on(self) -> bool:
-        """See `Laser.is_on`."""
-        return self.bare.is_on
 
 
 class GatedClaw(Gated[Claw]):
@@ -183,12 +147,12 @@ class GatedClaw(Gated[Claw]):
 
     def grip(self, timeout: float = 2.0) -> None:
         """See `Claw.grip`."""
-        self.gate.require()
+        self.gate.require(Command("claw", "grip"))
         self.bare.grip(timeout)
 
     def release(self, timeout: float = 2.0) -> None:
         """See `Claw.release`."""
-        self.gate.require()
+        self.gate.require(Command("claw", "release"))
         self.bare.release(timeout)
 
     @property

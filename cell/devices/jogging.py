@@ -6,15 +6,19 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur
+from cell.job import Job, load_job
 from cell.run.recorded_work import Hands
 from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
+from cell.steps.camera_poses import look_pose
 from cell.units import parse_quantity
+from cell.vision import parse_board
 from drivers.errors import ConfigError, LimitError
 
 if TYPE_CHECKING:
@@ -62,8 +66,12 @@ def _amount(text: str, unit: str) -> float:
         raise ConfigError(f"jog by {error}; write it like: {_USAGE}") from error
 
 
-def jog(cell: Cell, wish: Jog) -> dict[str, str]:
-    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell."""
+def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
+    """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell.
+
+    The vehicle is also jogged with the arm in the looking pose of `job`.
+    """
+    loaded, _ = load_job(job)
 
     def work(hands: Hands) -> dict[str, str]:
         match wish.device:
@@ -72,9 +80,17 @@ def jog(cell: Cell, wish: Jog) -> dict[str, str]:
             case "arm":
                 return _jog_arm(cell, wish)
             case _:
+                _name_look(cell, loaded)
                 return _jog_vehicle(cell, wish, hands.check)
 
     return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()})
+
+
+def _name_look(cell: Cell, job: Job) -> None:
+    """Where a run of `job` has the arm while it drives, by the camera's mounting as configured."""
+    mounting = cell.config.target_camera.flange_from_camera.se3()
+    look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
+    cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:

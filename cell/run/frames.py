@@ -28,14 +28,13 @@ PNG = (
 
 
 class FrameStore:
-    """Writes frames into `folder` as `<what>-<frame id>.png`, lossless.
+    """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless.
 
     `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
     there was looking at.
     """
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         self.begin()
         self._folder = folder
         self._waiting: queue.Queue[tuple[Path, Frame] | None] = queue.Queue(CAPACITY)
@@ -70,6 +69,7 @@ class FrameStore:
         while (item := self._waiting.get()) is not None:
             path, frame = item
             try:
+                path.parent.mkdir(parents=True, exist_ok=True)
                 if not cv2.imwrite(str(path), frame.image, PNG):
                     self._failure = f"{path} could not be written"
             except Exception as error:  # the writer must go on emptying the queue

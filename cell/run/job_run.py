@@ -159,6 +159,9 @@ class JobRun:
                 script=self.script,
             )
             result = runner.run()
+        if result.outcome in (Outcome.PLACED, Outcome.DONE):
+            # The stop at the end of a good run keeps nobody from going on.
+            self.devices.gate.clear()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
         cell_s = round(self.devices.clock.now() - begun, 3)

@@ -17,10 +17,12 @@ from typing import Any, TypeVar
 from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
 from cell.run.folder import REPORT, new_run, timeless, when, write_json
+from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
 from cell.version import release
 from drivers.errors import Aborted, CellError, Interrupted, RefusedError
+from drivers.interfaces import Frame
 from statemachine.journal import Journal, JournalError
 from statemachine.step import Event
 from statemachine.waiting import waiting_on
@@ -30,6 +32,9 @@ GRACE_S = 5.0
 REQUEST_POLLS, HEALTH_POLLS = 10, 5
 """At every so many looks around: requests of other processes, the cell's health."""
 
+FRAMES = "frames"
+"""Where in the run's folder the pictures are that its work looked at."""
+
 Made = TypeVar("Made")
 
 log = logging.getLogger(__name__)
@@ -37,11 +42,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Hands:
-    """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused."""
+    """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
+
+    `keep(what, frame)` leaves a picture that the work looked at in the run's folder.
+    """
 
     check: Callable[[], None]
     safe_point: Callable[[], None]
     progress: Callable[[float, str], None]
+    keep: Callable[[str, Frame], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +83,10 @@ class RecordedWork:
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
+        frames = FrameStore(folder / FRAMES)
         try:
-            with run_log(folder):
-                return self._watched(work, journal)
+            with run_log(folder), frames:
+                return self._watched(work, journal, frames)
         except BaseException as error:
             ended, outcome, reason = error, _outcome(error), str(error)
             raise
@@ -88,6 +98,10 @@ class RecordedWork:
                 "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),
                 "cell_s": round(self.devices.clock.now() - begun, 3), **facts,
             }  # fmt: skip
+            if outcome != "done" and frames.recent:
+                report["last_frames"] = [f"{FRAMES}/{name}" for name in frames.recent]
+            if frames.failure is not None:
+                report["frames_missing"] = frames.failure
             for action in (
                 lambda: journal.run_ended(outcome, reason), journal.close,
                 lambda: write_json(folder / REPORT, timeless(report)),
@@ -95,13 +109,14 @@ class RecordedWork:
                 _last(action, ended)
             self.run.folder = outer or folder
 
-    def _watched(self, work: Callable[[Hands], Made], journal: Journal) -> Made:
+    def _watched(self, work: Callable[[Hands], Made], journal: Journal, frames: FrameStore) -> Made:
         control, clock = self.run.control, self.devices.clock
         waiting = waiting_on(clock)
         hands = Hands(
             control.token.check,
             lambda: control.safe_point(control.token, self._say, waiting.look),
             self._progress,
+            frames.keep,
         )
         made: list[Made] = []
         problems: list[str] = []

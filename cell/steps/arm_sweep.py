@@ -51,12 +51,14 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     clocks.add([arm.latch_clock()])
     # Before anything is lit and moved in vain.
     shift_by_times([TimeBound(arm.name, "arm", clocks.uncertainty)], scan.speed, errors)
-    with devices.laser.lit(), arm.record() as states, camera.stream() as frames:
+    laser, purpose = devices.laser, devices.interlocks.purpose("sweep")
+    with purpose, laser.lit(), arm.record() as states, camera.stream() as frames:
         motion, patience = mover.begin(line)
         over: list[float] = []
         deadline = devices.clock.now() + patience
 
         def ended() -> float | None:
+            laser.renew()
             if motion.done or devices.clock.now() > deadline:
                 motion.wait(0.0)  # raises what ended it early, and the deadline
                 over.append(devices.clock.now())

@@ -162,7 +162,9 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
         here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)
     camera = here.calibration.target.flange_from_camera
-    here.mover.to(look_pose(here.config, here.job, here.board, camera), "the looking pose")
+    look = look_pose(here.config, here.job, here.board, camera)
+    here.mover.to(look, "the looking pose")
+    here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     vehicle.enable()
     return drive_to_target(

@@ -76,6 +76,7 @@ class Kind:
 def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
     here.devices.gate.enter(context.token)
     context.check()
+    here.devices.interlocks.work_with(here.calibration.configuration)
     here.mover.hold = context.safe_point
     here.frames.begin()
     return step.work(here, context)

@@ -28,10 +28,12 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     rail.move_to(rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)).wait(30.0)
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
     base_from_flange = from_ur(arm.state().flange)
-    with devices.laser.lit(), devices.scan_camera.stream() as frames:
+    laser = devices.laser
+    with devices.interlocks.purpose("sweep"), laser.lit(), devices.scan_camera.stream() as frames:
         sweep = rail.sweep(plan.rail_start, plan.rail_stop, scan.speed)
 
         def ended() -> float | None:
+            laser.renew()
             if not sweep.done:
                 return None
             sweep.wait(1.0)

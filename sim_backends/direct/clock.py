@@ -10,6 +10,7 @@ from drivers.clock import Clock
 from sim_backends.clock import SteppedClock
 
 Look = Callable[[], None]
+Ring = Callable[[], float | None]
 
 
 class VirtualClock(Clock):
@@ -25,6 +26,7 @@ class VirtualClock(Clock):
         self._tick = tick
         self._moving = threading.Lock()
         self._looking = threading.local()
+        self._alarms: dict[Ring, float] = {}
 
     def now(self) -> float:
         """World time in s."""
@@ -67,4 +69,20 @@ class VirtualClock(Clock):
             if self._time.now() >= until:
                 return False
             self._tick(until)
-            return True
+        self._ring()
+        return True
+
+    @contextmanager
+    def alarm(self, seconds: float, ring: Ring) -> Iterator[None]:
+        """See `Clock.alarm`; rung by whoever lets the time pass, after the tick that brings it there."""
+        self._alarms[ring] = self.now() + seconds
+        try:
+            yield
+        finally:
+            self._alarms.pop(ring, None)
+
+    def _ring(self) -> None:
+        for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
+            self._alarms.pop(ring, None)
+            if (again := ring()) is not None:
+                self._alarms[ring] = self.now() + again

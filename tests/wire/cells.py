@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,15 @@ from drivers.clock import Clock
 from statemachine.journal import JournalError, read
 
 SPEED = "3"
+
+
+@dataclass(frozen=True)
+class Supervised:
+    """What the README's script printed in `folder`, where it calibrated the simulated cell of seed 3 and placed."""
+
+    folder: Path
+    printed: str
+    report: dict[str, Any]
 
 
 def command(*arguments: str) -> list[str]:

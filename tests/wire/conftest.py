@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from tests.wire.cells import cell
+from cell.run.folder import list_runs, read_report
+from tests.test_readme import block
+from tests.wire.cells import Supervised
 from tests.wire.heartbeat import Heartbeat
 
 _heartbeat = pytest.StashKey[Heartbeat]()
@@ -33,9 +37,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the calibration of the simulated cell of seed 3; tests run jobs in it."""
+def supervised(tmp_path_factory: pytest.TempPathFactory) -> Supervised:
+    """A first run on a fresh machine, by the script that the README prints, over the wires."""
     folder = tmp_path_factory.mktemp("cell")
-    done = cell("calibrate", "--sim", "all", "--seed", "3", "--json", folder=folder, timeout=900.0)
+    (folder / "supervise.py").write_text(block("python"), encoding="utf-8")
+    done = subprocess.run([sys.executable, "supervise.py"], cwd=folder, capture_output=True, text=True, timeout=900.0)
     assert done.returncode == 0, done.stderr
-    return folder
+    (run,) = (run for run in list_runs(folder / "runs") if read_report(run)["kind"] == "job")
+    return Supervised(folder, done.stdout, read_report(run))
+
+
+@pytest.fixture(scope="session")
+def place(supervised: Supervised) -> Path:
+    """A folder with the calibration of the simulated cell of seed 3; tests run jobs in it."""
+    return supervised.folder

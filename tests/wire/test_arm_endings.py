@@ -291,10 +291,11 @@ def test_a_recovery_ends_the_old_program_before_it_unlocks_even_if_its_process_h
     bench.ask("protective_stop")
     with pytest.raises(DeviceFault, match="a person confirms"):
         arm.recover()
-    os.kill(arm._session.link.pid, signal.SIGCONT)
+    assert soon(lambda: not bench.ask("show")["moving"])
     bench.ask("clear")
     dashboard(bench, "play")
     assert stands_still(bench)
+    os.kill(arm._session.link.pid, signal.SIGCONT)
     arm.recover()
 
 
@@ -303,6 +304,7 @@ def test_a_motion_that_a_protective_stop_ended_does_not_go_on_when_it_is_unlocke
     bench.ask("protective_stop")
     with pytest.raises(DeviceFault, match="protective stop"):
         moving.wait(5.0)
+    assert soon(lambda: not bench.ask("show")["moving"])
     bench.ask("clear")
     dashboard(bench, "play")
     assert stands_still(bench)

@@ -18,7 +18,8 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
 
-pytestmark = pytest.mark.wire
+# Long runs over the wires of what the virtual clock shows in seconds.
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 
 def dry_run(folder: Path, *faults: str, job: str = "pot") -> dict[str, Any]:

@@ -54,6 +54,7 @@ def joints(made: Cell) -> list[float]:
     return [value for row in pose for value in row]
 
 
+@pytest.mark.campaign
 def test_stop_from_another_thread_while_it_reconstructs_ends_the_run_and_nothing_is_placed(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,6 +72,7 @@ def test_stop_from_another_thread_while_it_reconstructs_ends_the_run_and_nothing
         assert joints(made) == pytest.approx(before, abs=1e-6)
 
 
+@pytest.mark.campaign
 def test_a_protective_stop_waits_for_a_person_a_pause_holds_and_the_part_is_placed(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,6 +101,7 @@ def test_a_protective_stop_waits_for_a_person_a_pause_holds_and_the_part_is_plac
         assert (fault.code, fault.remedy) == ("arm.protective_stop", "confirmed by Ann, recovered")
 
 
+@pytest.mark.campaign
 def test_an_abort_while_a_person_is_waited_for_ends_the_run_and_the_arm_stays_locked(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +113,7 @@ def test_an_abort_while_a_person_is_waited_for_ends_the_run_and_the_arm_stays_lo
         assert ask_truth(made.config.cell.truth)["arm"]["safety"] == "protective_stop"
 
 
+@pytest.mark.campaign
 def test_closing_the_cell_ends_the_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with opened(place, monkeypatch) as made:
         run = made.start("pot")
@@ -183,6 +187,7 @@ def _children(pid: int) -> list[str]:
     return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
 
 
+@pytest.mark.campaign
 def test_progress_is_told_as_typed_events(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with opened(place, monkeypatch) as made:
         run = made.start("pot")

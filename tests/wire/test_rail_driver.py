@@ -397,8 +397,8 @@ def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench
     rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
     rail.home().wait(20.0)
     rail.close()
-    bench.model.rotate(bench.world.now(), 5 * 51_200)
-    bench.clock.sleep(4.0)
+    bench.model.rotate(bench.world.now(), 10 * 51_200)
+    bench.clock.sleep(7.0)
     again = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
     state = again.state()
     assert state.right_switch

@@ -11,7 +11,7 @@ import pytest
 
 from tests.wire.cells import cell
 
-pytestmark = pytest.mark.wire
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 
 def test_verify_tells_a_disturbed_calibration_from_a_good_one(place: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cell.steps.camera_poses import View, scan_calibration_views, target_calibra
 from cell.steps.moves import HOME, Mover
 from cell.vision import BoardSpec, BoardView, extract, find_board, parse_board
 from drivers.errors import DeviceFault, RefusedError
-from drivers.interfaces import Camera
+from drivers.interfaces import Camera, Frame
 
 PHOTO_RATE = 10.0
 LEAST_SHARE = 0.75
@@ -27,17 +27,20 @@ RAIL_MOVE_VIEWS, RAIL_MOVE = (6, 10, 14), 0.015
 
 Progress = Callable[[float, str], None]
 Check = Callable[[], None]
+Keep = Callable[[str, Frame], None]
+"""Takes what a picture shows, and the picture: what a refusal was about can then be looked at."""
 Made = TypeVar("Made")
 
 
 def collect_scan(
-    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress, keep: Keep
 ) -> list[ScanObservation]:
     """Dots and stripe on the fine board, at several depths, tilts and rail positions.
 
     At each view the laser is off for the photograph and on for the stripe; at some of them the rail moves either way
     for further photographs while the arm rests (`same_rest`), right after their view in the list. A view that does not
-    show the board is aimed anew by what the others showed. Raises `RefusedError` when too few views show it even then.
+    show the board is aimed anew by what the others showed. Every picture goes to `keep`. Raises `RefusedError` when too
+    few views show it even then.
     """
     board = parse_board(config.calibration.fine.board)
     views = scan_calibration_views(config, board)
@@ -58,48 +61,56 @@ def collect_scan(
         move_to_view(devices, mover, view, k)
         travel.wait(30.0)
         camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
-        seen = look_for(camera, lambda image: find_board(image, board), refusals)
+        what = f"fine-{k + 1:02d}"
+        seen = look_for(camera, board, refusals, keep, what)
         for other in aim.instead_of(view) if seen is None else ():
             check()
             progress(k / len(views), f"fine board, view {k + 1} of {len(views)}, aimed anew")
             if _can_move(devices, mover, other, k):
-                seen = look_for(camera, lambda image: find_board(image, board), refusals)
+                seen = look_for(camera, board, refusals, keep, f"{what}-again")
             if seen is not None:
                 break
         if seen is None:
             continue
         aim.learn(seen, from_ur(devices.arm.state().flange), rail.state().position)
         camera.configure(config.calibration.stripe_exposure, PHOTO_RATE)
-        with devices.laser.lit():
-            stripe = extract(camera.grab().image)
+        with devices.interlocks.purpose("calibration"), devices.laser.lit():
+            lit = camera.grab()
+        keep(f"{what}-stripe", lit)
+        stripe = extract(lit.image)
         base_from_flange = from_ur(devices.arm.state().flange)
         made.append(ScanObservation(seen, stripe, base_from_flange, rail.state().position, f"fine {k + 1}"))
         if k in RAIL_MOVE_VIEWS:
             camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
-            moved.extend(_rail_moves(config, devices, board, made[-1]))
+            moved.extend(_rail_moves(config, devices, board, made[-1], keep))
     _enough(made, views, refusals)
     return [o for view in made for o in (view, *(m for m in moved if m.name.startswith(view.name + " ")))]
 
 
-def _rail_moves(config: CellConfig, devices: Devices, board: BoardSpec, here: ScanObservation) -> list[ScanObservation]:
+def _rail_moves(
+    config: CellConfig, devices: Devices, board: BoardSpec, here: ScanObservation, keep: Keep
+) -> list[ScanObservation]:
     """Photographs of the fine board with the rail moved either way and the arm where it is; those that show it."""
     made = []
     low, high = config.rail.travel
     for way in (-RAIL_MOVE, RAIL_MOVE):
         position = min(max(here.rail_position + way, low), high)
         devices.rail.move_to(position).wait(30.0)
-        seen = look_for(devices.scan_camera, lambda image: find_board(image, board), Counter())
+        name = f"{here.name} {'+' if way > 0 else '-'}"
+        seen = look_for(devices.scan_camera, board, Counter(), keep, name.replace(" ", "-"))
         if seen is not None:
-            name = f"{here.name} {'+' if way > 0 else '-'}"
             rail = devices.rail.state().position
             made.append(ScanObservation(seen, None, here.base_from_flange, rail, name, same_rest=True))
     return made
 
 
 def collect_target(
-    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress
+    config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress, keep: Keep
 ) -> list[TargetObservation]:
-    """Dots of the large board, at several distances and tilts. Raises `RefusedError` when too few views show it."""
+    """Dots of the large board, at several distances and tilts; every picture goes to `keep`.
+
+    Raises `RefusedError` when too few views show it.
+    """
     board = parse_board(config.calibration.large.board)
     views = target_calibration_views(config, board)
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
@@ -109,7 +120,7 @@ def collect_target(
         check()
         progress(k / len(views), f"large board, view {k + 1} of {len(views)}")
         move_to_view(devices, mover, view, k)
-        seen = look_for(devices.target_camera, lambda image: find_board(image, board), refusals)
+        seen = look_for(devices.target_camera, board, refusals, keep, f"large-{k + 1:02d}")
         if seen is not None:
             made.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
     return _enough(made, views, refusals)
@@ -122,7 +133,6 @@ def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
     except DeviceFault as fault:
         if fault.device != devices.arm.name or not fault.recoverable:
             raise
-        devices.gate.require()
         devices.arm.recover()
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
 
@@ -136,13 +146,17 @@ def _can_move(devices: Devices, mover: Mover, view: View, k: int) -> bool:
     return True
 
 
-def look_for(camera: Camera, find: Callable[..., BoardView], refusals: Counter[str]) -> BoardView | None:
-    """The board in a new picture; None when it is refused, with the reason counted."""
+def look_for(camera: Camera, board: BoardSpec, refusals: Counter[str], keep: Keep, what: str) -> BoardView | None:
+    """The board in a new picture of `what`; None when it is refused, with the reason counted."""
+    frame = camera.grab()
     try:
-        return find(camera.grab().image)
+        seen = find_board(frame.image, board)
     except RefusedError as error:
         refusals[str(error)] += 1
+        keep(f"{what}-refused", frame)
         return None
+    keep(what, frame)
+    return seen
 
 
 def _enough(made: list[Made], views: list[View], refusals: Counter[str]) -> list[Made]:

@@ -7,13 +7,14 @@ board from both ends of the way that the rail can go with the board in view.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
 
 from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.collect.boards import PHOTO_RATE, Check, Progress, move_to_view
+from cell.calibration.collect.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
 from cell.calibration.store import CellCalibration
 from cell.calibration.verify.looks import CheckObservations
 from cell.config import CellConfig
@@ -25,9 +26,9 @@ from cell.steps.camera_poses import ScanPlan, View, rail_ends, verification_view
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
-from cell.vision import BoardSpec, BoardView, StripeProfile, find_board, parse_board
+from cell.vision import BoardSpec, BoardView, StripeProfile, parse_board
 from drivers.errors import RefusedError
-from drivers.interfaces import Camera
+from drivers.interfaces import Camera, Frame
 
 SCAN_APPROACHES, TARGET_APPROACHES = 2, 6
 BACK_M = 0.02
@@ -38,9 +39,18 @@ MAX_SHIFT = 0.15e-3
 
 
 def collect_verification(
-    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check, progress: Progress
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    check: Check,
+    progress: Progress,
+    keep: Keep,
 ) -> CheckObservations:
-    """Take all pictures. Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference."""
+    """Take all pictures; each goes to `keep`.
+
+    Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference.
+    """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
     assert calibration.scan.reference is not None
@@ -66,10 +76,11 @@ def collect_verification(
                 scan_view,
                 ends,
                 lambda f, t: progress(0.3 + 0.2 * f, t),
+                lambda frame: keep("stripe", frame),
             )
         else:
             move_to_view(devices, mover, scan_view, k)
-        photographs.append(_photographs(config, devices, fine, ends))
+        photographs.append(_photographs(config, devices, fine, ends, keep, f"fine-{k + 1}"))
     target: list[TargetObservation] = []
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
     for k in range(TARGET_APPROACHES):
@@ -78,19 +89,19 @@ def collect_verification(
         if k:
             move_to_view(devices, mover, _beside(target_view, k), k)
         move_to_view(devices, mover, target_view, k)
-        seen = _found(devices.target_camera, large, "large")
+        seen = _found(devices.target_camera, large, "large", keep, f"large-{k + 1}")
         target.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
     return CheckObservations(photographs, sweep, target)
 
 
 def _photographs(
-    config: CellConfig, devices: Devices, board: BoardSpec, ends: tuple[float, float]
+    config: CellConfig, devices: Devices, board: BoardSpec, ends: tuple[float, float], keep: Keep, what: str
 ) -> list[ScanObservation]:
     devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
     made = []
-    for end in ends:
+    for end, side in zip(ends, "ab", strict=True):
         devices.rail.move_to(end).wait(30.0)
-        seen = _found(devices.scan_camera, board, "fine")
+        seen = _found(devices.scan_camera, board, "fine", keep, what + side)
         flange = from_ur(devices.arm.state().flange)
         made.append(ScanObservation(seen, None, flange, devices.rail.state().position))
     return made
@@ -104,6 +115,7 @@ def _sweep(
     view: View,
     ends: tuple[float, float],
     progress: Callable[[float, str], None],
+    keep_frame: Callable[[Frame], None],
 ) -> list[ScanObservation]:
     """To the view and over the board's plate from end to end."""
     section = ScanSection.model_validate(
@@ -118,7 +130,7 @@ def _sweep(
     profiles: list[StripeProfile] = []
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
     errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)
-    collector = Collector(geometry, section, lambda _: None, progress, profiles.append)
+    collector = Collector(geometry, section, keep_frame, progress, profiles.append)
     rehearse(geometry)
     swath = rail_sweep(plan, mover, devices, errors, collector)
     return [
@@ -127,14 +139,15 @@ def _sweep(
     ]
 
 
-def _found(camera: Camera, board: BoardSpec, name: str) -> BoardView:
-    try:
-        return find_board(camera.grab().image, board)
-    except RefusedError as error:
+def _found(camera: Camera, board: BoardSpec, name: str, keep: Keep, what: str) -> BoardView:
+    refusals = Counter[str]()
+    seen = look_for(camera, board, refusals, keep, what)
+    if seen is None:
         raise RefusedError(
-            f"the {name} board on the deck is not seen where the calibration has it: {error}; clean it, see that it "
-            "and the camera are in place, then run `cell calibrate`"
-        ) from error
+            f"the {name} board on the deck is not seen where the calibration has it: {next(iter(refusals))}; clean it, "
+            "see that it and the camera are in place, then run `cell calibrate`"
+        )
+    return seen
 
 
 def _beside(view: View, turn: int) -> View:

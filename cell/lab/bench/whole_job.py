@@ -149,10 +149,9 @@ class _WholeJob:
         mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, hands.safe_point)
         self.cell.devices.vehicle.brake()
         devices, tell = self.cell.devices, self.tell
-        scan = collect_scan(self.config, devices, mover, hands.check, lambda f, t: tell(0.36 * f, f"calibrate: {t}"))
-        target = collect_target(
-            self.config, devices, mover, hands.check, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}")
-        )
+        given, keep = (self.config, devices, mover, hands.check), NoFrames().keep
+        scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
+        target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
         self.record.observations = (scan, target)
         tell(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)

@@ -22,13 +22,17 @@ def test_everything_moves_and_shines_and_nothing_does_after_the_stop(tmp_path: P
         devices = connect(config)
         try:
             devices.gate.enter(CancelToken())
+            arm, vehicle = (
+                devices.arm.bare,
+                devices.vehicle.bare,
+            )  # the interlocks would not let all of it begin at once
             devices.rail.home().wait(60.0)
             devices.rail.move_to(0.09, 0.01)
-            devices.arm.set_digital_output(config.laser.output, True)
-            away = devices.arm.state().joints + np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
-            devices.arm.move_joints(away, 0.3, 1.0)
-            devices.vehicle.enable()
-            devices.vehicle.drive(-0.2, 0.0)
+            arm.set_digital_output(config.laser.output, True)
+            away = arm.state().joints + np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
+            arm.move_joints(away, 0.3, 1.0)
+            vehicle.enable()
+            vehicle.drive(-0.2, 0.0)
             devices.clock.sleep(0.4)
             truth = ask(endpoints, op="truth")["truth"]
             assert truth["laser_on"]

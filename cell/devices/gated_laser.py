@@ -1,0 +1,70 @@
+"""The laser behind the gate, with a watchdog: it goes off by itself when whoever lit it falls asleep."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from cell.devices.gate import Gate, Gated
+from cell.devices.interlocks import Command
+from drivers.clock import Clock
+from drivers.errors import CellError, InterlockError
+from drivers.interfaces import Laser
+
+UNATTENDED_S = 20.0
+"""Seconds on the wall for which the laser stays on when nobody renews it: eyes do not run faster with a simulation."""
+
+log = logging.getLogger(__name__)
+
+
+class GatedLaser(Gated[Laser]):
+    """The laser, lit through a gate and for as long as its owner renews it."""
+
+    def __init__(self, bare: Laser, gate: Gate, clock: Clock) -> None:
+        super().__init__(bare, gate)
+        self._clock = clock
+        self._renewed = 0.0
+        self._slept = False
+
+    @contextmanager
+    def lit(self) -> Iterator[None]:
+        """See `Laser.lit`. Goes off, and raises `InterlockError` at the end, when it is not renewed every 20 s."""
+        self.gate.require(Command("laser", "lit"))
+        with self.bare.lit():
+            self.gate.require()
+            self._renewed, self._slept = self._clock.now(), False
+            with self._clock.alarm(self._limit, self._look):
+                yield
+                self.renew()
+
+    def renew(self) -> None:
+        """Its owner is awake. `InterlockError` when it had fallen asleep and the laser went off meanwhile."""
+        if self._slept:
+            raise InterlockError(
+                self.name,
+                f"went off because nobody renewed it for {UNATTENDED_S:.0f} s (interlock laser_attended). Light it "
+                "only while it is needed, and call renew() on it meanwhile",
+            )
+        self._renewed = self._clock.now()
+
+    @property
+    def is_on(self) -> bool:
+        """See `Laser.is_on`."""
+        return self.bare.is_on
+
+    @property
+    def _limit(self) -> float:
+        return UNATTENDED_S * self._clock.rate
+
+    def _look(self) -> float | None:
+        """Called by the alarm: off when the owner sleeps, else in how many seconds to look again."""
+        left = self._renewed + self._limit - self._clock.now()
+        if left > 0:
+            return left
+        self._slept = True
+        try:
+            self.bare.stop()
+        except CellError as error:
+            log.error("the laser's owner sleeps, and it could not be switched off: %s", error)
+        return None

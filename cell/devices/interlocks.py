@@ -1,0 +1,136 @@
+"""What has to hold before a command is passed on: checked in the gate, for real and simulated devices alike.
+
+The rules themselves are a table in `cell.devices.rules`. A person lifts named ones with `Cell.maintenance`; nothing
+else does.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import pinocchio as pin
+
+from drivers.errors import ConfigError, InterlockError
+from drivers.interfaces import Arm, ArmMotion, Claw, Laser, Vector, Vehicle
+
+PURPOSES = ("sweep", "calibration", "test")
+"""What the laser may be lit for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """A command to a device before it is passed on: `arm.move_joints` with its arguments by name."""
+
+    device: str
+    name: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.device}.{self.name}"
+
+
+@dataclass(eq=False)
+class Situation:
+    """What the rules look at: the bare devices, None where one is not connected, and what the cell knows of itself.
+
+    `outputs` says by number which of the arm's outputs belong to another device. `clear(joints, command)` gives the
+    pairs of bodies that the arm would bring together on the way that a command asks for, from where it stands (6,) in
+    rad. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by name.
+    `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is the
+    newest motion of the arm, `purposes` what this thread lights the laser for.
+    """
+
+    arm: Arm | None
+    vehicle: Vehicle | None
+    laser: Laser | None
+    claw: Claw | None
+    outputs: Mapping[int, str]
+    clear: Callable[[Vector, Command], Sequence[tuple[str, str]]]
+    forward: Callable[[Vector], pin.SE3]
+    postures: Mapping[str, Vector]
+    configuration: str
+    looks: dict[str, pin.SE3] = field(default_factory=dict)
+    calibrated: str | None = None
+    last: ArmMotion | None = None
+    purposes: threading.local = field(default_factory=threading.local)
+
+    @property
+    def purpose(self) -> str | None:
+        """What this thread lights the laser for, if it said so."""
+        return getattr(self.purposes, "name", None)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule: `check` gives None when the command may pass, else what stands against it, the value and the next step.
+
+    `commands` are those that it is asked for. A rule without `check` is kept by the gate or by a device behind it; one
+    that is not `liftable` holds in maintenance, too.
+    """
+
+    name: str
+    commands: tuple[str, ...]
+    condition: str
+    check: Callable[[Situation, Command], str | None] | None
+    liftable: bool = True
+
+
+class Interlocks:
+    """The rules over one cell's situation. Commands are checked by any thread."""
+
+    def __init__(self, situation: Situation, rules: Sequence[Rule]) -> None:
+        self.situation = situation
+        self._rules = tuple(rules)
+        self._lifted: list[frozenset[str]] = []
+
+    def require(self, command: Command) -> None:
+        """Raise `InterlockError`, which names the rule, when one stands against the command; nothing was sent then."""
+        lifted = self.names_lifted
+        for rule in self._rules:
+            if rule.check is None or str(command) not in rule.commands or rule.name in lifted:
+                continue
+            if (against := rule.check(self.situation, command)) is not None:
+                raise InterlockError(command.device, f"{against} (interlock {rule.name}; {command} was not sent)")
+
+    @property
+    def names_lifted(self) -> frozenset[str]:
+        """The rules that do not hold now."""
+        return frozenset[str]().union(*self._lifted)
+
+    @contextmanager
+    def lifted(self, names: Sequence[str]) -> Iterator[None]:
+        """Inside this context these rules do not hold, for any thread; `ConfigError` for one that cannot be lifted."""
+        liftable = [rule.name for rule in self._rules if rule.check is not None and rule.liftable]
+        if unknown := [name for name in names if name not in liftable]:
+            raise ConfigError(f"{', '.join(unknown)}: no interlock that can be lifted; those are {', '.join(liftable)}")
+        entry = frozenset(names)
+        self._lifted.append(entry)
+        try:
+            yield
+        finally:
+            self._lifted.remove(entry)
+
+    @contextmanager
+    def purpose(self, name: str) -> Iterator[None]:
+        """Inside this context this thread may light the laser, for one of `PURPOSES`; `ConfigError` for another."""
+        if name not in PURPOSES:
+            raise ConfigError(f'"{name}" is nothing that the laser is lit for: {", ".join(PURPOSES)}')
+        purposes = self.situation.purposes
+        outer = getattr(purposes, "name", None)
+        purposes.name = name
+        try:
+            yield
+        finally:
+            purposes.name = outer
+
+    def may_drive_with(self, name: str, base_from_flange: pin.SE3) -> None:
+        """The vehicle may also drive with the flange there: a looking pose that a job names."""
+        self.situation.looks[name] = base_from_flange
+
+    def work_with(self, configuration: str) -> None:
+        """From now on work is done with a calibration that was made under the configuration of this hash."""
+        self.situation.calibrated = configuration

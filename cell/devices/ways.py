@@ -1,0 +1,86 @@
+"""Which bodies the arm would bring together on the way that a command asks for, whoever asks, planned or not.
+
+Known here are the arm, its tool, the vehicle and the boards on its deck. The part in the claw and the station are known
+to the planner of a job alone, which checks its own ways among them.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config import CellConfig
+from cell.devices.interlocks import Command
+from cell.geometry.poses import from_ur
+from cell.motion.bodies import arm_bodies, tool_bodies, vehicle_bodies
+from cell.motion.collision import CollisionModel, Pair
+from cell.motion.kinematics import ArmKinematics, Joints
+from cell.steps.moves import deck_plates
+from drivers.interfaces import Vector
+
+MARGIN_M = 0.002
+"""Less than the planner keeps, so that what it finds free is not refused for a rounding."""
+STEP_RAD = 0.03
+LINE_STEP_M, LINE_STEP_RAD = 0.01, 0.03
+
+
+class Ways:
+    """The arm's ways through its own cell."""
+
+    def __init__(self, config: CellConfig) -> None:
+        self._config = config
+        self._one_at_a_time = threading.Lock()
+        self.kinematics = ArmKinematics()
+
+    @cached_property
+    def _bodies(self) -> CollisionModel:
+        bodies = [*arm_bodies(), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
+        return CollisionModel(self.kinematics, bodies, MARGIN_M)
+
+    def clear(self, start: Vector, command: Command) -> list[Pair]:
+        """The pairs that come closer than 2 mm on the way from `start`, (6,) rad; what touches there already may.
+
+        Raises `Unreachable` when the arm cannot follow a straight line.
+        """
+        with self._one_at_a_time:
+            allowed = [] if self._bodies.free(start) else self._bodies.touching(start)
+            for joints in self._way(start, command):
+                if not self._bodies.free(joints, allowed):
+                    return self._bodies.touching(joints, allowed)
+            return []
+
+    def _way(self, start: Joints, command: Command) -> Iterator[Joints]:
+        arguments = command.arguments
+        match command.name:
+            case "move_joints":
+                yield from _between(start, np.asarray(arguments["joints"]))
+            case "move_linear":
+                yield from self._line(start, from_ur(arguments["flange"]))
+            case _:
+                points = np.asarray(arguments["joints"])
+                last = points[0]
+                for point in points[1:]:
+                    if np.abs(point - last).max() >= STEP_RAD:
+                        yield from _between(last, point)
+                        last = point
+                yield points[-1]
+
+    def _line(self, joints: Joints, goal: pin.SE3) -> Iterator[Joints]:
+        begin = self.kinematics.fk(joints)
+        apart = begin.inverse() * goal
+        length, turn = np.linalg.norm(apart.translation), np.linalg.norm(pin.log3(apart.rotation))
+        count = max(1, int(np.ceil(max(length / LINE_STEP_M, turn / LINE_STEP_RAD))))
+        for k in range(1, count + 1):
+            pose = pin.SE3(begin.rotation @ pin.exp3(pin.log3(apart.rotation) * (k / count)), np.zeros(3))
+            pose.translation = begin.translation + (goal.translation - begin.translation) * (k / count)
+            joints = self.kinematics.track(pose, joints)
+            yield joints
+
+
+def _between(start: Joints, end: Joints) -> Iterator[Joints]:
+    count = max(1, int(np.ceil(np.abs(end - start).max() / STEP_RAD)))
+    return (start + (end - start) * (k / count) for k in range(1, count + 1))

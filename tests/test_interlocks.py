@@ -1,0 +1,252 @@
+"""Each interlock refuses what it is for, over the simulated world: with its name, what was found, what to do next."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.config import load_config
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
+from cell.devices.gated_laser import UNATTENDED_S
+from cell.devices.rules import RULES, markdown
+from cell.geometry.poses import from_parts, from_ur, to_ur
+from cell.run.folder import CellLock
+from cell.steps.moves import HOME
+from cell.supervisor import Cell
+from drivers.clock import Clock
+from drivers.errors import ConfigError, InterlockError
+
+CONFIG = load_config(None)
+LASER = CONFIG.laser.output
+DOCUMENT = Path(__file__).parent.parent / "docs" / "interlocks.md"
+
+
+@pytest.fixture
+def world() -> VirtualCell:
+    """A simulated cell: the vehicle braked, the arm folded, the rail homed, a part in the claw."""
+    made = VirtualCell(CONFIG, seed=4, level="ideal")
+    made.vehicle.brake()
+    made.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
+    made.rail.home().wait(60.0)
+    return made
+
+
+@pytest.fixture
+def devices(world: VirtualCell) -> Devices:
+    return world.devices
+
+
+def refused(rule: str, begin: Callable[[], object], *words: str) -> None:
+    """`begin` is refused by that rule alone, in these words."""
+    with pytest.raises(InterlockError) as caught:
+        begin()
+    for word in (f"interlock {rule}", *words):
+        assert word in str(caught.value)
+
+
+def shifted(devices: Devices, *by: float) -> np.ndarray:
+    """The flange moved by so many m along the base's axes."""
+    return to_ur(from_parts(by) * from_ur(devices.arm.state().flange))
+
+
+def test_the_table_in_the_documents_is_current() -> None:
+    assert markdown() in DOCUMENT.read_text(encoding="utf-8")
+
+
+def test_every_rule_is_asked_for_commands_that_there_are(devices: Devices) -> None:
+    for rule in RULES:
+        for command in rule.commands:
+            device, name = command.split(".")
+            assert hasattr(getattr(devices, device), name), command
+
+
+@pytest.mark.parametrize("moving", [True, False], ids=["driving", "brake open"])
+def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(
+    world: VirtualCell, devices: Devices, moving: bool
+) -> None:
+    devices.vehicle.enable()
+    if moving:
+        for _ in range(10):
+            devices.vehicle.drive(0.1, 0.0)
+            world.clock.sleep(0.04)
+    stood = devices.arm.state().joints
+    away = HOME + 0.1
+    words = ("vehicle drives at", "vehicle.brake()") if moving else ("brake is open", "vehicle.brake()")
+    refused("vehicle_parked", lambda: devices.arm.move_joints(away, 0.5, 1.0), *words)
+    refused("vehicle_parked", lambda: devices.arm.move_linear(shifted(devices, 0.0, 0.0, 0.01), 0.05, 0.5))
+    refused("vehicle_parked", lambda: devices.arm.follow(np.array([0.0, 1.0]), np.array([stood, away])))
+    with devices.interlocks.purpose("test"):
+        refused("vehicle_parked", devices.laser.lit().__enter__)
+    assert np.array_equal(devices.arm.state().joints, stood)
+    devices.vehicle.brake()
+    devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
+
+
+def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices) -> None:
+    devices.vehicle.enable()
+    devices.vehicle.drive(0.1, 0.0)
+    devices.vehicle.brake()
+    out = HOME + np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    motion = devices.arm.move_joints(out, 0.5, 1.0)
+    world.clock.sleep(0.1)
+    devices.vehicle.bare.enable()
+    refused("arm_stowed", lambda: devices.vehicle.drive(0.1, 0.0), "the arm moves")
+    motion.wait(30.0)
+    refused("arm_stowed", lambda: devices.vehicle.drive(0.0, 0.1), "28.6 deg from HOME", "cell home arm")
+    devices.vehicle.drive(0.0, 0.0)
+    devices.interlocks.may_drive_with("the looking pose of job pot", from_ur(devices.arm.state().flange))
+    devices.vehicle.drive(0.1, 0.0)
+    devices.vehicle.brake()
+
+
+def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devices: Devices) -> None:
+    refused("laser_purpose", devices.laser.lit().__enter__, "sweep, calibration, test")
+    assert not devices.laser.is_on
+    with pytest.raises(ConfigError, match="sweep, calibration, test"), devices.interlocks.purpose("show"):
+        pass
+    with devices.interlocks.purpose("test"), devices.laser.lit():
+        assert devices.laser.is_on
+        devices.vehicle.enable()
+        refused("laser_off_to_drive", lambda: devices.vehicle.drive(0.1, 0.0), "the laser is on")
+    assert not devices.laser.is_on
+
+
+def test_the_laser_goes_off_by_itself_when_its_owner_sleeps(world: VirtualCell, devices: Devices) -> None:
+    with devices.interlocks.purpose("test"):
+        with devices.laser.lit():
+            for _ in range(4):
+                world.clock.sleep(0.6 * UNATTENDED_S)
+                devices.laser.renew()
+            assert world.truth()["laser_on"]
+        with pytest.raises(InterlockError, match=r"nobody renewed it for 20 s .*laser_attended"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 0.2)
+            assert not world.truth()["laser_on"]
+        with devices.laser.lit():
+            assert world.truth()["laser_on"]
+
+
+def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_end() -> None:
+    clock, rung = Clock(rate=100.0), []
+
+    def ring() -> float | None:
+        rung.append(clock.now())
+        return 5.0 if len(rung) < 3 else None
+
+    with clock.alarm(10.0, ring):
+        clock.sleep(60.0)
+    assert len(rung) == 3
+    assert rung[0] >= 10.0
+    with clock.alarm(20.0, ring):
+        pass
+    clock.sleep(40.0)
+    assert len(rung) == 3
+
+
+def test_the_claw_opens_at_contact_or_when_it_is_empty(world: VirtualCell, devices: Devices) -> None:
+    refused("claw_at_contact", devices.claw.release, "the part would fall", "maintenance")
+    assert devices.claw.holding
+    devices.arm.move_joints(HOME + 0.02, 0.5, 1.0).wait(30.0)
+    refused("claw_at_contact", devices.claw.release)
+    devices.claw.bare.release()
+    devices.claw.release()
+
+
+def test_what_rests_on_a_calibration_is_refused_without_one_that_fits(devices: Devices) -> None:
+    devices.rail.move_to(devices.rail.sweep_start(0.02, 0.03, 0.015)).wait(30.0)
+    here = devices.arm.state().joints
+
+    def guarded() -> object:
+        return devices.arm.follow(np.array([0.0, 1.0]), np.array([here, here]), force_limit=20.0)
+
+    def sweep() -> object:
+        return devices.rail.sweep(0.02, 0.03, 0.015)
+
+    refused("calibration_fits", sweep, "no calibration is in use", "cell calibrate")
+    refused("calibration_fits", guarded)
+    devices.interlocks.work_with("0123456789abcdef")
+    refused("calibration_fits", sweep, "0123456789abcdef", CONFIG.calibration_hash())
+    devices.interlocks.work_with(CONFIG.calibration_hash())
+    devices.rail.sweep(0.02, 0.03, 0.015).wait(30.0)
+    devices.arm.follow(np.array([0.0, 1.0]), np.array([here, here])).wait(30.0)
+
+
+def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, devices: Devices) -> None:
+    stood = devices.arm.state()
+    onto_the_deck = shifted(devices, -0.6, 0.2, -0.6)
+    into_itself = HOME + np.array([0.0, 0.0, 1.55, 0.0, 0.0, 0.0])
+    refused("way_clear", lambda: devices.arm.move_joints(into_itself, 0.5, 1.0), "would collide on the way", "plan it")
+    refused("way_clear", lambda: devices.arm.follow(np.array([0.0, 9.0]), np.array([stood.joints, into_itself])))
+    refused("way_clear", lambda: devices.arm.move_linear(onto_the_deck, 0.05, 0.5), "claw and deck")
+    assert np.array_equal(devices.arm.state().joints, stood.joints)
+    assert world.world.collisions.found == ()
+
+
+def test_an_output_that_another_device_owns_is_switched_by_that_device(devices: Devices) -> None:
+    refused("own_switch", lambda: devices.arm.set_digital_output(LASER, True), "output 0 is the laser's")
+    refused("own_switch", lambda: devices.arm.set_digital_output(CONFIG.claw.output, False), "the claw's")
+    devices.arm.set_digital_output(LASER, False)
+    devices.arm.set_digital_output(7, True)
+    assert devices.claw.holding
+
+
+# --- a person's word ---
+
+
+@pytest.fixture
+def cell(world: VirtualCell, tmp_path: Path) -> Iterator[Cell]:
+    made = Cell(CONFIG, tmp_path, CellLock(CONFIG), world.devices, None)
+    yield made
+    made.close()
+
+
+def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell) -> None:
+    rail, arm = cell.devices.rail, cell.devices.arm
+    rail.move_to(0.01).wait(30.0)
+    cell.stop()
+    for begin in (
+        lambda: rail.move_to(0.02), rail.home, lambda: arm.move_joints(HOME + 0.01, 0.5, 1.0), arm.recover,
+        cell.devices.vehicle.enable, cell.devices.claw.grip,
+    ):  # fmt: skip
+        refused("after_a_stop", begin, "clear_stop(by)")
+    with pytest.raises(ConfigError, match="name of the person"):
+        cell.clear_stop(" ")
+    cell.clear_stop("Anna")
+    rail.move_to(0.02).wait(30.0)
+    assert rail.state().position == pytest.approx(0.02, abs=1e-6)
+
+
+def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(
+    cell: Cell, caplog: pytest.LogCaptureFixture
+) -> None:
+    devices, away = cell.devices, HOME + 0.05
+    devices.vehicle.enable()
+    with caplog.at_level(logging.WARNING), cell.maintenance("the brake is being changed", lift=["vehicle_parked"]):
+        devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
+        refused("claw_at_contact", devices.claw.release)
+    assert "maintenance (the brake is being changed): lifted vehicle_parked" in caplog.text
+    refused("vehicle_parked", lambda: devices.arm.move_joints(HOME, 0.5, 1.0))
+    (report,) = (json.loads(path.read_text()) for path in cell.runs_folder.glob("*/report.json"))
+    assert (report["kind"], report["outcome"]) == ("maintenance", "done")
+    assert (report["maintenance"], report["lifted"]) == ("the brake is being changed", ["vehicle_parked"])
+
+
+def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell) -> None:
+    with cell.maintenance("trial", lift=["own_switch"]):
+        cell.home("rail")
+    reports = [json.loads(path.read_text()) for path in cell.runs_folder.glob("*/report.json")]
+    assert {report["kind"]: report.get("interlocks_lifted") for report in reports}["homing"] == ["own_switch"]
+
+
+@pytest.mark.parametrize("names", [["no_such_rule"], ["after_a_stop"], ["laser_attended"], []])
+def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell: Cell, names: list[str]) -> None:
+    with pytest.raises(ConfigError), cell.maintenance("why not", lift=names):
+        pass
+    with pytest.raises(ConfigError, match="needs a reason"), cell.maintenance(" ", lift=["own_switch"]):
+        pass
+    assert not list(cell.runs_folder.glob("*/report.json"))

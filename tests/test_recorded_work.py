@@ -1,0 +1,90 @@
+"""Work outside a job leaves what it looked at: a refused calibration or verification can be judged by its pictures."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cell.calibration.collect.boards import collect_scan, look_for
+from cell.config import load_config
+from cell.devices.devices import Devices
+from cell.devices.direct import VirtualCell
+from cell.job import load_job
+from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.run import Run
+from cell.steps.moves import HOME, Mover
+from cell.vision import parse_board
+from drivers.camera.folder import read_image
+from drivers.errors import RefusedError
+
+CONFIG = load_config(None)
+FINE = parse_board(CONFIG.calibration.fine.board)
+
+
+def well(devices: Devices) -> None:
+    """Nothing of this bench's health ends the work."""
+
+
+def recorded(root: Path, cell: VirtualCell, work: Any) -> tuple[dict[str, Any], Path]:
+    """The report of a calibration that is refused, and its folder."""
+    run: Run[None] = Run(
+        "calibration", lambda run: RecordedWork(run, "calibration", cell.devices, root, {}, well).perform(work)
+    )
+    with pytest.raises(RefusedError):
+        run.result(300.0)
+    assert run.folder is not None
+    return json.loads((run.folder / "report.json").read_text()), run.folder
+
+
+def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(tmp_path: Path) -> None:
+    """Its lamp is out: the fine board is seen at no view."""
+    dark = CONFIG.model_copy(update={"scan_camera": CONFIG.scan_camera.model_copy(update={"photo_exposure": 20e-6})})
+    cell = VirtualCell(dark, seed=4, level="ideal")
+
+    def work(hands: Hands) -> None:
+        cell.devices.vehicle.brake()
+        mover = Mover(cell.devices.arm, cell.clock, dark, load_job("pot")[0])
+        collect_scan(dark, cell.devices, mover, hands.check, hands.progress, hands.keep)
+
+    report, folder = recorded(tmp_path, cell, work)
+    assert report["outcome"] == "refused"
+    assert "of 20 calibration views show the board" in report["reason"]
+    kept = sorted((folder / "frames").glob("fine-*-refused-*.png"))
+    assert {path.name.split("-")[1] for path in kept} == {f"{k:02d}" for k in range(1, 21)}
+    assert len(report["last_frames"]) == 12
+    assert all((folder / name).exists() for name in report["last_frames"])
+
+
+def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    pictures: list[np.ndarray] = []
+
+    def work(hands: Hands) -> None:
+        def keep(what: str, frame: Any) -> None:
+            pictures.append(frame.image)
+            hands.keep(what, frame)
+
+        cell.devices.vehicle.brake()
+        Mover(cell.devices.arm, cell.clock, CONFIG, None).to_joints(HOME)
+        cell.devices.scan_camera.configure(CONFIG.scan_camera.photo_exposure, 10.0)
+        assert look_for(cell.devices.scan_camera, FINE, Counter(), keep, "fine-01") is None
+        raise RefusedError("no board")
+
+    report, folder = recorded(tmp_path, cell, work)
+    (name,) = report["last_frames"]
+    assert name.startswith("frames/fine-01-refused-")
+    assert np.array_equal(read_image(folder / name, pictures[0].shape), pictures[0])
+
+
+def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> None:
+    def work(hands: Hands) -> None:
+        raise RefusedError("not today")
+
+    report, folder = recorded(tmp_path, VirtualCell(CONFIG, seed=4, level="ideal"), work)
+    assert not (folder / "frames").exists()
+    assert "last_frames" not in report
