@@ -265,7 +265,7 @@ def crippled(record: JobRecord, root: Path) -> Ended:
     cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
-        (folder / "frames").rmdir()
+        (folder / "frames").write_text("no folder", encoding="utf-8")
         frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
     witness = Witness(partial(ask_truth, "127.0.0.1:1"))
