@@ -76,6 +76,7 @@ def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root:
     assert record.calibration is not None
     folder = new_run(root)
     cell = VirtualCell(CONFIG, record.seed, record.level)
+    cell.devices.vehicle.brake()
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
         work = work_of(cell, job, nominal, record, frames, folder)
