@@ -173,6 +173,7 @@ def reported(
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
         "clock": "wall",
+        "cell_s": 12.34,
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),
