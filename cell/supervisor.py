@@ -35,7 +35,6 @@ from cell.check.fit import require_fit
 from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
 from cell.devices.assembly import connect, connected_for
 from cell.devices.devices import Devices
-from cell.devices.direct import VirtualCell
 from cell.devices.injection import Injection, Injector
 from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
@@ -144,6 +143,9 @@ class Cell:
         folder = beside(path)
         with EndSignals(), ExitStack() as opened:
             if clock == "virtual":
+                # The world takes long to load, and a cell over wires has it in another process, or none.
+                from cell.devices.direct import VirtualCell
+
                 virtual = VirtualCell(loaded, seed, level, surface)
                 cell = cls(loaded, folder, nullcontext(), virtual.devices, virtual)
             else:

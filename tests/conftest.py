@@ -10,7 +10,7 @@ from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 
 @pytest.fixture(scope="session")
 def placed_pot() -> JobRecord:
-    """The job `pot` on the cell in lock step, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
+    """The job `pot` on the virtual clock, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
     job, nominal = pot()
     record = run_whole_job(CONFIG, job, nominal, 2, "nominal")
     assert (record.outcome, record.reason) == ("placed", "")

@@ -1,4 +1,4 @@
-"""Runs for the tests of what is said at the end: the product's own steps on the cell in lock step, ended in many ways.
+"""Runs for the tests of what is said at the end: the product's own steps on the cell without wires, ended in many ways.
 
 What a step returns or raises is the product's; only the runner's record of it is put together here.
 """
@@ -172,6 +172,7 @@ def reported(
         "seed": 2 if simulated else None,
         "level": "nominal" if simulated else None,
         "clock": "wall",
+        "cell_s": 12.34,
         **job_source("pot"),
         "speed": config.cell.time_scale,
         "configuration_hash": config.calibration_hash(),

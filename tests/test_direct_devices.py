@@ -1,4 +1,4 @@
-"""The cell in lock step keeps the devices' promises, its time is the world's, and the whole job on it is as good as
+"""The cell without wires keeps the devices' promises, its time is the world's, and the whole job on it is as good as
 its declared noise allows."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Placing, on the simulated arm in lock step: what the force, the claw and a fault make of it."""
+"""Placing, on the simulated arm without wires: what the force, the claw and a fault make of it."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def _facts(report: Mapping[str, Any]) -> str:
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
     if report.get("simulated"):
         facts.append(f"simulated, seed {report.get('seed')}, level {report.get('level')}")
-    if (wall := wall_seconds(report)) is not None:
+    if report.get("cell_s") is None and (wall := wall_seconds(report)) is not None:
         facts.append(f"{duration(wall)} on the wall")
     if report.get("started"):
         facts.append(str(report["started"])[:16].replace("T", " "))

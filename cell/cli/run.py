@@ -166,7 +166,7 @@ def _perform(
             if json:
                 print_json(outcome.report)
             else:
-                print_report(outcome.report, str(outcome.folder), noise=noise)
+                print_report({**outcome.report, "wall_s": outcome.wall_s}, str(outcome.folder), noise=noise)
         code = outcome.exit_code
     except SignalInterrupt:
         if outcome is None:

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from cell.geometry.camera import Array, CameraModel
 
 STEP = 1e-4
+_STEPS = STEP * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (0.0, 0.0)])
+"""To either side along x and y, and none."""
 
 
 def seen_centres(centres: ArrayLike, normal: ArrayLike, radius: float) -> Array:
@@ -54,14 +56,12 @@ def lens_shift(camera: CameraModel, centres: ArrayLike, normal: ArrayLike, radiu
     to_plane[:, :, 2] = -xy / c[:, 2:]
     moments = 0.25 * radius**2 * to_plane @ (np.eye(3) - np.outer(n, n)) @ to_plane.transpose(0, 2, 1)
 
-    def jacobian(shift: tuple[float, float]) -> Array:
-        right, left, down, up = (
-            camera.distort(xy + shift + np.array(d)) for d in ((STEP, 0), (-STEP, 0), (0, STEP), (0, -STEP))
-        )
-        return np.stack([right - left, down - up], axis=2) / (2 * STEP)
-
-    along, across = ((jacobian(d) - jacobian((-d[0], -d[1]))) / (2 * STEP) for d in ((STEP, 0.0), (0.0, STEP)))
-    middle = jacobian((0.0, 0.0))
+    # All in one call: it takes as long for few points as for many.
+    about = xy + _STEPS[:, None, None] + _STEPS[:4, None]
+    right, left, down, up = camera.distort(about.reshape(-1, 2)).reshape(about.shape).swapaxes(0, 1)
+    jacobians = np.stack([right - left, down - up], axis=3) / (2 * STEP)
+    along, across = ((jacobians[k] - jacobians[k + 1]) / (2 * STEP) for k in (0, 2))
+    middle = jacobians[4]
     second = np.stack([along, across], axis=3)
     inverse = np.linalg.inv(middle)
     slope = np.column_stack([np.trace(inverse @ d, axis1=1, axis2=2) for d in (along, across)])

@@ -212,8 +212,8 @@ def run_row(folder: Path) -> dict[str, Any]:
 
 
 def when(seconds: float) -> str:
-    """A time since the epoch as ISO 8601 to the millisecond, local, with its offset."""
-    return datetime.fromtimestamp(seconds).astimezone().isoformat(timespec="milliseconds")
+    """A time since the epoch as ISO 8601, local, with its offset."""
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(seconds))
 
 
 def timeless(report: dict[str, Any]) -> dict[str, Any]:

@@ -57,7 +57,8 @@ class RunOutcome:
     """How a run ended: `outcome` is placed (done, for a kind of job that places nothing), refused, faulted or aborted;
     `report` is what report.json holds, `results` what each step made, by its name.
 
-    One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same.
+    One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same. `wall_s` are the
+    seconds that it took on the wall, which the report of a run on the virtual clock does not hold.
     """
 
     outcome: str
@@ -66,6 +67,7 @@ class RunOutcome:
     report: Mapping[str, Any]
     results: Mapping[str, object] = field(default_factory=dict, repr=False)
     control: RunControl = field(default_factory=RunControl, repr=False, compare=False)
+    wall_s: float = field(default=0.0, repr=False, compare=False)
 
     @property
     def interrupted(self) -> bool:
@@ -167,7 +169,15 @@ class JobRun:
         report = make_report(
             folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
-        return RunOutcome(report["outcome"], report["reason"], folder, report, result.results, self.run.control)
+        return RunOutcome(
+            report["outcome"],
+            report["reason"],
+            folder,
+            report,
+            result.results,
+            self.run.control,
+            time.time() - started,
+        )
 
     def _facts(self) -> dict[str, Any]:
         return {

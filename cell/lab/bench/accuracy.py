@@ -1,7 +1,7 @@
 """`cell bench accuracy`: the whole job on many simulated cells, its errors beside their bounds and limits.
 
-A world a seed and level, each calibrated and run by the product's own steps in lock step, spread over the cores; at
-every level the acceptance tests of the trade on the first seed's scan head.
+A world a seed and level, each calibrated and run by the product's own runner on the virtual clock, spread over the
+cores; at every level the acceptance tests of the trade on the first seed's scan head.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def accuracy(
     picture: Annotated[Path | None, typer.Option("--picture", help="Draw every run's error to this PNG file.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate and run many simulated cells in lock step and measure them against the truth.
+    """Calibrate and run many simulated cells on the virtual clock and measure them against the truth.
 
     At each level the acceptance tests of `cell bench acceptance` are done too, on the first seed's scan head.
 
