@@ -21,7 +21,6 @@ from drivers.errors import ConfigError
 from drivers.interfaces import Rail
 from tests.packages import RAIL, install, with_acme_rail
 
-
 TWIN = """
 from typing import Literal
 from cell.devices.built_in import BUILT_IN, TmclRailConfig
