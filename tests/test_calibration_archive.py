@@ -165,6 +165,7 @@ def test_the_adjustment_states_the_deviations_of_the_bound(world, solved):
     np.testing.assert_allclose(stated[12:21], bound[11:20], rtol=0.06)
 
 
+@pytest.mark.campaign
 def test_errors_lie_at_the_bound():
     trials = [one_trial(seed, NOISE) for seed in (11, 12)]
     for trial in trials:

@@ -81,6 +81,7 @@ def test_the_least_shift_is_that_of_the_noncentral_chi_square():
     assert all(np.isinf(d.size) and not d.enough for d in seen[1:])
 
 
+@pytest.mark.campaign
 def test_what_is_called_detectable_is_found_and_what_is_far_below_is_not(calibrated):
     cell, calibration = calibrated
     before = cell.truth

@@ -243,6 +243,7 @@ def test_the_whole_job_at_nominal_is_as_good_as_its_declared_noise(single):
     assert set(result["assumed_noise"]) >= {"arm_repeatability", "arm_dh_length", "speckle_contrast"}
 
 
+@pytest.mark.campaign
 def test_two_sweeps_side_by_side_place_a_part_wider_than_one(single):
     record, result = whole_job("panel", {}, calibrated=single[0])
     require_near_what_is_expected(result)
@@ -257,6 +258,7 @@ def test_two_sweeps_side_by_side_place_a_part_wider_than_one(single):
     assert pose.sigma[3:].max() < 0.25e-3
 
 
+@pytest.mark.campaign
 def test_a_sweep_by_the_arm_alone_places_the_part(single):
     record, result = whole_job("pot", {"mode": "arm"}, calibrated=single[0])
     require_near_what_is_expected(result)

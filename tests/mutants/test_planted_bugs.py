@@ -1,6 +1,7 @@
 """Planted bugs: each of `planted.toml` is one change to a copy of the product, and the tests that it names must fail.
 
-Run with `pytest -m mutants`. A change that no longer applies fails as well, and so do tests that fail without any.
+Run with `pytest -m mutants --dist load`. A change that no longer applies fails as well, and so do tests that fail
+without any.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def run(copy: Path, *tests: str) -> subprocess.CompletedProcess[str]:
     """The tests in the copy; nothing that is compiled there outlives it."""
     return subprocess.run(
-        [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist", *tests],
+        [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-n0", *tests],
         cwd=copy, capture_output=True, text=True, timeout=TIMEOUT_S,
         env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
     )  # fmt: skip

@@ -80,6 +80,7 @@ def test_a_pose_without_a_picture_is_named(tmp_path):
     assert any("pose0003.txt" in note for note in notes)
 
 
+@pytest.mark.campaign
 def test_two_frames_with_poses_of_elsewhere_do_not_hide_each_other(tmp_path):
     for path in recording("robot_line_laser").iterdir():
         shutil.copy(path, tmp_path)
