@@ -89,6 +89,11 @@ def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(
     devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
 
 
+def test_a_brake_that_this_program_has_not_locked_is_not_taken_as_locked() -> None:
+    arm = VirtualCell(CONFIG, seed=4, level="ideal").devices.arm
+    refused("vehicle_parked", lambda: arm.move_joints(HOME, 0.5, 1.0), "not known to be locked")
+
+
 def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices) -> None:
     devices.vehicle.enable()
     devices.vehicle.drive(0.1, 0.0)
