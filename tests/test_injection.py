@@ -7,6 +7,7 @@ import pytest
 from cell.devices.injection import Injection
 from cell.steps.kinds import PLACE
 from drivers.errors import ConfigError
+from sim_backends.direct import faults as direct
 from sim_backends.faults import FAULT_NAMES
 
 
@@ -37,3 +38,13 @@ def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
 def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         Injection.parse(text, PLACE.names)
+
+
+def test_the_door_without_wires_has_every_fault_but_those_of_a_wire() -> None:
+    assert set(direct.NAMES) | set(direct.ON_WIRES) == set(FAULT_NAMES)
+    for name in direct.NAMES:
+        direct.require(name)
+    assert set(direct.ON_WIRES) == {"arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"}
+    for name in direct.ON_WIRES:
+        with pytest.raises(ValueError, match=r"fault of the wire.*use --clock wall"):
+            direct.require(name)

@@ -143,7 +143,7 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
     require_safe(dict(outcome.report))
 
 
-@pytest.mark.parametrize("name", ["rail.drop_reply", "rail.late_reply", "can.bus_off"])
+@pytest.mark.parametrize("name", ["arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"])
 def test_a_fault_of_a_wire_is_refused_where_there_is_none(name: str) -> None:
     with opened() as cell, pytest.raises(ConfigError, match=r"fault of the wire.*use --clock wall"):
         cell.start("pot.toml", inject=[f"{name}@laser_sweep"])
