@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -38,18 +39,26 @@ def jog(
     ],
     config: ConfigOption = None,
     job: JobOption = "pot",
+    lift: Annotated[
+        list[str] | None, typer.Option("--lift", help="An interlock that a person lifts; needs a --reason.")
+    ] = None,
+    reason: Annotated[str, typer.Option("--reason", help="Why interlocks are lifted; it is recorded.")] = "",
     sim: SimOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
-    from cell.devices.jogging import NEEDED, parse_jog
     from cell.devices.jogging import jog as perform
+    from cell.devices.jogging import needed_for, parse_jog
     from cell.supervisor import Cell
 
     wish = parse_jog(device, motion)
-    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=NEEDED[wish.device]) as cell:
+    lifted = lift or []
+    with (
+        Cell.open(config, sim=sim, seed=seed, level=level.value, only=needed_for(wish, lifted)) as cell,
+        cell.maintenance(reason, lifted) if lifted else nullcontext(),
+    ):
         result = perform(cell, wish, job)
     if json:
         print_json(result)

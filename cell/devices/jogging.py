@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 MAX_LENGTH_MM = 500.0
 MAX_ANGLE_DEG = 90.0
 JOG_SPEED = 0.05  # m/s
-NEEDED = {"rail": ("rail",), "arm": ("arm", "vehicle"), "vehicle": ("vehicle", "arm")}
-"""Which devices have to be connected to jog one: arm and vehicle move only while the other one is safe."""
+_WATCHED = {"arm": ("vehicle", "vehicle_parked"), "vehicle": ("arm", "arm_stowed")}
+"""Arm and vehicle move only while the other one is safe: which that is, and the interlock that says so."""
 _USAGE = "rail +5mm · arm z -10mm · arm rx +2deg · arm j3 +5deg · vehicle +0.1m · vehicle +5deg"
 
 
@@ -39,6 +39,12 @@ class Jog:
     device: str
     axis: str
     amount: float
+
+
+def needed_for(wish: Jog, lift: Sequence[str] = ()) -> tuple[str, ...]:
+    """The devices that have to be connected for it when the interlocks in `lift` are lifted."""
+    other, rule = _WATCHED.get(wish.device, ("", ""))
+    return (wish.device, other) if other and rule not in lift else (wish.device,)
 
 
 def parse_jog(device: str, words: list[str]) -> Jog:
@@ -105,7 +111,8 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 
 
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
-    cell.devices.vehicle.brake()
+    if "vehicle" in cell.devices:
+        cell.devices.vehicle.brake()
     mover = cell.mover(None)
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1

@@ -136,7 +136,10 @@ def test_jogs_move_and_are_refused_outside_the_limits(tmp_path: Path) -> None:
         assert cell("jog", "rail", "+5mm", "-c", "sim.toml", folder=tmp_path).returncode == 0
         assert ask(endpoints, op="truth")["truth"]["rail"]["carriage"] == pytest.approx(0.005, abs=0.0002)
         start = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
-        assert cell("jog", "vehicle", "+0.1m", "-c", "sim.toml", folder=tmp_path).returncode == 0
+        refused = cell("jog", "vehicle", "+0.1m", "-c", "sim.toml", folder=tmp_path)
+        assert (refused.returncode, "arm_stowed" in refused.stderr) == (1, True)
+        word = ("--lift", "arm_stowed", "--reason", "the arm stands upright")
+        assert cell("jog", "vehicle", "+0.1m", *word, "-c", "sim.toml", folder=tmp_path).returncode == 0
         end = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
         assert np.linalg.norm(end[:2, 3] - start[:2, 3]) == pytest.approx(0.1, abs=0.01)
         refused = cell("jog", "rail", "-20mm", "-c", "sim.toml", folder=tmp_path)
