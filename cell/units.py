@@ -52,16 +52,21 @@ def parse_quantity(text: object, unit: str, low: float = -math.inf, high: float 
         raise ValueError(f"{shown(text)} is not a number and a unit, such as {example}{allowed}")
     if match[3] is None:
         raise ValueError(f"{shown(text)} has no unit; write it with one, such as {example}{allowed}")
-    ureg = _registry()
     try:
-        parsed: Any = ureg.Quantity(text.strip())
-        shown_in_unit = float(parsed.to(unit).magnitude)
-        value = float(parsed.to(unit).to_base_units().magnitude)
+        shown_in_unit, value = _converted(text.strip(), unit)
     except Exception as error:  # the library's parser raises whatever its tokens lead to
         raise ValueError(f"{shown(text)} is not a quantity in {unit}, such as {example}{allowed}") from error
     if not math.isfinite(shown_in_unit) or not low <= shown_in_unit <= high:
         raise ValueError(f"{shown(text)} is outside the allowed range{allowed}")
     return value
+
+
+@lru_cache(maxsize=1024)
+def _converted(text: str, unit: str) -> tuple[float, float]:
+    """A quantity in `unit` and in base units. Kept, because a command reads the same files several times."""
+    parsed: Any = _registry().Quantity(text)
+    there = parsed.to(unit)
+    return float(there.magnitude), float(there.to_base_units().magnitude)
 
 
 def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> Any:

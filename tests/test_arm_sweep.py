@@ -34,6 +34,7 @@ def sweep(late: float = 0.0, meddle: Callable[[DirectArm], None] = nothing) -> t
     """
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     devices, arm, camera = cell.devices, cell.arm, cell.scan_camera
+    devices.vehicle.brake()
     devices.rail.home().wait(60.0)
     mover = Mover(devices.arm, cell.clock, CONFIG, None)
     mover.to_joints(HOME)

@@ -16,7 +16,8 @@ from cell.job import load_job
 from cell.lab.bench.accuracy import LIMITS, figures, summed_up
 from cell.lab.bench.expected import mean_distance
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from drivers.errors import InterlockError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError
+from drivers.interfaces import ArmSafety
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from tests.report_runs import pot
@@ -122,6 +123,84 @@ def test_the_laser_is_seen_only_while_it_is_lit(cell):
     with cell.devices.laser.bare.lit():
         lit = cell.world.laser.at(cell.clock.now())
     assert (lit_before, lit, cell.world.laser.at(cell.clock.now())) == (False, True, False)
+
+
+def test_a_stop_of_the_rail_ends_its_motion_and_lasts_until_it_stands(cell):
+    rail = cell.rail
+    rail.move_to(0.010).wait(30.0)
+    motion = rail.move_to(0.090)
+    cell.clock.sleep(0.5)
+    rail.stop()
+    assert cell.world.rail.velocity(cell.clock.now()) == 0
+    with pytest.raises(Aborted, match="before its target"):
+        motion.wait(30.0)
+    assert rail.state().homed
+
+
+def test_a_search_that_was_stopped_has_found_no_zero():
+    rail = VirtualCell(CONFIG, seed=4, level="ideal").rail
+    search = rail.home()
+    rail.clock.sleep(0.2)
+    rail.stop()
+    with pytest.raises(Aborted):
+        search.wait(30.0)
+    assert not rail.state().homed
+    with pytest.raises(InterlockError, match="is not homed"):
+        rail.move_to(0.02)
+
+
+def test_a_rail_that_was_reset_says_so_once_and_is_not_homed():
+    rail = VirtualCell(CONFIG, seed=4, level="ideal").rail
+    rail.home().wait(60.0)
+    rail.reset()
+    with pytest.raises(DeviceFault) as caught:
+        rail.state()
+    assert caught.value.code == "rail.reset"
+    assert not rail.state().homed
+    rail.home().wait(60.0)
+    rail.move_to(0.05).wait(30.0)
+    assert rail.state().position == pytest.approx(0.05, abs=1e-7)
+
+
+def test_a_protective_stop_is_unlocked_on_a_persons_word_after_its_delay_with_the_laser_off():
+    made = VirtualCell(CONFIG, seed=4, level="ideal")
+    arm = made.arm
+    motion = arm.move_joints(arm.state().joints + 0.5, 0.5, 1.0)
+    made.clock.sleep(0.3)
+    arm.set_digital_output(CONFIG.laser.output, True)
+    made.fault("arm.protective_stop")
+    with pytest.raises(DeviceFault, match="protective stop") as caught:
+        motion.wait(30.0)
+    assert (caught.value.code, caught.value.recoverable) == ("arm.protective_stop", True)
+    with pytest.raises(DeviceFault, match="nobody has confirmed"):
+        arm.recover()
+    assert not made.world.laser.at(made.clock.now())
+    begun = made.clock.now()
+    arm.recover(confirmed=True)
+    assert made.clock.now() - begun >= made.world.arm.params.unlock_delay
+    assert arm.state().safety is ArmSafety.NORMAL
+    made.fault("arm.emergency_stop")
+    with pytest.raises(DeviceFault) as caught:
+        arm.recover(confirmed=True)
+    assert (caught.value.code, caught.value.recoverable) == ("arm.emergency_stop", False)
+
+
+def test_a_silent_camera_is_a_deadline_and_a_lost_frame_is_counted():
+    made = VirtualCell(CONFIG, seed=4, level="ideal")
+    camera = made.scan_camera
+    camera.configure(0.002, 50.0)
+    with camera.stream() as frames:
+        first = frames.next(1.0)
+        made.fault("camera.frame_loss")
+        second = frames.next(1.0)
+        assert (second.frame_id - first.frame_id, second.lost_before, frames.lost) == (2, 1, 1)
+        made.fault("camera.silent")
+        begun = made.clock.now()
+        with pytest.raises(DeadlineError):
+            frames.next(1.0)
+        assert made.clock.now() - begun == pytest.approx(1.0, abs=0.05)
+    with pytest.raises(DeadlineError):
+        camera.grab()
 
 
 def test_the_mean_length_of_a_round_gaussian_error_is_the_closed_form():

@@ -14,6 +14,7 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.devices.gated_laser import UNATTENDED_S
+from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.run.folder import CellLock
@@ -86,6 +87,11 @@ def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(
     assert np.array_equal(devices.arm.state().joints, stood)
     devices.vehicle.brake()
     devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
+
+
+def test_a_brake_that_this_program_has_not_locked_is_not_taken_as_locked() -> None:
+    arm = VirtualCell(CONFIG, seed=4, level="ideal").devices.arm
+    refused("vehicle_parked", lambda: arm.move_joints(HOME, 0.5, 1.0), "not known to be locked")
 
 
 def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices) -> None:
@@ -250,3 +256,17 @@ def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell
     with pytest.raises(ConfigError, match="needs a reason"), cell.maintenance(" ", lift=["own_switch"]):
         pass
     assert not list(cell.runs_folder.glob("*/report.json"))
+
+
+def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell: Cell) -> None:
+    def jogged(device: str, *words: str) -> dict[str, str]:
+        return jog(cell, parse_jog(device, list(words)))
+
+    assert "moved" in jogged("vehicle", "+0.1m")["vehicle"]
+    assert "→" in jogged("arm", "j1", "+20deg")["j1"]
+    with pytest.raises(InterlockError, match=r"20\.0 deg from HOME.*cell home arm.*arm_stowed"):
+        jogged("vehicle", "+0.1m")
+    cell.home("arm")
+    jogged("vehicle", "-0.1m")
+    moved = jogged("arm", "z", "+10mm")["flange"].split("moved ")[1]
+    assert float(moved.removesuffix(" mm")) == pytest.approx(10.0, abs=0.1)

@@ -21,6 +21,18 @@ from drivers.errors import ConfigError
 from drivers.interfaces import Rail
 from tests.packages import RAIL, install, with_acme_rail
 
+TWIN = """
+from typing import Literal
+from cell.devices.built_in import BUILT_IN, TmclRailConfig
+from cell.devices.make import Make
+
+class TwinConfig(TmclRailConfig):
+    driver: Literal["twin"] = "twin"
+
+MAKE = Make("rail", "twin", TwinConfig, BUILT_IN[0].connect, BUILT_IN[0].calibrated)
+"""
+"""A rail with the built-in one's record, from another package."""
+
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -67,6 +79,16 @@ def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path:
     assert own != load_config(None).calibration_hash()
     assert loaded(tmp_path, port="/dev/acme1").calibration_hash() == own
     assert loaded(tmp_path, belt="3 mm").calibration_hash() != own
+
+
+def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(site: Path, tmp_path: Path) -> None:
+    install(site, "twin-rail", "1.0", "rail.twin = twin_rail:MAKE", twin_rail=TWIN)
+    path = tmp_path / "twin.toml"
+    path.write_text(default_toml().replace('driver = "tmcl"', 'driver = "twin"'))
+    own = load_config(None)
+    twin = load_config(path)
+    assert twin.rail.model_dump(exclude={"driver"}) == own.rail.model_dump(exclude={"driver"})
+    assert twin.calibration_hash() != own.calibration_hash()
 
 
 def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path: Path) -> None:

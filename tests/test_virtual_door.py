@@ -14,28 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
 from cell import Cell
 from cell.calibration.store import save_calibration
 from cell.cli import main
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.devices.stopping import stop_cell
 from cell.job import job_path
 from cell.lab.bench.whole_job import JobRecord
 from cell.run.events import ConfirmNeeded, Held, RunEvent, StepStarted
-from cell.run.job_run import RunOutcome, classify
+from cell.run.job_run import RunOutcome
 from cell.run.run import Run
-from cell.steps.moves import HOME
 from drivers.errors import ConfigError
-from statemachine.control import RunControl
-from statemachine.journal import Journal, request
-from statemachine.policy import OnFailure, Policy, Step
-from statemachine.runner import Runner, RunResult, StepContext
-from statemachine.sequence import Sequence, State
-from statemachine.step import StepCall
+from statemachine.journal import request
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -265,60 +255,3 @@ def test_the_command_line_says_what_time_passed_here_and_there(
     assert command(monkeypatch, *virtual) == 0
     assert re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", capsys.readouterr().out)
     assert command(monkeypatch, *virtual, "--speed", "2") == 2
-
-
-# --- the runner in line, on single steps ---
-
-
-def run_step(cell: VirtualCell, folder: Path, first: StepCall) -> RunResult:
-    """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
-    folder.mkdir()
-    journal = Journal(folder, "here")
-    try:
-        return Runner(
-            sequence=Sequence(("first", "second"), State.DONE),
-            steps={"first": first, "second": lambda context: None},
-            policy=Policy((Step("first", 2.0, on_failure=OnFailure.STOP), Step("second", 2.0))),
-            journal=journal,
-            clock=cell.clock,
-            classify=classify,
-            safe_stop=lambda reason: stop_cell(cell.devices),
-            control=RunControl(),
-        ).run()
-    finally:
-        journal.close()
-
-
-def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(folder: Path) -> None:
-    cell = VirtualCell(load_config(None), SEED)
-    cell.devices.vehicle.brake()
-    threads: list[str] = []
-
-    def slow(context: StepContext) -> None:
-        threads.append(threading.current_thread().name)
-        cell.devices.gate.enter(context.token)
-        cell.devices.arm.move_joints(HOME + np.array([3.0, 0, 0, 0, 0, 0]), 0.05, 0.5).wait(600.0)
-
-    result = run_step(cell, folder / "late", slow)
-    assert (result.outcome.value, result.code) == ("faulted", "step.deadline")
-    assert threads == [threading.current_thread().name]
-    assert not cell.world.arm.moving
-    # Two seconds of its own, then the arm's braking and the safe stops.
-    assert 2.0 <= cell.clock.now() < 5.0
-
-
-def test_a_step_that_catches_its_end_and_goes_on_is_told_again(folder: Path) -> None:
-    cell = VirtualCell(load_config(None), SEED)
-    told: list[str] = []
-
-    def stubborn(context: StepContext) -> None:
-        for _ in range(3):
-            try:
-                cell.clock.sleep(100.0)
-            except RuntimeError as error:
-                told.append(str(error))
-
-    result = run_step(cell, folder / "stubborn", stubborn)
-    assert result.code == "step.deadline"
-    assert len(told) == 3
-    assert cell.clock.now() < 2.0 + 3 * Policy(()).grace_s + 2.0

@@ -1,0 +1,134 @@
+"""What the cell relies on in a rail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.devices.contracts import Bench
+from cell.devices.contracts.device import DeviceContract
+from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
+from drivers.interfaces import Rail
+
+FAR_M, SPEED = 0.03, 0.02
+"""Way in m and speed in m/s of the suite's motions at full motion; its rail takes ten times the speed."""
+PATIENCE_S = 90.0
+STANDS_S = 1.0
+EXACT_M = 2e-5
+
+
+class RailContract(DeviceContract):
+    """A rail whose travel begins at or below 0 and is longer than 0.06 m. It homes."""
+
+    def homed(self, bench: Bench[Rail]) -> Rail:
+        """The rail, homed, at position 0."""
+        rail = bench.device
+        if not rail.state().homed_here:
+            rail.home().wait(PATIENCE_S)
+        rail.move_to(max(0.0, rail.travel[0])).wait(PATIENCE_S)
+        return rail
+
+    def stands(self, bench: Bench[Rail]) -> None:
+        """A stop comes back when the rail has taken it: a moment later it stands."""
+        until = bench.clock.now() + STANDS_S
+        while bench.device.state().moving:
+            assert bench.clock.now() < until
+            bench.clock.sleep(0.02)
+
+    def test_a_rail_that_is_not_homed_goes_nowhere(self, bench: Bench[Rail]) -> None:
+        """`InterlockError`, since positions mean nothing yet."""
+        rail = bench.device
+        if rail.state().homed:
+            pytest.skip("it remembers an earlier homing")
+        before = rail.state().position
+        with pytest.raises(InterlockError):
+            rail.move_to(0.0)
+        assert rail.state().position == before
+
+    def test_homing_ends_at_zero_at_rest(self, bench: Bench[Rail]) -> None:
+        """Position 0 is at the switch."""
+        rail = bench.device
+        rail.home().wait(PATIENCE_S)
+        state = rail.state()
+        assert state.homed
+        assert state.homed_here
+        assert not state.moving
+        assert abs(state.position) < 1e-3
+
+    def test_positions_are_metres_and_speeds_metres_a_second(self, bench: Bench[Rail]) -> None:
+        """A move ends where it was sent, and takes the time of its way at its speed."""
+        rail, way, speed = self.homed(bench), FAR_M * bench.motion, SPEED * bench.motion
+        took: list[float] = []
+        with bench.timed(took):
+            rail.move_to(way, speed).wait(PATIENCE_S)
+        assert rail.state().position == pytest.approx(way, abs=EXACT_M)
+        assert way / speed <= took[0] + 0.05 < 1.5 * way / speed + 2.0
+
+    def test_limits_are_kept_before_anything_is_sent(self, bench: Bench[Rail]) -> None:
+        """`LimitError`, and the carriage has not moved."""
+        rail = self.homed(bench)
+        low, high = rail.travel
+        before = rail.state().position
+        for beyond in (lambda: rail.move_to(high + 0.001), lambda: rail.move_to(low - 0.001),
+                       lambda: rail.move_to(0.01, 100.0), lambda: rail.move_to(0.01, -0.01),
+                       lambda: rail.sweep_start(low, high, SPEED)):  # fmt: skip
+            with pytest.raises(LimitError):
+                beyond()
+        assert rail.state().position == pytest.approx(before, abs=EXACT_M)
+        assert not rail.state().moving
+
+    def test_a_stop_overtakes_a_motion(self, bench: Bench[Rail]) -> None:
+        """It stands short of its goal, and whoever waits is told by `Aborted`."""
+        rail, way = self.homed(bench), FAR_M * bench.motion
+        motion = rail.move_to(way, 0.2 * SPEED * bench.motion)
+        with pytest.raises(InterlockError):
+            rail.move_to(0.0)
+        bench.clock.sleep(0.5)
+        rail.stop()
+        with pytest.raises(Aborted):
+            motion.wait(PATIENCE_S)
+        assert motion.done
+        self.stands(bench)
+        state = rail.state()
+        assert 0.0 < state.position < way
+        assert rail.state().position == pytest.approx(state.position, abs=EXACT_M)
+
+    def test_a_deadline_stops_the_motion(self, bench: Bench[Rail]) -> None:
+        """`wait` raises `DeadlineError` for a motion that does not arrive in time, and it is stopped."""
+        rail = self.homed(bench)
+        motion = rail.move_to(FAR_M * bench.motion, 0.2 * SPEED * bench.motion)
+        with pytest.raises(DeadlineError):
+            motion.wait(0.5)
+        self.stands(bench)
+        rail.move_to(0.0).wait(PATIENCE_S)
+
+    def test_time_stamps_are_of_the_host_when_the_position_held(self, bench: Bench[Rail]) -> None:
+        """Between the question and the answer, and never backwards."""
+        rail, stamps = self.homed(bench), []
+        for _ in range(5):
+            asked = bench.clock.now()
+            stamps.append(rail.state().stamp)
+            assert asked <= stamps[-1]
+            bench.clock.sleep(0.02)
+            assert stamps[-1] <= bench.clock.now()
+        assert stamps == sorted(stamps)
+
+    def test_a_sweep_has_constant_velocity_in_its_window(self, bench: Bench[Rail]) -> None:
+        """`position_at` runs from `start` to `stop` at the speed that was asked for; outside it is a ValueError."""
+        rail, speed = self.homed(bench), SPEED * bench.motion
+        start, stop = 0.01, 0.01 + FAR_M * bench.motion
+        with pytest.raises(InterlockError):
+            rail.sweep(start, stop, speed)
+        rail.move_to(rail.sweep_start(start, stop, speed)).wait(PATIENCE_S)
+        sweep = rail.sweep(start, stop, speed)
+        sweep.wait(PATIENCE_S)
+        begin, end = sweep.window
+        assert (end - begin) == pytest.approx((stop - start) / speed, rel=0.02)
+        times = np.linspace(begin, end, 9)[1:-1]
+        places = [sweep.position_at(float(time)) for time in times]
+        assert np.polyfit(times, places, 1)[0] == pytest.approx(speed, rel=0.02)
+        assert start - 2e-4 <= places[0] < places[-1] <= stop + 2e-4
+        assert sweep.samples.shape[1] == 2
+        assert sweep.time_bound >= 0.0
+        with pytest.raises(ValueError, match=r".+"):
+            sweep.position_at(end + 60.0)

@@ -1,0 +1,102 @@
+"""The devices of a configured cell, put to the contracts of their kinds; the package says how it is started."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell.config import CellConfig, load_config, require_real_addresses
+from cell.devices.assembly import connect_one
+from cell.devices.contracts import Bench
+from cell.devices.contracts.arm import ArmContract
+from cell.devices.contracts.camera import CameraContract
+from cell.devices.contracts.rail import RailContract
+from cell.devices.contracts.switches import ClawContract, LaserContract
+from cell.devices.contracts.vehicle import VehicleContract
+from cell.run.folder import CellLock
+from drivers.clock import Clock
+
+pytestmark = pytest.mark.skipif(
+    "CELL_CONTRACTS" not in os.environ, reason="CELL_CONTRACTS names no configuration: no device is touched"
+)
+
+
+@pytest.fixture(scope="module")
+def configured() -> Iterator[CellConfig]:
+    """The configuration, its devices held."""
+    config = load_config(Path(os.environ["CELL_CONTRACTS"]))
+    require_real_addresses(config)
+    with CellLock(config):
+        yield config
+
+
+def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
+    """The bench of one device; what hangs on the arm brings the arm with it."""
+    clock = Clock(config.cell.time_scale)
+    with ExitStack() as over:
+        arm = None
+        if config.make(name).on_arm:
+            arm = connect_one(config, "arm", clock)
+            over.callback(arm.close)
+        motion = float(os.environ.get("CELL_CONTRACTS_MOTION", "0.2"))
+        linked = not config.make(name).on_arm
+        bench = Bench(lambda: connect_one(config, name, clock, arm=arm), clock, motion, linked)
+        over.callback(bench.over)
+        yield bench
+
+
+class _Configured:
+    NAME = ""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def bench(cls, configured: CellConfig) -> Iterator[Bench[Any]]:
+        """The device of this name."""
+        yield from bench_of(configured, cls.NAME)
+
+
+class TestRail(_Configured, RailContract):
+    """The rail."""
+
+    NAME = "rail"
+
+
+class TestArm(_Configured, ArmContract):
+    """The arm."""
+
+    NAME = "arm"
+
+
+class TestVehicle(_Configured, VehicleContract):
+    """The vehicle."""
+
+    NAME = "vehicle"
+
+
+class TestScanCamera(_Configured, CameraContract):
+    """The camera on the rail."""
+
+    NAME = "scan_camera"
+
+
+class TestTargetCamera(_Configured, CameraContract):
+    """The camera on the flange."""
+
+    NAME = "target_camera"
+
+
+class TestLaser(_Configured, LaserContract):
+    """The laser."""
+
+    NAME = "laser"
+
+
+class TestClaw(_Configured, ClawContract):
+    """The claw."""
+
+    NAME = "claw"

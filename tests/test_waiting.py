@@ -1,0 +1,170 @@
+"""Work in line on the virtual clock: who waits looks around, what ends work comes out of its wait, after the stop."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from cell.devices.stopping import stop_cell
+from cell.run.job_run import classify
+from cell.steps.moves import HOME
+from drivers.errors import Aborted
+from statemachine.cancel import Cancelled
+from statemachine.control import RunControl
+from statemachine.journal import Journal, request
+from statemachine.policy import OnFailure, Policy, Step
+from statemachine.runner import Runner, RunResult, StepContext
+from statemachine.sequence import Sequence, State
+from statemachine.step import StepCall
+from statemachine.waiting import InLine, Threads, waiting_on
+
+FAR = HOME + np.array([3.0, 0, 0, 0, 0, 0])
+
+
+@pytest.fixture
+def cell() -> VirtualCell:
+    made = VirtualCell(load_config(None), 2)
+    made.devices.vehicle.brake()
+    return made
+
+
+def run_step(cell: VirtualCell, folder: Path, first: StepCall, control: RunControl | None = None) -> RunResult:
+    """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
+    journal = Journal(folder, "here")
+    try:
+        return Runner(
+            sequence=Sequence(("first", "second"), State.DONE),
+            steps={"first": first, "second": lambda context: None},
+            policy=Policy((Step("first", 2.0, on_failure=OnFailure.STOP), Step("second", 2.0))),
+            journal=journal,
+            clock=cell.clock,
+            classify=classify,
+            safe_stop=lambda reason: stop_cell(cell.devices),
+            control=control or RunControl(),
+        ).run()
+    finally:
+        journal.close()
+
+
+def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(
+    cell: VirtualCell, tmp_path: Path
+) -> None:
+    threads: list[str] = []
+
+    def slow(context: StepContext) -> None:
+        threads.append(threading.current_thread().name)
+        cell.devices.gate.enter(context.token)
+        cell.devices.arm.move_joints(FAR, 0.05, 0.5).wait(600.0)
+
+    result = run_step(cell, tmp_path, slow)
+    assert (result.outcome.value, result.code) == ("faulted", "step.deadline")
+    assert threads == [threading.current_thread().name]
+    assert not cell.world.arm.moving
+    # Two seconds of its own, then the arm's braking and the safe stops.
+    assert 2.0 <= cell.clock.now() < 5.0
+
+
+def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothing(
+    cell: VirtualCell, tmp_path: Path
+) -> None:
+    told: list[str] = []
+
+    def stubborn(context: StepContext) -> None:
+        cell.devices.gate.enter(context.token)
+        for _ in range(3):
+            try:
+                cell.clock.sleep(100.0)
+            except Cancelled as error:
+                told.append(str(error))
+        with pytest.raises(Aborted):
+            cell.devices.arm.move_joints(FAR, 0.05, 0.5)
+
+    result = run_step(cell, tmp_path, stubborn)
+    assert result.code == "step.deadline"
+    assert len(told) == 3
+    assert cell.clock.now() < 2.0 + 3 * Policy(()).grace_s + 2.0
+
+
+def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell, tmp_path: Path) -> None:
+    def asking(context: StepContext) -> None:
+        request(tmp_path, "abort", "by another process")
+        cell.clock.sleep(100.0)
+
+    result = run_step(cell, tmp_path, asking)
+    assert (result.outcome.value, result.reason) == ("aborted", "by another process")
+    assert cell.clock.now() < 2.0
+
+
+def test_held_work_hears_that_it_is_to_end_although_no_time_passes(cell: VirtualCell, tmp_path: Path) -> None:
+    control = RunControl()
+
+    def held(context: StepContext) -> None:
+        control.pause()
+        request(tmp_path, "abort", "while it is held")
+        context.safe_point()
+
+    before = cell.clock.now()
+    result = run_step(cell, tmp_path, held, control)
+    assert (result.outcome.value, result.reason) == ("aborted", "while it is held")
+    assert cell.clock.now() - before < 0.5
+
+
+def test_time_that_another_thread_lets_pass_ends_nothing_there(cell: VirtualCell) -> None:
+    waiting = InLine(cell.clock)
+    seen: list[str] = []
+
+    def cut() -> str | None:
+        seen.append(threading.current_thread().name)
+        return None
+
+    def work() -> None:
+        other = threading.Thread(target=cell.clock.sleep, args=(1.0,), name="other")
+        other.start()
+        cell.clock.sleep(1.0)
+        other.join()
+
+    call = waiting.do("work", work, cut, 1.0)
+    assert call.error is None
+    assert set(seen) == {threading.current_thread().name}
+
+
+def test_the_stop_is_not_ended_by_what_it_is_for(cell: VirtualCell) -> None:
+    stopped: list[float] = []
+
+    def stop() -> str:
+        cell.clock.sleep(3.0)
+        stopped.append(cell.clock.now())
+        return "enough"
+
+    begun = cell.clock.now()
+    call = InLine(cell.clock).do("work", lambda: cell.clock.sleep(100.0), stop, 1.0)
+    assert isinstance(call.error, Cancelled)
+    assert stopped == [pytest.approx(begun + 3.0, abs=0.1)]
+
+
+def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -> None:
+    done: list[str] = []
+
+    def fails() -> None:
+        done.append("fails")
+        raise ValueError("it cannot")
+
+    def lasts() -> None:
+        done.append("lasts")
+        cell.clock.sleep(1000.0)
+
+    problems = waiting_on(cell.clock).each({"a": fails, "b": lasts, "c": lambda: done.append("last")}, 5.0)
+    assert done == ["fails", "lasts", "last"]
+    assert problems == ["a: not confirmed, it cannot", "b: not confirmed, it took longer than 5 s"]
+    assert cell.clock.now() < 10.0
+
+
+def test_a_clock_that_runs_by_itself_gets_threads() -> None:
+    from drivers.clock import Clock
+
+    assert isinstance(waiting_on(Clock()), Threads)
