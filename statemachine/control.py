@@ -102,11 +102,6 @@ class RunControl:
         return self._paused
 
     @property
-    def waits_for(self) -> str | None:
-        """What a person has to confirm now, or None."""
-        return self._wanted
-
-    @property
     def held_s(self) -> float:
         """Wall seconds that the run was held in its steps, until now: they count towards no deadline."""
         with self._change:

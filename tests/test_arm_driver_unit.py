@@ -113,7 +113,8 @@ def test_pose_difference_agrees_with_an_independent_one():
         (9, "arm.safety_fault"),
     ],
 )
-def test_safety_bits_have_the_meaning_of_the_protocol_sheet(bit, code):
+def test_safety_bits_have_the_makers_meaning(bit, code):
+    # docs/protocols.md, section 1
     assert safety_code(1 << bit) == code
     assert safety_code(1) == ""
 

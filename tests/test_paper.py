@@ -1,4 +1,4 @@
-"""The paper's design study and equations, against the theory sheet's figures and the simulator's optics."""
+"""The paper's design study and equations, against the figures of docs/theory.md, section 3, and the simulator."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ from sim_backends.optics.stripe import crossings
     ("focal_mm", "half_millimetre", "fifth"),
     [(6.54, 0.242, 0.242), (8.0, 0.75, 0.537), (12.0, 2.72, 1.54), (16.0, 5.04, 2.67)],
 )
-def test_the_papers_claims_need_the_stripe_errors_of_the_theory_sheet(
-    focal_mm: float, half_millimetre: float, fifth: float
-) -> None:
+def test_the_papers_claims_need_small_stripe_errors(focal_mm: float, half_millimetre: float, fifth: float) -> None:
     limits = [
         1e6 * delta_limit(Head.at_stand_off(baseline, 1e-3 * focal_mm), demand)
         for baseline, demand in ((0.030, 0.5e-3), (0.035, 0.2e-3))
@@ -35,7 +33,7 @@ def test_the_papers_claims_need_the_stripe_errors_of_the_theory_sheet(
     assert limits == pytest.approx([half_millimetre, fifth], rel=3e-3)
 
 
-def test_light_is_as_even_as_the_theory_sheet_says() -> None:
+def test_light_is_the_more_even_the_longer_the_baseline() -> None:
     found = [uniformity(Head.at_stand_off(1e-3 * mm, 8e-3), Light()) for mm in (20, 30, 35, 50, 80)]
     assert found == pytest.approx([0.00, 0.11, 0.17, 0.33, 0.52], abs=0.005)
 

@@ -1,6 +1,6 @@
 """Where the middle of a printed dot is seen: the centre of its ellipse, which is not the image of its centre.
 
-The difference is .05 px at 20° and .1 px at 40° for a dot of 1.2 mm radius (theory sheet, part 4).
+For a dot of 1.2 mm radius at 130 mm the difference is .05 px at 20° and .07 px at 40° (docs/theory.md, section 6).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The laser's light plane in the camera frame, and triangulation: where a pixel's ray meets it.
 
 The general form holds for any plane; the closed form of the paper (its equation 1, corrected) is the special case of a
-laser on the camera's x axis, kept because a test proves the two equal. Theory sheet, part 1.
+laser on the camera's x axis, kept because a test proves the two equal. docs/theory.md, section 2.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class LightPlane:
     def intersect_with_jacobians(self, rays: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """Points P (n, 3), ∂P/∂u (n, 3, 3), ∂P/∂n (n, 3, 3) and ∂P/∂d (n, 3) for unit rays u (n, 3).
 
-        ∂P/∂u = s(I − u nᵀ/(n·u)) with s = d/(n·u); ∂P/∂n = −P Pᵀ/d; ∂P/∂d = P/d (theory sheet, part 1).
+        ∂P/∂u = s(I − u nᵀ/(n·u)) with s = d/(n·u); ∂P/∂n = −P Pᵀ/d; ∂P/∂d = P/d (docs/theory.md, section 2).
         """
         u = np.atleast_2d(np.asarray(rays, dtype=np.float64))
         s = self._range(u)
@@ -118,7 +118,7 @@ def closed_form(
 
 
 def closed_form_jacobian(x: float, y: float, baseline: float, focal: float, theta: float) -> Array:
-    """∂(X, Y, Z)/∂(x', y', l, f, θ) of `closed_form`, (3, 5). Theory sheet, part 1, with ∂X/∂f and ∂Y/∂f added."""
+    """∂(X, Y, Z)/∂(x', y', l, f, θ) of `closed_form`, (3, 5): the table of docs/theory.md, section 2."""
     d = focal / np.tan(theta) - x
     px, py, pz = baseline * x / d, baseline * y / d, baseline * focal / d
     cot, csc2 = 1 / np.tan(theta), 1 / np.sin(theta) ** 2

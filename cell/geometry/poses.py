@@ -110,15 +110,6 @@ def composition_jacobians(a_from_b: pin.SE3, b_from_c: pin.SE3) -> tuple[Array, 
     return outer, inner
 
 
-def inverse_covariance_frame(a_from_b: pin.SE3, covariance: ArrayLike) -> Array:
-    """6×6 covariance of b_from_a, in the axes of b, from that of a_from_b."""
-    back = a_from_b.rotation.T
-    j = np.zeros((6, 6))
-    j[:3, :3] = j[3:, 3:] = -back
-    j[:3, 3:] = -back @ pin.skew(a_from_b.translation)
-    return np.asarray(j @ np.asarray(covariance, dtype=np.float64) @ j.T, dtype=np.float64)
-
-
 def point_covariances(
     a_from_b: pin.SE3, pose_covariance: ArrayLike, points: ArrayLike, covariances: ArrayLike
 ) -> Array:

@@ -16,7 +16,7 @@ from drivers.errors import Measured, NotObservable
 
 FREE = 1e-3
 """Smallest eigenvalue of the scan's information, per point and σ, below which a motion counts as not determined by the
-scan (theory sheet, part 5)."""
+scan (docs/theory.md, section 9)."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Where the nominal surface lies in the scan: robust point-to-plane Gauss–Newton with the board's pose as a prior.
 
-The prior is anchored: its gradient pulls to the board's pose, so that a
-direction that the scan does not determine stays where the board put it (theory sheet, part 5). Correspondences are
-gated from coarse to fine. What the uncertainty means for the job is judged in `observability`.
+The prior is anchored: its gradient pulls to the board's pose, so that a direction that the scan does not determine
+stays where the board put it (docs/theory.md, section 8). Correspondences are gated from coarse to fine. What the
+uncertainty means for the job is judged in `observability`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Registration:
     scan and prior together; follow: (6, m) how the pose follows each accepted point along its normal.
     used: indices of the accepted points of the scan; heights: their distances from the surface (m);
     normals, arms: (m, 3) their normals and places relative to the surface's origin, in base axes; sigmas: m.
-    share: accepted points among those over the surface; offered: points of the scan.
+    share: accepted points among those over the surface.
     """
 
     base_from_surface: pin.SE3
@@ -75,7 +75,6 @@ class Registration:
     arms: Array
     sigmas: Array
     share: float
-    offered: int
 
     @property
     def gain(self) -> Array:
@@ -257,7 +256,6 @@ def _result(
         arms=rows.arms[keep],
         sigmas=sigmas[keep],
         share=len(keep) / max(1, len(over.index)),
-        offered=len(scan.points),
     )
     lines = by_lines(found.follow, scan, found)
     return replace(found, covariance=found.covariance + lines @ lines.T)

@@ -28,7 +28,7 @@ class Unreachable(RefusedError):
 
 @dataclass(frozen=True)
 class DenavitHartenberg:
-    """Table of an arm, one entry per joint: d and a in m, alpha in rad. Default: UR10e (protocol sheet, part 5)."""
+    """Table of an arm, by joint: d and a in m, alpha in rad. Default: UR10e (docs/protocols.md, section 1)."""
 
     d: tuple[float, ...] = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)
     a: tuple[float, ...] = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)

@@ -1,7 +1,7 @@
 """Points of an organised cloud that do not lie on the surface around them.
 
 The depth of each point is compared with the median of its 5×5 neighbours (line × row), in units of its noise and of
-the deviations around it, so that near outliers and streaks stand out (theory sheet, part 5). Compiled.
+the deviations around it, so that near outliers and streaks stand out (docs/theory.md, section 7). Compiled.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 THRESHOLD = 6.5
 """Deviation, in median absolute deviations, from which on a point is an outlier.
 
-The deviation is the lesser of two, so its median is less than a normal variable's and the sheet's 5 becomes 6.5.
+The deviation is the lesser of two, so its median is less than a normal variable's: of white noise this is 4.1 σ.
 """
 LEAST_LEVEL = 0.25
 """Smallest median absolute deviation that is taken for the noise, in units of the noise stated."""

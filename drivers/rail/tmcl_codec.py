@@ -1,6 +1,6 @@
 """TMCL's binary telegrams: nine bytes each way, summed to eight bits.
 
-Source: the vendor's TMCL firmware manual and the protocol notes of this project. Bytes only: no port, no units.
+Source: the maker's TMCL firmware manual; docs/protocols.md, section 2. Bytes only: no port, no units.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ class Command(IntEnum):
     """Command numbers."""
 
     ROTATE_RIGHT = 1
-    ROTATE_LEFT = 2
     MOTOR_STOP = 3
     MOVE_TO = 4
     SET_AXIS = 5
@@ -43,12 +42,10 @@ class Axis(IntEnum):
 
     TARGET_POSITION = 0
     POSITION = 1
-    TARGET_VELOCITY = 2
     VELOCITY = 3
     MAX_VELOCITY = 4
     MAX_ACCELERATION = 5
     POSITION_REACHED = 8
-    HOME_SWITCH = 9
     RIGHT_SWITCH = 10
     LEFT_SWITCH = 11
     MICROSTEP_RESOLUTION = 140

@@ -1,6 +1,6 @@
 """The light of one row crossing of the stripe: how bright, how wide, and spread over which pixels.
 
-Radiometry after the theory sheet, part 2: the irradiance of the sheet falls with the distance from the laser and the
+Radiometry, docs/theory.md, section 4: the irradiance of the light sheet falls with the distance from the laser and the
 cosine of incidence; a diffuse surface's image does not depend on the camera's distance.
 """
 

@@ -2,7 +2,7 @@
 
 The cut of every object is a set of straight segments; each is followed to the image rows' centres exactly, seen from
 the camera and lit by the laser or not at all. What is drawn is the Gaussian of the sheet's thickness as the camera
-sees it on the slope, widened by point spread and defocus, integrated over pixels (theory sheet, parts 2 and 6).
+sees it on the slope, widened by point spread and defocus, integrated over pixels (docs/theory.md, section 4).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.boards import appearance
-from sim_backends.optics.camera import CameraOptics, blur_disc, distort, distort_jacobian
+from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.pattern import plain_parameters
 from sim_backends.optics.profile import expose
@@ -203,11 +203,3 @@ def follow(
             values[count, 7] = normals[s, 2]
             count += 1
     return count
-
-
-def stripe_width_px(optics: CameraOptics, laser: LaserOptics, distance: float) -> float:
-    """Standard deviation in px of the stripe on a surface that faces the camera at `distance` m, without pixel size."""
-    normal, _, _ = laser_frame(laser)
-    geometric = laser.width * optics.fx / (distance * abs(normal[0]))
-    disc = blur_disc(optics.focal, optics.f_number, optics.focus_distance, distance) / optics.pixel
-    return float(np.sqrt(geometric**2 + optics.psf_px**2 + disc**2 / 16))

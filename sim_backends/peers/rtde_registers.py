@@ -35,7 +35,6 @@ class Registers:
     def __init__(self) -> None:
         self.int_in = [0] * REGISTERS
         self.double_in = [0.0] * REGISTERS
-        self.bits_in = [0, 0]
         self.int_out = [0] * REGISTERS
         self.double_out = [0.0] * REGISTERS
         self.bits_out = [0, 0]

@@ -175,7 +175,7 @@ def draw(seed: int, level: str) -> Scene:
 
 
 def _light_plane(d: _Draws, sigma: Deviations) -> tuple[Vector, float, Vector]:
-    """Unit normal, distance and exit point, in C: nominally X = −l + Z cot θ (theory sheet, part 1)."""
+    """Unit normal, distance and exit point, in C: nominally X = −l + Z cot θ (docs/theory.md, section 2)."""
     plain = np.array([1.0, 0.0, -1.0 / nominal.LASER_TAN_THETA])
     normal = rotation(d.vector("light_plane.tilt", sigma.light_plane_tilt)) @ (plain / np.linalg.norm(plain))
     origin = nominal.LASER_ORIGIN + d.vector("light_plane.offset", sigma.light_plane_offset)

@@ -54,7 +54,6 @@ class Expected:
     own_m: float
     placing_m: float
     sensor_m: float
-    kinematic_own: Vector
 
 
 def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurface) -> Expected:
@@ -89,9 +88,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
         return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
 
     in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
-    return Expected(
-        absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera), _square(own)
-    )
+    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera))
 
 
 def mean_distance(covariances: Vector) -> float:

@@ -55,11 +55,6 @@ class Part:
             return np.asarray(np.hypot(x, y) < DISC)
         return np.asarray((np.abs(x) < HALF_X) & (np.abs(y) < HALF_Y))
 
-    @property
-    def determined(self) -> int:
-        """How many of the six motions of the pose the surface determines."""
-        return {"none": 6, "axis": 5, "centre": 3}[self.symmetry]
-
     def error(self, found: pin.SE3, true: pin.SE3) -> tuple[float, float]:
         """Error of a pose in m and rad, of what the surface determines: its free motions do not count."""
         if self.symmetry == "centre":

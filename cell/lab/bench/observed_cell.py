@@ -8,7 +8,7 @@ stated in `Noise`, as measured on rendered pictures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,10 +220,6 @@ class ObservedCell:
             rest = self.move(view.base_from_flange.homogeneous)
             made.append(TargetObservation(self.target_view(rest), from_matrix(rest.reported), f"large {k + 1}"))
         return made
-
-    def disturb(self, **changes: Array | float) -> None:
-        """Replace parts of the truth by name."""
-        self.truth = replace(self.truth, **changes)  # type: ignore[arg-type]
 
 
 def bend_of(spec: BoardSpec, sagitta: float, local: Array) -> Array:

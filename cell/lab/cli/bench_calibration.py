@@ -61,7 +61,7 @@ def _print(result: Mapping[str, Any]) -> None:
     )
     table = Table(title="errors in mm, means over the seeds")
     titles = ("of", "mean D", "85 %", "max D", "bound of mean D", "ratio", "best on same noise", "ratio")
-    for name in (*titles, "theory sheet: mean, 85 %, max"):
+    for name in (*titles, "reachable: mean, 85 %, max"):
         table.add_column(name, justify="left" if name == "of" else "right")
     for frame, title in FRAMES.items():
         row, theory = result["frames_mm"][frame], result["frames_mm"][frame]["theory"]

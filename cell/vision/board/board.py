@@ -39,14 +39,13 @@ class BoardPose:
 
     `covariance` (6, 6) of (translation, rotation) in camera axes, m and rad, from each point's σ, larger where the
     residuals say more; `rms_px` of all residual components; `obliquity` in rad between the board's normal and the line
-    of sight to its middle; `second_rms_px` that of the other pose that the flat board allows, NaN when there is none.
+    of sight to its middle.
     """
 
     camera_from_board: pin.SE3
     covariance: Array
     rms_px: float
     obliquity: float
-    second_rms_px: float
 
 
 def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None) -> BoardView:
@@ -80,7 +79,6 @@ def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
     best = fits[0]
     pose, scale = best.pose, best.scale
     covariance: Array = np.asarray(scale**2 * np.linalg.inv(best.normal), dtype=np.float64)
-    second = np.nan
     if len(fits) > 1:
         apart = difference(fits[1].pose, pose)
         distinct = np.linalg.norm(apart[3:]) > 3 * np.sqrt(np.trace(covariance[3:, 3:]))
@@ -90,14 +88,12 @@ def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
                 f"two poses {np.degrees(np.linalg.norm(apart[3:])):.1f}° apart explain the picture of {view.spec.name} "
                 "equally well; go nearer or look at it from another side",
             )
-        if distinct:
-            second = fits[1].rms_px
     normal_out = pose.rotation[:, 2]
     middle = transform(pose, view.object_points.mean(axis=0))
     cosine = float(normal_out @ middle / np.linalg.norm(middle))
     if cosine <= 0:
         raise PictureRefused(Reason.MIRRORED, f"{view.spec.name} is seen from behind: the picture is mirrored")
-    return BoardPose(pose, covariance, best.rms_px, float(np.arccos(min(1.0, cosine))), second)
+    return BoardPose(pose, covariance, best.rms_px, float(np.arccos(min(1.0, cosine))))
 
 
 def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_radius: float) -> Array:

@@ -1,7 +1,7 @@
 """Sub-pixel centres of the laser stripe, one per image row (or column), with an honest standard deviation each.
 
 `extract` is the way in, to all methods; weighted maximum likelihood is the default and the one that attains the bound
-(theory sheet, part 3). What a centre means in space is the business of the geometry.
+(docs/theory.md, section 5). What a centre means in space is the business of the geometry.
 """
 
 from __future__ import annotations

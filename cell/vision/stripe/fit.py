@@ -1,4 +1,4 @@
-"""The likeliest centre of the stripe in each line: the compiled maximum likelihood fit (theory sheet, part 3).
+"""The likeliest centre of the stripe in each line: the compiled maximum likelihood fit (docs/theory.md, section 5).
 
 Fisher scoring on centre, amplitude, width and linear background, `LANES` lines at a time; one step is in
 `stripe_lanes.py`. `stripe_numpy.py` says the same without a compiler.

@@ -3,8 +3,8 @@
 Residuals of fitted lines are compared with what the fit leaves of photon noise and of speckle of contrast 1, for its
 grain: the fit swallows much of a coarse speckle, and that share is computed, not guessed. The grain is seen across the
 lines, where nothing is swallowed: round grains correlate a line with the next as they correlate a pixel with the next.
-Without speckle in the weights and correlation in the deviation, a stated σ is 1.4 to 2.2 times too small (theory sheet,
-part 3).
+Without speckle in the weights centres scatter 1.6 to 2 times as far, and a stated σ is 3 to 4 times too small
+(docs/theory.md, section 5).
 """
 
 from __future__ import annotations
