@@ -138,13 +138,20 @@ class ArmSession:
             self._require_open()
             self.dashboard.ask("stop")
             unlock(self._name, self.dashboard, self._clock, confirmed, lambda: self._require_no_stop_since(stops))
-            self.link.close(_CLOSE_S)
-            self._on_broken(fault(self._name, "arm.program_stopped", "the arm was recovered"))
-            self._safing.join()
-            self.feed.forget()
-            self._reconnect(stops)
+            self._begin_anew(stops)
+            if not self.feed.fresh(0.1)[0].program_running:
+                # On a busy machine the new child may come too late for the controller's watchdog: once more.
+                self.statistics.count("started again")
+                self._begin_anew(stops)
             self.require_ready()
             self._require_model()
+
+    def _begin_anew(self, stops: int) -> None:
+        self.link.close(_CLOSE_S)
+        self._on_broken(fault(self._name, "arm.program_stopped", "the arm was recovered"))
+        self._safing.join()
+        self.feed.forget()
+        self._reconnect(stops)
 
     def _reconnect(self, stops: int) -> None:
         self._require_no_stop_since(stops)
