@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -45,3 +47,18 @@ def test_the_command_line_tells_its_release_and_completes(
         main()
     assert not end.value.code
     assert shown in capsys.readouterr().out
+
+
+def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path: Path) -> None:
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[assembly_cell.commands]\nbroken = no_such_module:register\n")
+    done = subprocess.run(
+        [sys.executable, "-c", "from cell.cli import main; main()", "abort", "--help"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},
+    )
+    assert done.returncode == 0
+    assert "the commands of no_such_module:register cannot be used" in done.stderr

@@ -49,6 +49,10 @@ def _cell(
 for register in (run.register, export.register, calibrate.register, devices.register, setup.register):
     register(app)
 app.add_typer(sim.app, name="sim")
-# Whole groups of commands that stand beside the product, such as the laboratory's, bring themselves.
+# Whole groups of commands that stand beside the product, such as the laboratory's, bring themselves. One that is broken
+# must not take `cell abort` with it.
 for group in sorted(entry_points(group=COMMANDS), key=lambda found: found.name):
-    group.load()(app)
+    try:
+        group.load()(app)
+    except Exception as error:
+        typer.echo(f"warning: the commands of {group.value} cannot be used: {error}", err=True)
