@@ -394,16 +394,23 @@ class Cell:
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
-        self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
+        self,
+        run: str | Path | None = None,
+        observer: Observer | None = None,
+        *,
+        at_start: bool = False,
+        script: Script = NO_SCRIPT,
     ) -> RunOutcome:
         """Do the job of a run that was aborted, faulted or cut short, as a new run; without `run` the newest.
 
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
-        the board has not moved. `at_start` as in `run`. Raises `ConfigError` when there is nothing to resume.
+        the board has not moved. `at_start` as in `run`. It ends after the same step as that run was to end; one that a
+        script looked at is resumed with its `script` only. Raises `ConfigError` when there is nothing to resume.
         """
-        before = UnfinishedRun.find(find_run(self.runs_folder, None if run is None else str(run), "job"))
-        info = {"resumed_from": before.folder.name}
-        return self._start(before.job, observer, info, before, at_start=at_start).result()
+        folder = find_run(self.runs_folder, None if run is None else str(run), "job")
+        before = UnfinishedRun.find(folder, scripted=not script.idle)
+        info, until = {"resumed_from": before.folder.name}, before.info.get("until")
+        return self._start(before.job, observer, info, before, at_start=at_start, until=until, script=script).result()
 
     def _start(
         self,
@@ -431,6 +438,9 @@ class Cell:
             if self.simulated is None:
                 raise
         info |= {**self._world(), **job_source(job)}
+        # A resumed run must end where this one was to end, and be looked at as this one was.
+        info |= {"until": until} if until is not None else {}
+        info |= {} if script.idle else {"scripted": True}
 
         def work(run: Run[RunOutcome]) -> RunOutcome:
             def note(text: str) -> None:

@@ -86,6 +86,7 @@ class Runner:
     _faults: list[FaultRecord] = field(default_factory=list, init=False)
     _error: BaseException | None = field(default=None, init=False)
     _abandoned: bool = field(default=False, init=False)
+    _ailment: Exception | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         missing = [name for name in self.sequence.steps if name not in self.steps]
@@ -305,6 +306,9 @@ class Runner:
         call = self._waiting.do(what, work, cut, self.policy.grace_s)
         if cause is None:
             return call, None
+        ailment, self._ailment = self._ailment, None
+        if ailment is not None:
+            self._trace(ailment)
         if not call.done.is_set():
             self._abandoned = True
             text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
@@ -345,8 +349,9 @@ class Runner:
         try:
             self.health()
         except Exception as error:
-            self._error = error
-            return self._judge(error)
+            # It is written down once the cell stands: a disk may stall.
+            self._error = self._ailment = error
+            return self._classified(error)
         return None
 
     def _hold(self) -> Failure | None:
@@ -374,8 +379,14 @@ class Runner:
     def _judge(self, error: BaseException) -> Failure:
         if isinstance(error, KeyboardInterrupt | SystemExit):
             return Failure(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
+        self._trace(error)
+        return self._classified(error)
+
+    def _trace(self, error: BaseException) -> None:
         text = "".join(traceback.format_exception(error))
         self.journal.event("traceback", str(self.sequence.state), {"text": text})
+
+    def _classified(self, error: BaseException) -> Failure:
         try:
             return self.classify(error)
         except Exception as second:

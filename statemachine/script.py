@@ -26,6 +26,11 @@ class Script:
     after: Mapping[str, Callable[[object], None]] = field(default_factory=dict)
     on_refusal: Callable[[str, Failure], Again | None] | None = None
 
+    @property
+    def idle(self) -> bool:
+        """Whether it does nothing at all."""
+        return not self.after and self.on_refusal is None
+
 
 NO_SCRIPT = Script()
 """Nobody looks between the steps, and a refusal ends the run."""

@@ -363,6 +363,25 @@ def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
     assert "reconstruct" not in bench.log
 
 
+def test_what_ails_the_cell_is_written_down_once_it_stands(tmp_path):
+    """A disk that stalls must not keep the arm moving."""
+
+    def health():
+        if bench.log[-1] == "laser_sweep":
+            raise ValueError("the vehicle reports a fault")
+
+    def event(kind, *rest):
+        if kind == "traceback":
+            bench.log.append("written")
+        write(kind, *rest)
+
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
+    write, bench.runner.journal.event = bench.runner.journal.event, event
+    bench.runner.health = health
+    assert bench.run().reason == "the vehicle reports a fault"
+    assert bench.log[3:5] == ["stop: the vehicle reports a fault", "written"]
+
+
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):
     def work(context):
         os.kill(os.getpid(), signal.SIGINT)

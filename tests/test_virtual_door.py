@@ -24,8 +24,9 @@ from cell.lab.bench.whole_job import JobRecord
 from cell.run.events import ConfirmNeeded, Held, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
-from drivers.errors import ConfigError
+from drivers.errors import Aborted, ConfigError
 from statemachine.journal import request
+from statemachine.script import Script
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -246,6 +247,32 @@ def test_an_aborted_run_is_resumed_through_the_same_door(
     assert command(monkeypatch, "resume", aborted.folder.name, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["outcome"], report["clock"], report["resumed_from"]) == ("placed", "virtual", aborted.folder.name)
+
+
+def test_a_resumed_run_ends_where_the_first_was_to_end() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml", until="board_photo")
+        upto(run, StepStarted, "board_photo")
+        run.abort("to be resumed")
+        aborted = run.result(60.0)
+        assert (aborted.outcome, aborted.report["until"]) == ("aborted", "board_photo")
+        resumed = cell.resume(aborted.folder)
+        assert (resumed.outcome, resumed.report["until"]) == ("done", "board_photo")
+        with pytest.raises(ConfigError, match="has ended done"):
+            cell.resume(resumed.folder)
+
+
+def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
+    def abort(result: object) -> None:
+        raise Aborted("to be resumed")
+
+    script = Script(after={"drive_to_target": abort})
+    with opened() as cell:
+        aborted = cell.run("pot.toml", script=script)
+        assert (aborted.outcome, aborted.report["scripted"]) == ("aborted", True)
+        with pytest.raises(ConfigError, match="was looked at by a script"):
+            cell.resume(aborted.folder)
+        assert cell.resume(aborted.folder, script=script).outcome == "aborted"
 
 
 def test_the_command_line_says_what_time_passed_here_and_there(

@@ -13,7 +13,7 @@ from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.step import JobStep
-from cell.steps.stored_sweep import save_sweep
+from cell.steps.stored_sweep import FILE, save_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
@@ -71,6 +71,8 @@ def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
 def _at(here: Workplace, context: StepContext) -> SweepRecord:
     """Not swept again what an earlier run has swept, if the board has not moved."""
     fix = context.made(BoardFix)
+    # One that is to be done again holds no more, should this run be cut short now.
+    (here.folder / FILE).unlink(missing_ok=True)
     if here.earlier is not None:
         try:
             sweep = here.earlier.confirmed_by(fix)
