@@ -96,6 +96,7 @@ class Cell:
         self._beginning = threading.Lock()
         self._run: Run[Any] | None = None
         self._stops = 0
+        self._stopped: Run[Any] | None = None
         self._closed = False
         self._signals = EndSignals()
 
@@ -209,11 +210,14 @@ class Cell:
         """End the run that is going on, and bring the whole cell to rest now, whatever it does.
 
         Laser off, vehicle stopped and braked, rail and arm stopped. Callable from any thread; the run then ends as
-        aborted. Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
+        aborted. One that had just come to a good end keeps its outcome and says `stopped_after_end`; the next job is
+        then not begun, once, and raises `Aborted`, so that a loop over jobs ends as well. Direct commands are held
+        until a person begins a run or calls `clear_stop`.
+        Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
         """
         with self._beginning:
             self._stops += 1
-            run = self.current
+            run = self._stopped = self.current
         if run is not None:
             run.abort("stopped with Cell.stop()")
         stop_cell(self.devices)
@@ -425,6 +429,12 @@ class Cell:
         script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         self._require_free()
+        stopped, self._stopped = self._stopped, None
+        if stopped is not None and stopped.control.late:
+            raise Aborted(
+                f"the cell was stopped as the {stopped.kind} before had just ended; nothing was begun. See that it is "
+                "safe, then begin the job again"
+            )
         stops = self._stops
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config, mesh)

@@ -44,9 +44,14 @@ class Gate:
         """This thread's work has ended; it is now as one that never entered."""
         self._entered.stops = self._entered.token = None
 
-    def clear(self) -> None:
-        """The stops so far keep no one any more but the work that they ended."""
-        self._cleared = self._stops
+    @property
+    def stops(self) -> int:
+        """How many there have been."""
+        return self._stops
+
+    def clear(self, stops: int | None = None) -> None:
+        """The stops so far, or the first `stops` of them, keep no one any more but the work that they ended."""
+        self._cleared = self._stops if stops is None else max(stops, self._cleared)
 
     def shut(self) -> None:
         """Bar all work that has entered so far. Comes before the devices are stopped."""
