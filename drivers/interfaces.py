@@ -254,7 +254,9 @@ class ArmState:
 class ArmMotion(Motion, Protocol):
     """A motion of the arm; `contact` tells whether a guarded motion ended because the force limit was met."""
 
-    contact: bool
+    @property
+    def contact(self) -> bool:
+        """Whether it ended at its force limit."""
 
 
 class Arm(Device, Protocol):
