@@ -125,8 +125,8 @@ class CellConfig(Table):
             make = self.make(name)
             if make.calibrated:
                 parts[name] = self.device(name).model_dump(include=set(make.calibrated))
-                if make not in BUILT_IN:
-                    parts[name] |= {"driver": f"{kind}.{make.name}"}
+            if make not in BUILT_IN:
+                parts[name] = {**parts.get(name, {}), "driver": f"{kind}.{make.name}"}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
