@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,11 +21,12 @@ from cell.devices.interlocks import Command
 from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
+from cell.job import job_path
 from cell.run.folder import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock
-from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
+from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser
 
 CONFIG = load_config(None)
@@ -432,6 +434,39 @@ def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell)
     cell.clear_stop("Anna")
     rail.move_to(0.02).wait(30.0)
     assert rail.state().position == pytest.approx(0.02, abs=1e-6)
+
+
+class ReadSlowly(os.PathLike[str]):
+    """A job's file that is read so slowly that a stop comes meanwhile."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+
+    def __fspath__(self) -> str:
+        self.cell.stop()
+        return str(job_path("pot"))
+
+
+def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> None:
+    stood = cell.devices.arm.state().joints
+    for begin in (
+        lambda job: cell.calibrate(job=job),
+        lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job),
+    ):
+        with pytest.raises(Aborted, match=r"was stopped before the .* began"):
+            begin(ReadSlowly(cell))
+    before = cell.stops
+    cell.stop()
+    with pytest.raises(Aborted, match="was stopped before the test began"):
+        cell.perform("test", lambda hands: None, stops=before)
+    assert np.array_equal(cell.devices.arm.state().joints, stood)
+
+
+def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(cell: Cell) -> None:
+    assert not cell.devices.vehicle.state().command_mode
+    cell.home("arm")
+    state = cell.devices.vehicle.state()
+    assert (state.command_mode, state.braked) == (True, True)
 
 
 def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(

@@ -24,8 +24,9 @@ from cell.lab.bench.whole_job import JobRecord
 from cell.run.events import ConfirmNeeded, Held, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, InterlockError
 from statemachine.journal import request
+from statemachine.script import Script
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -141,6 +142,25 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
     outcome = done((inject,))
     assert (outcome.outcome, outcome.report["code"]) == ("faulted", code)
     require_safe(dict(outcome.report))
+
+
+def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_the_run_is_not_forgotten() -> None:
+    with opened() as cell:
+        rail, moved = cell.devices.rail, []
+
+        def look(result: object) -> None:
+            rail.home().wait(60.0)
+            rail.move_to(0.01).wait(60.0)
+            moved.append(round(rail.state().position, 4))
+
+        cell.stop()
+        outcome = cell.run("pot.toml", script=Script(after={"drive_to_target": look}), until="drive_to_target")
+        assert (outcome.outcome, moved) == ("done", [0.01]), outcome.reason
+        with pytest.raises(InterlockError, match="after_a_stop"):
+            rail.move_to(0.02)
+        cell.clear_stop("Anna")
+        cell.run("pot.toml", until="drive_to_target")
+        rail.move_to(0.02).wait(60.0)
 
 
 @pytest.mark.parametrize("name", ["arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"])

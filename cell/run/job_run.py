@@ -161,7 +161,7 @@ class JobRun:
             )
             result = runner.run()
         good = result.outcome in (Outcome.PLACED, Outcome.DONE)
-        if good and open_before and self.run.control.token.reason is None:
+        if good and open_before:
             # The stop at the end of a good run keeps nobody from going on. One from before the run still does.
             self.devices.gate.clear()
         if result.outcome is not Outcome.PLACED:
