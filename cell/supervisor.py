@@ -96,6 +96,7 @@ class Cell:
         self._beginning = threading.Lock()
         self._run: Run[Any] | None = None
         self._stops = 0
+        self._stopped: Run[Any] | None = None
         self._closed = False
         self._signals = EndSignals()
 
@@ -209,11 +210,14 @@ class Cell:
         """End the run that is going on, and bring the whole cell to rest now, whatever it does.
 
         Laser off, vehicle stopped and braked, rail and arm stopped. Callable from any thread; the run then ends as
-        aborted. Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
+        aborted. One that had just come to a good end keeps its outcome and says `stopped_after_end`; the next job is
+        then not begun, once, and raises `Aborted`, so that a loop over jobs ends as well. Direct commands are held
+        until a person begins a run or calls `clear_stop`.
+        Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
         """
         with self._beginning:
             self._stops += 1
-            run = self.current
+            run = self._stopped = self.current
         if run is not None:
             run.abort("stopped with Cell.stop()")
         stop_cell(self.devices)
@@ -400,16 +404,23 @@ class Cell:
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
-        self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False
+        self,
+        run: str | Path | None = None,
+        observer: Observer | None = None,
+        *,
+        at_start: bool = False,
+        script: Script = NO_SCRIPT,
     ) -> RunOutcome:
         """Do the job of a run that was aborted, faulted or cut short, as a new run; without `run` the newest.
 
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
-        the board has not moved. `at_start` as in `run`. Raises `ConfigError` when there is nothing to resume.
+        the board has not moved. `at_start` as in `run`. It ends after the same step as that run was to end; one that a
+        script looked at is resumed with its `script` only. Raises `ConfigError` when there is nothing to resume.
         """
-        before = UnfinishedRun.find(find_run(self.runs_folder, None if run is None else str(run), "job"))
-        info = {"resumed_from": before.folder.name}
-        return self._start(before.job, observer, info, before, at_start=at_start).result()
+        folder = find_run(self.runs_folder, None if run is None else str(run), "job")
+        before = UnfinishedRun.find(folder, scripted=not script.idle)
+        info, until = {"resumed_from": before.folder.name}, before.info.get("until")
+        return self._start(before.job, observer, info, before, at_start=at_start, until=until, script=script).result()
 
     def _start(
         self,
@@ -424,6 +435,12 @@ class Cell:
         script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
         self._require_free()
+        stopped, self._stopped = self._stopped, None
+        if stopped is not None and stopped.control.late:
+            raise Aborted(
+                f"the cell was stopped as the {stopped.kind} before had just ended; nothing was begun. See that it is "
+                "safe, then begin the job again"
+            )
         stops = self._stops
         loaded, mesh = load_job(job)
         require_fit(loaded, self.config, mesh)
@@ -437,6 +454,9 @@ class Cell:
             if self.simulated is None:
                 raise
         info |= {**self._world(), **job_source(job)}
+        # A resumed run must end where this one was to end, and be looked at as this one was.
+        info |= {"until": until} if until is not None else {}
+        info |= {} if script.idle else {"scripted": True}
 
         def work(run: Run[RunOutcome]) -> RunOutcome:
             def note(text: str) -> None:

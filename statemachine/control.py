@@ -38,6 +38,8 @@ class RunControl:
         self.signal: int | None = None
         self.over = False
         """Set by the run once it has come to an end of its own."""
+        self.late = False
+        """Whether somebody asked to end the run when it had come to a good end already, or was just coming to it."""
         self._change = threading.Condition()
         self._paused = False
         self._wanted: str | None = None
@@ -50,6 +52,8 @@ class RunControl:
 
     def abort(self, reason: str, signal: int | None = None) -> None:
         """End the run as aborted: what moves is stopped at once. `signal` is the number of one that asked for it."""
+        if self.over:
+            self.late = True
         first = self.token.cancel(reason)
         # A signal after the run's own end still tells the program to end.
         if signal is not None and self.signal is None and (first or self.over):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -29,7 +30,7 @@ from statemachine.step import (
     StepContext,
     StepOverrun,
     StepRecord,
-    Summarised,
+    summary_of,
 )
 from statemachine.waiting import POLL_S, Waiting, waiting_on
 from statemachine.watch import Call, Clock, SignalWatch
@@ -86,6 +87,10 @@ class Runner:
     _faults: list[FaultRecord] = field(default_factory=list, init=False)
     _error: BaseException | None = field(default=None, init=False)
     _abandoned: bool = field(default=False, init=False)
+    _ailment: Exception | None = field(default=None, init=False)
+    _met: Exception | None = field(default=None, init=False)
+    _tries: int = field(default=1, init=False)
+    _decisions: Counter[str] = field(default_factory=Counter, init=False)
 
     def __post_init__(self) -> None:
         missing = [name for name in self.sequence.steps if name not in self.steps]
@@ -121,12 +126,13 @@ class Runner:
             return end
         self.sequence.fire(Trigger.START)
         while (state := self.sequence.state) in self.sequence.steps:
+            self._tries = 1
             end = self._hold() or self._perform(self.policy.of(state)) or self._after(state)
             if end is None:
                 self.sequence.facts.done.add(state)
                 self.sequence.fire(Trigger.NEXT)
             elif (end := self._again(state, end)) is not None:
-                self._note_fault(state, self._attempts(state), end, "ended the run")
+                self._note_fault(state, self._tries, end, "ended the run")
                 return end
         return None
 
@@ -142,6 +148,10 @@ class Runner:
         decide = self.script.on_refusal
         if decide is None or end.outcome is not Outcome.REFUSED:
             return end
+        if self._decisions[name] >= self.script.most:
+            text = f"{end.reason}; the script has decided about {name} {self.script.most} times, the most allowed"
+            return replace(end, reason=text)
+        self._decisions[name] += 1
         failed, chosen = self._scripted(name, lambda: decide(name, end))
         if failed is not None or not isinstance(chosen, Again):
             return failed or end
@@ -152,7 +162,7 @@ class Runner:
             return replace(end, reason=text)
         if (unsafe := self._stop(f"before {chosen.step} is done again", end)) is not None:
             return unsafe
-        self._note_fault(name, self._attempts(name), end, f"again from {chosen.step}")
+        self._note_fault(name, self._tries, end, f"again from {chosen.step}")
         self._tell(Event("decided", name, {"reason": end.reason, "again": chosen.step, "why": chosen.why}))
         for later in steps[steps.index(chosen.step) :]:
             self._results.pop(later, None)
@@ -248,6 +258,8 @@ class Runner:
 
     def _attempt(self, step: Step, attempt: int) -> Failure | None:
         """One try: None, or the end that it leads to unless it is repeated."""
+        self._tries = attempt
+        met, self._met = self._met, None
         started, begun = self.clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (self.clock.rate if step.on_wall else 1.0)
         context = StepContext(
@@ -256,7 +268,7 @@ class Runner:
         key = self.journal.step_started(step.name, attempt)
         self._tell(Event("step_started", step.name, {"attempt": attempt}))
         self._error = None
-        call, end = self._watch(step.name, lambda: self.steps[step.name](context), deadline, context.token, ailing=True)
+        call, end = self._watch(step.name, lambda: self._begin(context, met), deadline, context.token, ailing=True)
         context.token.cancel(f"{step.name} has ended")
         if end is None and call.error is not None:
             self._error = call.error
@@ -269,16 +281,25 @@ class Runner:
         before = self._records[step.name]
         wall = before.wall_s + time.monotonic() - begun
         state = "done" if end is None else "failed"
-        self._records[step.name] = StepRecord(step.name, state, before.duration_s + duration, attempt - 1, wall)
+        retries = before.retries + (attempt > 1)
+        self._records[step.name] = StepRecord(step.name, state, before.duration_s + duration, retries, wall)
         if end is not None:
             self.journal.step_ended(key, duration, error=end.reason)
             self._tell(Event("step_failed", step.name, {"attempt": attempt, "reason": end.reason}))
             return end
-        summary = dict(call.result.summary()) if isinstance(call.result, Summarised) else {}
+        summary = summary_of(call.result) or {}
         self._results[step.name] = call.result
         self.journal.step_ended(key, duration, summary)
         self._tell(Event("step_done", step.name, {"duration_s": duration, **summary}))
         return None
+
+    def _begin(self, context: StepContext, met: Exception | None) -> object:
+        """A step's work, in a cell that is well; what was `met` while the run was held fails the attempt here."""
+        if met is not None:
+            raise met
+        if self.health is not None:
+            self.health()
+        return self.steps[context.step.name](context)
 
     # --- watching ---
 
@@ -305,6 +326,9 @@ class Runner:
         call = self._waiting.do(what, work, cut, self.policy.grace_s)
         if cause is None:
             return call, None
+        ailment, self._ailment = self._ailment, None
+        if ailment is not None:
+            self._trace(ailment)
         if not call.done.is_set():
             self._abandoned = True
             text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
@@ -340,27 +364,34 @@ class Runner:
 
     def _ail(self) -> Failure | None:
         """What `health` raises, if anything."""
-        if self.health is None or self._polls % HEALTH_POLLS:
+        if self._polls % HEALTH_POLLS or (error := self._examine()) is None:
             return None
+        # It is written down once the cell stands: a disk may stall.
+        self._error = self._ailment = error
+        return self._classified(error)
+
+    def _examine(self) -> Exception | None:
         try:
-            self.health()
+            if self.health is not None:
+                self.health()
         except Exception as error:
-            self._error = error
-            return self._judge(error)
+            return error
         return None
 
     def _hold(self) -> Failure | None:
-        """Stay paused for as long as it is asked for."""
+        """Stay paused for as long as it is asked for and the cell is well; what ails it fails the next attempt."""
         end = self._ask()
         if end is None and self.control.paused():
             step = self.sequence.state
             self.sequence.fire(Trigger.PAUSE)
             self._tell(Event("paused", step, {"text": f"held before {step}"}))
-            while end is None and self.control.paused():
+            while end is None and self.control.paused() and self._met is None:
                 end = self._pause_briefly()
+                self._met = self._examine()
             if end is None:
                 self.sequence.fire(Trigger.RESUME)
-                self._tell(Event("going_on", step, {"text": "goes on"}))
+                text = "goes on" if self._met is None else f"held no longer: {self._met}"
+                self._tell(Event("going_on", step, {"text": text}))
         return end
 
     def _pause_briefly(self) -> Failure | None:
@@ -374,8 +405,14 @@ class Runner:
     def _judge(self, error: BaseException) -> Failure:
         if isinstance(error, KeyboardInterrupt | SystemExit):
             return Failure(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
+        self._trace(error)
+        return self._classified(error)
+
+    def _trace(self, error: BaseException) -> None:
         text = "".join(traceback.format_exception(error))
         self.journal.event("traceback", str(self.sequence.state), {"text": text})
+
+    def _classified(self, error: BaseException) -> Failure:
         try:
             return self.classify(error)
         except Exception as second:
@@ -407,8 +444,9 @@ class Runner:
         outcome = Outcome(self.sequence.success.value) if end is None else end.outcome
         reason = f"end of the run ({outcome.value})"
         # Whoever still works in an abandoned thread begins nothing any more.
-        self.control.token.cancel("the run has ended")
         self.control.over = True
+        if not self.control.token.cancel("the run has ended") and end is None:
+            self.control.late = True
         trouble = self._halt(reason)
         said = "all steps done" if end is None else end.reason
         if trouble is not None:
@@ -439,9 +477,6 @@ class Runner:
         if end.outcome is Outcome.ABORTED:
             return
         self._tell(Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy}))
-
-    def _attempts(self, name: str) -> int:
-        return self._records[name].retries + 1
 
     def _on_change(self, trigger: Trigger, source: str, target: str) -> None:
         self._tell(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))

@@ -20,11 +20,18 @@ class Again:
 class Script:
     """`after` maps a step's name to what is called with its result before the next step begins; what it raises ends
     the run as if the step had raised it. `on_refusal` is called with the name of the step that was refused and the
-    failure: it gives `Again`, or None to let the run end. Both run with the cell at rest, for as long as they like.
+    failure: it gives `Again`, or None to let the run end; after `most` decisions about one step the run ends without
+    asking. Both run with the cell at rest, for as long as they like.
     """
 
     after: Mapping[str, Callable[[object], None]] = field(default_factory=dict)
     on_refusal: Callable[[str, Failure], Again | None] | None = None
+    most: int = 3
+
+    @property
+    def idle(self) -> bool:
+        """Whether it does nothing at all."""
+        return not self.after and self.on_refusal is None
 
 
 NO_SCRIPT = Script()

@@ -27,6 +27,19 @@ class Summarised(Protocol):
         """JSON-ready figures."""
 
 
+def summary_of(made: object) -> dict[str, object] | None:
+    """What a step's result says for the journal and the report, None when it has nothing to say.
+
+    One whose summary fails says why: the step is done all the same.
+    """
+    if not isinstance(made, Summarised):
+        return None
+    try:
+        return {str(key): value for key, value in made.summary().items()}
+    except Exception as error:
+        return {"summary_missing": f"{type(error).__name__}: {error}"}
+
+
 @dataclass(frozen=True)
 class Event:
     """What an observer is told, with the time in seconds since the epoch.

@@ -93,6 +93,24 @@ def test_what_to_type_next_depends_on_the_end(ends: Ends, make: Make, words: str
     assert words in next(line for line in end_screen(run.report, run.folder) if line.startswith("next"))
 
 
+@pytest.mark.parametrize(
+    ("part", "words"), [("released", "look at the part, it is down"), ("unknown", "what has become")]
+)
+@pytest.mark.parametrize("outcome", ["refused", "faulted", "aborted", "not ended"])
+def test_whoever_has_lost_a_part_is_not_told_to_resume(tmp_path: Path, outcome: str, part: str, words: str) -> None:
+    report = {"outcome": outcome, "reason": "a link broke", "job": "pot", "part": part, "simulated": False}
+    text = "\n".join(end_screen(report, tmp_path))
+    assert words in text
+    assert "resume" not in text
+
+
+def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {"job": "pot"})
+    journal.event("note", "place", {"part": "unknown"})
+    journal.close()
+    assert read_report(tmp_path)["part"] == "unknown"
+
+
 def test_a_stale_calibration_asks_for_a_new_one(tmp_path: Path) -> None:
     report = {"outcome": "refused", "code": "CalibrationStale", "reason": "too old", "job": "pot", "simulated": False}
     assert "cell calibrate, then cell run -j pot" in "\n".join(end_screen(report, tmp_path))

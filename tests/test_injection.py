@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from cell.devices.injection import Injection
+from cell.devices.injection import Injection, Injector
 from cell.steps.kinds import PLACE
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceFault
 from sim_backends.direct import faults as direct
 from sim_backends.faults import FAULT_NAMES
+from statemachine.step import Event
 
 
 def test_a_scheduled_fault_is_written_as_fault_step_and_share() -> None:
@@ -38,6 +39,24 @@ def test_every_fault_that_is_known_can_be_scheduled_and_written_back() -> None:
 def test_what_cannot_be_scheduled_is_refused_with_what_can(text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         Injection.parse(text, PLACE.names)
+
+
+def test_what_was_scheduled_and_did_not_happen_is_told_and_keeps_no_other_from_happening() -> None:
+    caused: list[str] = []
+
+    def cause(name: str) -> None:
+        if name == "rail.reset":
+            raise DeviceFault("rail", "rail.gone", "the world does not answer", recoverable=False, hint="")
+        caused.append(name)
+
+    texts = ("rail.reset@laser_sweep:10%", "arm.protective_stop@laser_sweep:40%", "rail.reset@place:50%")
+    injector = Injector(cause, [Injection.parse(text, PLACE.names) for text in texts])
+    injector(Event("progress", "laser_sweep", {"fraction": 0.5}))
+    assert caused == ["arm.protective_stop"]
+    assert set(injector.missed) == {texts[0], texts[2]}
+    assert "could not be caused: " in injector.missed[texts[0]]
+    assert "the world does not answer" in injector.missed[texts[0]]
+    assert injector.missed[texts[2]] == "the run did not come that far"
 
 
 def test_the_door_without_wires_has_every_fault_but_those_of_a_wire() -> None:

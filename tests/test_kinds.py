@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from cell.steps import kinds
-from cell.steps.kinds import PLACE, find_kind
+from cell.steps.kinds import PLACE, Kind, find_kind
 from cell.steps.photograph import BoardFix
 from cell.steps.place import PlaceResult
 from cell.steps.step import JobStep
@@ -84,6 +86,43 @@ def test_a_step_finds_what_it_needs_by_type() -> None:
         context.made(PlaceResult)
 
 
+@dataclass(frozen=True)
+class Leaning(Tilt):
+    """A tilt that is one all the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed(PlaceResult):
+    """How another package places."""
+
+
+def test_what_a_step_makes_serves_whoever_needs_a_base_of_it() -> None:
+    lean = JobStep(Step("see_lean", 5.0), tilt, Leaning)
+    use = JobStep(Step("use_lean", 5.0), tilt, Placed, needs=(Tilt,))
+    assert Kind("leaning", (lean, use)).sequence().success == "placed"
+
+
+def test_a_step_that_made_something_else_has_failed() -> None:
+    site = cast(Any, SimpleNamespace())
+    site.devices = SimpleNamespace(gate=SimpleNamespace(enter=print), interlocks=SimpleNamespace(work_with=print))
+    site.calibration, site.mover = SimpleNamespace(configuration=""), SimpleNamespace()
+    site.frames = SimpleNamespace(begin=print)
+    work = Kind("promising", (JobStep(Step("see", 5.0), lambda here, context: 7, Tilt),)).work(site)["see"]
+    with pytest.raises(TypeError, match="step see made a int, not the Tilt it promises"):
+        work(StepContext(Step("see", 5.0), 1, 5.0, {}, Clock(), print))
+
+
+def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ends_the_program.py").write_text("import sys\nsys.exit(3)\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    installed = [EntryPoint("ends", "ends_the_program:KIND", kinds.GROUP)]
+    monkeypatch.setattr(kinds, "entry_points", lambda group: installed)
+    with pytest.raises(ConfigError, match="ends_the_program:KIND cannot be used: 3"):
+        find_kind("ends")
+
+
 class Bench:
     """Three steps, the second refuses as often as it is told to."""
 
@@ -144,6 +183,31 @@ def test_a_decision_for_a_step_that_was_not_reached_ends_the_run(tmp_path: Path)
     result = Bench(tmp_path, 1, Script(on_refusal=lambda step, failure: Again("place", "hurry"))).run()
     assert result.outcome is Outcome.REFUSED
     assert "chose to go on from 'place', allowed: photo, sweep" in result.reason
+
+
+def test_a_script_that_never_gives_up_is_asked_three_times_about_a_step(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def decide(step: str, failure: Failure) -> Again:
+        asked.append(step)
+        return Again("photo", "once more")
+
+    result = Bench(tmp_path, 99, Script(on_refusal=decide)).run()
+    assert asked == ["sweep"] * 3
+    assert result.outcome is Outcome.REFUSED
+    assert "has decided about sweep 3 times, the most allowed" in result.reason
+
+
+def test_retries_before_a_decision_are_counted_with_those_after_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, 5, Script(on_refusal=lambda step, failure: Again("sweep", "once more")))
+    bench.runner.policy = bench.runner.policy.with_step(Step("sweep", 5.0, 1, ("ValueError",)))
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    # Failed, retried; again: failed, retried; again: failed, retried, done.
+    assert [record.retries for record in result.steps] == [0, 3, 0]
+    assert [(fault.attempt, fault.remedy) for fault in result.faults] == [
+        (1, "tried again"), (2, "again from sweep"), (1, "tried again"), (2, "again from sweep"), (1, "tried again"),
+    ]  # fmt: skip
 
 
 def test_a_script_sees_each_result_before_the_next_step_and_may_refuse(tmp_path: Path) -> None:

@@ -114,8 +114,8 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     assert result.contact
     assert abs(result.depth_error) < JOB.place.contact_travel
     assert not site.held
-    assert site.noted == [PartState.RELEASED]
-    assert above[0] == pytest.approx(0.0, abs=JOB.place.contact_travel)
+    assert site.noted == [PartState.UNKNOWN, PartState.RELEASED], "known before the claw is told, and after"
+    assert above == pytest.approx([0.0, 0.0], abs=JOB.place.contact_travel)
     assert max(site.forces) < 3 * JOB.place.contact_force
     assert site.cell.world.collisions.found == ()
     where = site.part.where
@@ -179,8 +179,13 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
 
 def test_a_fault_after_the_release_says_that_the_part_is_down() -> None:
     site = Site()
+
+    def note(part: PartProgress) -> None:
+        if part.state is PartState.RELEASED:
+            site.cell.world.arm.fault("protective_stop")
+
     with pytest.raises(DeviceError) as caught:
-        site.place(note=lambda part: site.cell.world.arm.fault("protective_stop"))
+        site.place(note=note)
     assert not site.held
     assert site.part.state is PartState.RELEASED
     told = site.part.told(str(caught.value))
@@ -196,7 +201,19 @@ def test_a_release_that_is_not_confirmed_leaves_the_part_unknown() -> None:
         site.place(claw=miswired)
     assert site.part.state is PartState.UNKNOWN
     assert "look whether it did" in site.part.told(str(caught.value))
-    assert site.noted == []
+    assert site.noted == [PartState.UNKNOWN]
+
+
+def test_nothing_is_placed_twice_and_nothing_moves_for_it() -> None:
+    site = Site()
+    site.place()
+    before = site.arm.state().joints
+    with pytest.raises(RefusedError, match="the part is released, not held: nothing is placed a second time"):
+        site.place()
+    assert np.array_equal(site.arm.state().joints, before), "nothing has moved"
+    told = site.part.told("a later step failed")
+    assert told.startswith("the part is already down")
+    assert "retreat" not in told
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
@@ -209,5 +226,23 @@ def test_a_run_that_has_put_its_part_down_is_not_resumed(tmp_path: Path) -> None
     journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
     journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
     journal.close()
-    with pytest.raises(ConfigError, match="had put its part down already"):
+    with pytest.raises(ConfigError, match="had put its part down already, only the retreat failed"):
+        UnfinishedRun.find(tmp_path)
+
+
+def test_a_run_that_failed_in_a_later_step_does_not_blame_the_retreat(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
+    key = journal.step_started("place", 1)
+    journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
+    journal.step_ended(key, 1.0, {})
+    journal.close()
+    with pytest.raises(ConfigError, match="what came after that failed"):
+        UnfinishedRun.find(tmp_path)
+
+
+def test_a_run_that_was_killed_while_the_claw_released_is_not_resumed(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
+    journal.event("note", "place", {"part": "unknown", "base_from_part": [0.0] * 6})
+    journal.close()
+    with pytest.raises(ConfigError, match="Look what has become of the part"):
         UnfinishedRun.find(tmp_path)

@@ -186,6 +186,8 @@ def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp
         write_json(tmp_path / "x.json", {"value": float("inf")})
     assert not list(tmp_path.glob("x*"))
     assert strict({"a": (np.float32(1.5), np.int64(2), float("-inf"))}) == {"a": [1.5, 2, None]}
+    # What a foreign step may have said.
+    assert strict({"at": np.array([[1.0, np.nan]]), "file": Path("x")}) == {"at": [[1.0, None]], "file": "x"}
 
 
 # --- docs/report.md ---
@@ -233,7 +235,10 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
     reports = [placed.report, two_sweeps.report, *(ends(make).report for make in others)]
     found = set().union(*(keys(report) for report in reports))
     # What other places of the program add, each only where something out of the ordinary was asked for or went wrong.
-    elsewhere = {"injected", "resumed_from", "frames_missing", "truth_missing", "picture_missing"}
+    elsewhere = {
+        "injected", "not_injected", "not_injected[].fault", "not_injected[].why", "until", "scripted", "resumed_from",
+        "frames_missing", "truth_missing", "picture_missing",
+    }  # fmt: skip
     assert found - documented() == set()
     parents = {key for key in documented() if any(other.startswith((f"{key}.", f"{key}[")) for other in found)}
     assert documented() - found - parents == elsewhere

@@ -66,9 +66,11 @@ def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
         "job_file": str(job), "job_hash": job_hash(job), "simulated": False,
         "configuration_hash": CONFIG.calibration_hash(), "calibration_hash": CALIBRATION.hash(), **other,
     }  # fmt: skip
-    Journal(run, "run", info).close()
+    journal = Journal(run, "run", info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    journal.close()
     (run / FILE).write_bytes(b"")
-    return UnfinishedRun.find(run), job
+    return UnfinishedRun.find(run, scripted=True), job
 
 
 @pytest.mark.parametrize("name", ["pot.toml", "pot.stl"])
@@ -97,3 +99,41 @@ def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
     sweep, why = run.sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None
     assert said in why
+
+
+def test_a_sweep_that_a_script_rejected_is_not_used(tmp_path: Path) -> None:
+    run, job = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    journal.event("decided", "invert_pose", {"reason": "too few points", "again": "board_photo", "why": "wiped"})
+    journal.close()
+    sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
+    assert sweep is None
+    assert "had not finished its sweep" in why
+
+
+def test_a_sweep_that_was_begun_again_is_not_used(tmp_path: Path) -> None:
+    run, job = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    journal.step_started("laser_sweep", 1)
+    journal.close()
+    sweep, _ = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
+    assert sweep is None
+
+
+@pytest.mark.parametrize("outcome", ["placed", "done", "refused"])
+def test_a_run_that_came_to_its_end_is_not_resumed(tmp_path: Path, outcome: str) -> None:
+    """One that was to end after a step would drive on and place."""
+    journal = Journal(tmp_path, "run", {"until": "invert_pose"})
+    journal.run_ended(outcome, "all steps done")
+    journal.close()
+    with pytest.raises(ConfigError, match=f"has ended {outcome}"):
+        UnfinishedRun.find(tmp_path)
+
+
+def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only(tmp_path: Path) -> None:
+    run, _ = cut_short(tmp_path, scripted=True)
+    assert run.info["scripted"]
+    with pytest.raises(ConfigError, match="was looked at by a script"):
+        UnfinishedRun.find(run.folder)

@@ -353,7 +353,7 @@ def outlived(number):
 
 def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
     def health():
-        if bench.log[-1] == "laser_sweep":
+        if bench.log[-1:] == ["laser_sweep"]:
             raise ValueError("the vehicle reports a fault")
 
     bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
@@ -361,6 +361,96 @@ def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
     result = bench.run()
     assert (result.outcome, result.reason) == (Outcome.REFUSED, "the vehicle reports a fault")
     assert "reconstruct" not in bench.log
+
+
+def test_what_ails_the_cell_is_written_down_once_it_stands(tmp_path):
+    """A disk that stalls must not keep the arm moving."""
+
+    def health():
+        if bench.log[-1:] == ["laser_sweep"]:
+            raise ValueError("the vehicle reports a fault")
+
+    def event(kind, *rest):
+        if kind == "traceback":
+            bench.log.append("written")
+        write(kind, *rest)
+
+    bench = Bench(tmp_path, laser_sweep=lambda context: bench.stopped.wait(5))
+    write, bench.runner.journal.event = bench.runner.journal.event, event
+    bench.runner.health = health
+    assert bench.run().reason == "the vehicle reports a fault"
+    assert bench.log[3:5] == ["stop: the vehicle reports a fault", "written"]
+
+
+def test_an_ailing_cell_is_found_before_an_attempt_begins(tmp_path):
+    def health():
+        raise ValueError("the emergency stop is pressed")
+
+    bench = Bench(tmp_path)
+    bench.runner.health = health
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.REFUSED, "the emergency stop is pressed")
+    assert "drive_to_target" not in bench.log
+
+
+def test_a_fault_while_the_run_is_held_is_recovered_and_the_run_is_held_again(tmp_path):
+    ails = threading.Event()
+    log = []
+
+    def health():
+        if ails.is_set():
+            raise ConnectionError("protective stop")
+
+    def pause(context):
+        bench.runner.control.pause()
+        ails.set()
+
+    def recover(error, token, confirmed):
+        ails.clear()
+        log.append(bench.log.count("laser_sweep"))
+        threading.Timer(0.2, go_on).start()
+
+    def go_on():
+        log.append(bench.log.count("laser_sweep"))
+        bench.runner.control.go_on()
+
+    bench = Bench(tmp_path, board_photo=pause)
+    bench.runner.health, bench.runner.recover = health, recover
+    # board_photo ends before its health is looked at again.
+    result = bench.run()
+    assert result.outcome is Outcome.PLACED
+    assert log == [0, 0], "nothing began while the run was to be held"
+    assert [(fault.step, fault.remedy) for fault in result.faults] == [("laser_sweep", "recovered")]
+    assert sum(event.kind == "paused" for event in bench.events) == 2
+
+
+def test_a_summary_that_fails_does_not_undo_what_was_done(tmp_path):
+    class Photo:
+        def summary(self):
+            raise ZeroDivisionError("no dots")
+
+    bench = Bench(tmp_path, place=lambda context: Photo())
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.record.done["place"] == {"summary_missing": "ZeroDivisionError: no dots"}
+
+
+def test_who_asks_for_the_end_as_a_run_comes_to_a_good_one_is_not_lost(tmp_path):
+    bench = Bench(tmp_path)
+    stop = bench.runner.safe_stop
+
+    def asked_meanwhile(reason):
+        bench.runner.control.abort("Cell.stop()")
+        stop(reason)
+
+    bench.runner.safe_stop = asked_meanwhile
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.runner.control.late
+
+
+def test_who_ended_a_run_did_not_come_late(tmp_path):
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.abort("enough"))
+    assert bench.run().outcome is Outcome.ABORTED
+    assert not bench.runner.control.late
 
 
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):

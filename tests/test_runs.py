@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
+from cell.cli.run import abort
 from cell.config import CellConfig, default_toml, load_config
 from cell.run.folder import (
     CellLock,
@@ -171,6 +172,36 @@ def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="more than one is going on"):
         find_going(root, None)
     assert find_going(root, two[0].name) == two[0]
+
+
+def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    job = new_run(root)
+    Journal(job, job.name, {"kind": "job", "pid": os.getpid()})
+    maintenance = new_run(root)
+    Journal(maintenance, maintenance.name, {"kind": "maintenance", "pid": os.getpid()})
+    assert is_going(maintenance)
+    assert find_going(root, None) == job
+    with pytest.raises(ConfigError, match="nothing is going on there"):
+        find_going(root, maintenance.name)
+
+
+def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "runs"
+    going = [new_run(root), new_run(root)]
+    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
+    first = min(going)
+    base = sqlite3.connect(first / "journal.sqlite")
+    base.execute("DROP TABLE requests")
+    base.commit()
+    base.close()
+    with pytest.raises(ConfigError, match=f"not asked to end: .*{first.name}"):
+        abort()
+    other = journals[going.index(max(going))]
+    assert [request.kind for request in other.take_requests()] == ["abort"]
 
 
 def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:

@@ -19,14 +19,16 @@ import pytest
 from cell import Cell
 from cell.calibration.store import save_calibration
 from cell.cli import main
+from cell.devices.direct import VirtualCell
 from cell.job import job_path
 from cell.lab.bench.whole_job import JobRecord
-from cell.run.events import ConfirmNeeded, Held, RunEvent, StepStarted
+from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
-from drivers.errors import ConfigError, InterlockError
+from drivers.errors import Aborted, ConfigError, InterlockError
 from statemachine.journal import request
 from statemachine.script import Script
+from statemachine.step import Event
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -109,6 +111,22 @@ def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -
     )
     assert (report["clock"], report["wall_s"], report["pid"]) == ("virtual", None, None)
     assert report["truth"]["error_mm"]["d"]["mean"] < 3 * report["truth"]["bound_mm"]
+
+
+def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() -> None:
+    with opened(confirm="simulated") as cell:
+
+        def push(event: Event) -> None:
+            if event.kind == "recovered" or (event.kind == "state" and event.data["trigger"] == "recovered"):
+                assert isinstance(cell.simulated, VirtualCell)
+                cell.simulated.world.vehicle._x += 0.01
+
+        run = cell.start("pot.toml", inject=[STOP])
+        tell = run.tell
+        run.tell = lambda event: (push(event), tell(event))[1]  # type: ignore[method-assign]
+        outcome = run.result(120.0)
+    assert outcome.outcome == "refused"
+    assert re.search(r"the board has moved by \d+\.\d+ mm .* since it was photographed", outcome.reason)
 
 
 def test_it_takes_the_course_of_another_seed_otherwise() -> None:
@@ -230,6 +248,25 @@ def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str) -> None:
     require_safe(dict(outcome.report))
 
 
+def test_a_stop_after_a_good_end_is_kept_and_the_next_job_is_not_begun() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml", until="drive_to_target")
+        for event in run.events():
+            if isinstance(event, RunEnded):
+                # Its report is still to be written.
+                cell.stop()
+                break
+        outcome = run.result(60.0)
+        assert (outcome.outcome, outcome.stopped_after_end) == ("done", True)
+        with pytest.raises(InterlockError, match="was stopped, and nothing begins"):
+            cell.devices.rail.home()
+        with pytest.raises(Aborted, match="stopped as the job before had just ended"):
+            cell.run("pot.toml", until="drive_to_target")
+        # A person who begins it again has seen that.
+        again = cell.run("pot.toml", until="drive_to_target")
+        assert (again.outcome, again.stopped_after_end) == ("done", False)
+
+
 def test_a_paused_run_stands_until_it_goes_on() -> None:
     with opened() as cell:
         run = cell.start("pot.toml")
@@ -266,6 +303,32 @@ def test_an_aborted_run_is_resumed_through_the_same_door(
     assert command(monkeypatch, "resume", aborted.folder.name, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["outcome"], report["clock"], report["resumed_from"]) == ("placed", "virtual", aborted.folder.name)
+
+
+def test_a_resumed_run_ends_where_the_first_was_to_end() -> None:
+    with opened() as cell:
+        run = cell.start("pot.toml", until="board_photo")
+        upto(run, StepStarted, "board_photo")
+        run.abort("to be resumed")
+        aborted = run.result(60.0)
+        assert (aborted.outcome, aborted.report["until"]) == ("aborted", "board_photo")
+        resumed = cell.resume(aborted.folder)
+        assert (resumed.outcome, resumed.report["until"]) == ("done", "board_photo")
+        with pytest.raises(ConfigError, match="has ended done"):
+            cell.resume(resumed.folder)
+
+
+def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
+    def abort(result: object) -> None:
+        raise Aborted("to be resumed")
+
+    script = Script(after={"drive_to_target": abort})
+    with opened() as cell:
+        aborted = cell.run("pot.toml", script=script)
+        assert (aborted.outcome, aborted.report["scripted"]) == ("aborted", True)
+        with pytest.raises(ConfigError, match="was looked at by a script"):
+            cell.resume(aborted.folder)
+        assert cell.resume(aborted.folder, script=script).outcome == "aborted"
 
 
 def test_the_command_line_says_what_time_passed_here_and_there(

@@ -183,14 +183,21 @@ def abort(
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
-    from cell.run.folder import is_going, list_runs
+    from cell.run.folder import list_runs, listens
+    from drivers.errors import ConfigError
 
-    going = [run for run in list_runs(_going_folder(config)) if is_going(run)] if name is None else []
+    going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:
         _ask(name, config, "abort", reason, "asked {} to end")
     # Whoever says stop does not choose: everything that goes on here ends.
+    unasked = []
     for run in going:
-        _ask(str(run), config, "abort", reason, "asked {} to end")
+        try:
+            _ask(str(run), config, "abort", reason, "asked {} to end")
+        except ConfigError as error:
+            unasked.append(str(error))
+    if unasked:
+        raise ConfigError("not asked to end: " + "; ".join(unasked))
 
 
 def pause(name: RunArgument = None, config: ConfigOption = None) -> None:

@@ -57,9 +57,14 @@ class Gate:
         finally:
             self._entered.stops, self._entered.token = outer
 
-    def clear(self) -> None:
-        """The stops so far keep no one any more but the work that they ended."""
-        self._cleared = self._stops
+    @property
+    def stops(self) -> int:
+        """How many there have been."""
+        return self._stops
+
+    def clear(self, stops: int | None = None) -> None:
+        """The stops so far, or the first `stops` of them, keep no one any more but the work that they ended."""
+        self._cleared = self._stops if stops is None else max(stops, self._cleared)
 
     @property
     def is_open(self) -> bool:

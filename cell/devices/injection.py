@@ -44,11 +44,15 @@ class Injection:
 
 
 class Injector:
-    """An observer of a run that causes each fault once, by `cause(name)`."""
+    """An observer of a run that causes each fault once, by `cause(name)`.
+
+    `missed` has what was scheduled and did not happen: not reached, or not to be caused, and why.
+    """
 
     def __init__(self, cause: Callable[[str], None], injections: Sequence[Injection]) -> None:
         self._cause = cause
         self._waiting = list(injections)
+        self._failed: dict[Injection, str] = {}
 
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""
@@ -64,4 +68,14 @@ class Injector:
         for injection in list(self._waiting):
             if injection.step == event.step and fraction >= injection.fraction:
                 self._waiting.remove(injection)
-                self._cause(injection.fault)
+                try:
+                    self._cause(injection.fault)
+                # The others are still to happen, and the report tells of this one.
+                except Exception as error:
+                    self._failed[injection] = f"could not be caused: {error}"
+
+    @property
+    def missed(self) -> dict[str, str]:
+        """Why each fault that did not happen did not."""
+        early = {str(injection): "the run did not come that far" for injection in self._waiting}
+        return early | {str(injection): why for injection, why in self._failed.items()}

@@ -27,7 +27,7 @@ from cell.steps.sweep_record import SweepRecord
 from cell.version import release
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
-from statemachine.step import Summarised
+from statemachine.step import summary_of
 
 log = logging.getLogger(__name__)
 
@@ -106,22 +106,24 @@ def _write(folder: Path, report: dict[str, Any]) -> None:
     """The report as a file; a disk that takes none of it does not hide how the run ended."""
     try:
         write_json(folder / REPORT, report)
-    except OSError as error:
+    except Exception as error:
         report["report_missing"] = f"{type(error).__name__}: {error}"
         log.error("the report could not be written: %s", error)
 
 
 def strict(data: Any) -> Any:
-    """The same data as strict JSON has it: a number that is none becomes None."""
+    """The same data as strict JSON has it: a number that is none becomes None, what JSON does not know becomes text."""
     if isinstance(data, dict):
         return {str(key): strict(value) for key, value in data.items()}
     if isinstance(data, list | tuple):
         return [strict(value) for value in data]
+    if isinstance(data, np.ndarray):
+        return strict(data.tolist())
     if isinstance(data, np.generic):
         return strict(data.item())
     if isinstance(data, float) and not math.isfinite(data):
         return None
-    return data
+    return data if data is None or isinstance(data, str | int | float) else str(data)
 
 
 def _steps(result: RunResult) -> list[dict[str, Any]]:
@@ -135,7 +137,7 @@ def _steps(result: RunResult) -> list[dict[str, Any]]:
                 "duration_s": round(step.duration_s, 3),
                 "wall_s": round(step.wall_s, 3),
                 "retries": step.retries,
-                "result": dict(made.summary()) if isinstance(made, Summarised) else None,
+                "result": summary_of(made),
             }
         )
     return rows

@@ -64,10 +64,10 @@ def find_going(root: Path, name: str | None) -> Path:
     """The run that is going on below `root`, by name or the only one; `ConfigError` that says what there is instead."""
     if name is not None:
         folder = find_run(root, name)
-        if not is_going(folder):
+        if not listens(folder):
             raise ConfigError(f"run {folder.name} has ended already, or its process died; nothing is going on there")
         return folder
-    going = [folder for folder in list_runs(root) if is_going(folder)]
+    going = [folder for folder in list_runs(root) if listens(folder)]
     if len(going) == 1:
         return going[0]
     if going:
@@ -86,6 +86,11 @@ def is_going(folder: Path) -> bool:
     except (JournalError, ValueError, TypeError):
         return False
     return run.ended is None and _lives(run.pid, run.started)
+
+
+def listens(folder: Path) -> bool:
+    """Whether a run is going on that takes requests: nobody works in a time of maintenance, it is only recorded."""
+    return is_going(folder) and _info(folder).get("kind", "job") != "maintenance"
 
 
 def _lives(pid: object, since: float) -> bool:
@@ -171,6 +176,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
     run = record.run
     waits = _awaited(record)
     going = "the run is still going on, or its process died" if waits is None else f"waits for a person, {waits}"
+    part = [event.data["part"] for event in record.events if event.kind == "note" and "part" in event.data]
     steps: dict[str, dict[str, Any]] = {}
     for row in record.steps:
         before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
@@ -191,6 +197,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
         "wall_s": None if run.ended is None else round(run.ended - run.started, 2),
         "pid": run.pid,
         "steps": list(steps.values()),
+        **({"part": part[-1]} if part else {}),
         **run.info,
     }
 

@@ -13,6 +13,7 @@ from typing import Any
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
 from cell.devices.devices import Devices
+from cell.devices.injection import Injector
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
 from cell.job import Job
@@ -73,6 +74,11 @@ class RunOutcome:
     def interrupted(self) -> bool:
         """Whether a signal has asked the program to end since the run began."""
         return self.control.signal is not None
+
+    @property
+    def stopped_after_end(self) -> bool:
+        """Whether somebody stopped the cell, or asked to end the run, after the outcome was decided."""
+        return self.control.late
 
     @property
     def exit_code(self) -> int:
@@ -162,12 +168,19 @@ class JobRun:
             result = runner.run()
         good = result.outcome in (Outcome.PLACED, Outcome.DONE)
         if good and open_before:
-            # The stop at the end of a good run keeps nobody from going on. One from before the run still does.
-            self.devices.gate.clear()
+            # The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
+            # that a person asked for meanwhile.
+            stops = self.devices.gate.stops
+            if not self.run.control.late:
+                self.devices.gate.clear(stops)
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
         cell_s = round(self.devices.clock.now() - begun, 3)
         facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
+        if missed := {
+            name: why for each in self.inline if isinstance(each, Injector) for name, why in each.missed.items()
+        }:
+            facts["not_injected"] = [{"fault": name, "why": why} for name, why in missed.items()]
         report = make_report(
             folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip

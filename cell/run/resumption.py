@@ -10,47 +10,57 @@ from typing import Any
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
 from cell.job import Job, job_path, load_job
+from cell.steps import laser_sweep
+from cell.steps.part import PartState
 from cell.steps.stored_sweep import FILE, StoredSweep
 from drivers.errors import ConfigError, RefusedError
-from statemachine.journal import JournalError, read
+from statemachine.journal import JournalError, Record, read
 
 
 @dataclass(frozen=True)
 class UnfinishedRun:
-    """A run that did not come to its end: its folder, its job, and what its journal says of it."""
+    """A run that did not come to its end: its folder, its job, and what its journal says of it.
+
+    `swept` tells whether its last sweep was finished, and not decided to be done again.
+    """
 
     folder: Path
     job: str
     info: dict[str, Any]
+    swept: bool
 
     @classmethod
-    def find(cls, folder: Path) -> UnfinishedRun:
-        """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now."""
+    def find(cls, folder: Path, *, scripted: bool = False) -> UnfinishedRun:
+        """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now.
+
+        A run that a script looked at is only found for one that is `scripted` as well.
+        """
         try:
             record = read(folder)
         except JournalError as error:
             raise ConfigError(f"{folder} cannot be resumed: {error}") from error
         run = record.run
-        if run.outcome in ("placed", "refused"):
+        if run.outcome in ("placed", "done", "refused"):
             raise ConfigError(
                 f"run {folder.name} has ended {run.outcome} ({run.reason}); only a run that was aborted, faulted or "
                 "cut short can be resumed. Run its job again"
             )
-        if any(event.kind == "note" and event.data.get("part") == "released" for event in record.events):
+        _require_held(folder, record)
+        if run.info.get("scripted") and not scripted:
             raise ConfigError(
-                f"run {folder.name} had put its part down already, only the retreat failed: there is nothing to "
-                "resume. Look at the part, fold the arm with `cell home`, then run the job with the next part"
+                f"run {folder.name} was looked at by a script between its steps: without it, it is not resumed. Call "
+                "Cell.resume with that script, or run the job again"
             )
         if "job_file" not in run.info:
             raise ConfigError(f"run {folder.name} does not say which file its job was; run the job again")
         job, told = run.info["job_file"], run.info["job_hash"]
         if job_hash(job) != told:
             raise ConfigError(f"{job} or its mesh was changed since run {folder.name}; run the job again")
-        return cls(folder, job, run.info)
+        return cls(folder, job, run.info, _swept(record))
 
     def sweep(self, job: Job, config: CellConfig, calibration: CellCalibration) -> tuple[StoredSweep | None, str]:
         """The run's sweep, or None, and why it is or is not used; whether the station moved is seen later."""
-        if not (self.folder / FILE).exists():
+        if not self.swept or not (self.folder / FILE).exists():
             return None, f"run {self.folder.name} had not finished its sweep"
         if self.info["simulated"]:
             return None, "the simulated world of that run has ended"
@@ -63,6 +73,32 @@ class UnfinishedRun:
         except RefusedError as error:
             return None, str(error)
         return stored, f"the sweep of run {self.folder.name} is used if the board has not moved"
+
+
+def _require_held(folder: Path, record: Record) -> None:
+    """`ConfigError` when the part is not in the claw any more, or may not be."""
+    told = [event for event in record.events if event.kind == "note" and "part" in event.data]
+    match told[-1].data["part"] if told else PartState.HELD.value:
+        case PartState.RELEASED.value:
+            failed = "what came after that" if told[-1].step in record.done else "only the retreat"
+            raise ConfigError(
+                f"run {folder.name} had put its part down already, {failed} failed: there is nothing to resume. Look "
+                "at the part, fold the arm with `cell home`, then run the job with the next part"
+            )
+        case PartState.UNKNOWN.value:
+            raise ConfigError(
+                f"run {folder.name} ended while the claw was releasing its part: whether it did is not known, and it "
+                "is not resumed. Look what has become of the part, fold the arm with `cell home`, then run the job "
+                "with a part in the claw"
+            )
+
+
+def _swept(record: Record) -> bool:
+    sweeps = [step for step in record.steps if step.name == laser_sweep.STEP.name]
+    if not sweeps or sweeps[-1].state != "done" or sweeps[-1].ended is None:
+        return False
+    # Whatever a script had done again after it, it was not content with what came of the sweep.
+    return not any(event.kind == "decided" and event.at >= sweeps[-1].ended for event in record.events)
 
 
 def job_source(name: str | Path) -> dict[str, object]:

@@ -33,7 +33,7 @@ class Kind:
         self.sequence()
         made: set[type] = set()
         for step in self.steps:
-            if missing := [need.__name__ for need in step.needs if need not in made]:
+            if missing := [need.__name__ for need in step.needs if not any(issubclass(m, need) for m in made)]:
                 raise ValueError(f"step {step.name} needs {', '.join(missing)}, which no step before it makes")
             made.add(step.makes)
 
@@ -44,7 +44,7 @@ class Kind:
 
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
-        places = any(step.makes is place.PlaceResult for step in self.steps)
+        places = any(issubclass(step.makes, place.PlaceResult) for step in self.steps)
         return Sequence(self.names, State.PLACED if places else State.DONE)
 
     def policy(self, *, simulated_person: bool = False) -> Policy:
@@ -79,7 +79,11 @@ def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
     here.devices.interlocks.work_with(here.calibration.configuration)
     here.mover.hold = context.safe_point
     here.frames.begin()
-    return step.work(here, context)
+    result = step.work(here, context)
+    # What a later step finds by this type, and whether the job ends placed, rests on it.
+    if not isinstance(result, step.makes):
+        raise TypeError(f"step {step.name} made a {type(result).__name__}, not the {step.makes.__name__} it promises")
+    return result
 
 
 PLACE = Kind(
@@ -105,7 +109,8 @@ def find_kind(name: str) -> Kind:
         raise ConfigError(f'job.kind "{name}": there is no such kind of job; installed: {known}')
     try:
         kind = found[name].load()
-    except Exception as error:
+    # Also a module that ends the program when it is imported.
+    except (Exception, SystemExit) as error:
         raise ConfigError(f'job.kind "{name}": {found[name].value} cannot be used: {error}') from error
     if not isinstance(kind, Kind):
         raise ConfigError(f'job.kind "{name}": {found[name].value} is a {type(kind).__name__}, no kind of job')

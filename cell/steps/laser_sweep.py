@@ -8,16 +8,17 @@ from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
-from cell.steps.camera_poses import ScanPlan, scan_plans
+from cell.steps.board_photo import board_photo
+from cell.steps.camera_poses import ScanPlan, photo_pose, scan_plans
 from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.step import JobStep
-from cell.steps.stored_sweep import save_sweep
+from cell.steps.stored_sweep import FILE, moved_by, save_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
-from cell.steps.workplace import Workplace
-from drivers.errors import CalibrationStale
+from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame
 from statemachine.policy import Step
 from statemachine.runner import StepContext
@@ -71,6 +72,10 @@ def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
 def _at(here: Workplace, context: StepContext) -> SweepRecord:
     """Not swept again what an earlier run has swept, if the board has not moved."""
     fix = context.made(BoardFix)
+    # One that is to be done again holds no more, should this run be cut short now.
+    (here.folder / FILE).unlink(missing_ok=True)
+    if context.attempt > 1:
+        _require_unmoved(here, context, fix)
     if here.earlier is not None:
         try:
             sweep = here.earlier.confirmed_by(fix)
@@ -83,6 +88,21 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     sweep = _sweep(here, context, fix)
     save_sweep(here.folder, sweep, fix)
     return sweep
+
+
+def _require_unmoved(here: Workplace, context: StepContext, fix: BoardFix) -> None:
+    """After a fault the arm's base may stand elsewhere: photograph the board again. `RefusedError` if it does."""
+    goal = photo_pose(here.job, here.board, fix.base_from_board, here.calibration.target.flange_from_camera)
+    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    now = board_photo(
+        goal, here.mover, here.photograph, here.job.photo.count, lambda share, text: context.progress(0.0, text)
+    )
+    if (moved := moved_by(now, fix.base_from_board, fix.covariance)) is not None:
+        raise RefusedError(
+            f"the board has moved by {moved} since it was photographed, before the fault that ended the sweep. See "
+            "that the vehicle and the station stand firm, then run the job again"
+        )
+    context.note(text="the board has not moved since the fault")
 
 
 def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:

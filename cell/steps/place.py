@@ -60,11 +60,14 @@ def place(
     """Put the part onto the surface whose pose was measured.
 
     Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
-    `contact_force`; afterwards the arm folds. `part` follows what becomes of the part; `note` is called as soon as it
-    is released, before anything else is done.
-    Raises `RefusedError`, with the part still held and lifted, when contact comes too early, that is with
-    `contact_force` more than `contact_travel` above where it was expected, or does not come at all.
+    `contact_force`; afterwards the arm folds. `part` follows what becomes of the part; `note` is called before the claw
+    is told to release it, and again as soon as it has, before anything else is done.
+    Raises `RefusedError` before anything moves when the part is not held any more; with the part still held and lifted
+    when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was expected,
+    or does not come at all.
     """
+    if part.state is not PartState.HELD:
+        raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
     plan = job.place
     base_from_part = base_from_surface * plan.surface_from_part.se3()
     part_from_flange = job.grasp.flange_from_part.se3().inverse()
@@ -111,6 +114,8 @@ def place(
         )
     progress(0.8, "releasing")
     part.state, part.where = PartState.UNKNOWN, reached * job.grasp.flange_from_part.se3()
+    # Whoever finds this run cut short here must not take the part as still held.
+    note(part)
     claw.release()
     part.state = PartState.RELEASED
     note(part)
@@ -119,6 +124,7 @@ def place(
     mover.line(above, plan.speed, TOUCHES)
     progress(0.95, "folding the arm")
     mover.to_joints(HOME)
+    part.left = True
     return PlaceResult(reached, contact, off)
 
 

@@ -90,11 +90,14 @@ def reconstruct(
 
 
 def _at(here: Workplace, context: StepContext) -> Reconstruction:
+    path = here.folder / "cloud.ply"
+    # The cloud of an earlier sweep must not be taken for this one's.
+    path.unlink(missing_ok=True)
     return reconstruct(
         context.made(SweepRecord),
         here.calibration.scan,
         here.job.scan.largest_hole,
-        here.folder / "cloud.ply",
+        path,
         here.config.arm.vehicle_from_base.se3().inverse(),
         here.config.vehicle.lean_sigma,
     )

@@ -84,14 +84,10 @@ class StoredSweep:
 
         Raises `CalibrationStale` when the board is seen elsewhere: then the sweep says nothing any more.
         """
-        moved = difference(fix.base_from_board, self.base_from_board)
+        moved = moved_by(fix, self.base_from_board, self.board_covariance)
+        if moved is not None:
+            raise CalibrationStale(f"the board has moved by {moved} since the sweep of run {self.folder.name}")
         spread = fix.covariance + self.board_covariance
-        distance = float(moved @ np.linalg.solve(spread, moved))
-        if distance > MOVED:
-            raise CalibrationStale(
-                f"the board has moved by {1e3 * np.linalg.norm(moved[:3]):.2f} mm and "
-                f"{np.degrees(np.linalg.norm(moved[3:])):.3f} deg since the sweep of run {self.folder.name}"
-            )
         return SweepRecord(tuple(self._loosened(swath, spread) for swath in self.sweep.swaths))
 
     def _loosened(self, swath: Swath, spread: Vector) -> Swath:
@@ -107,6 +103,14 @@ class StoredSweep:
             for frame_id in swath.frame_ids:
                 shutil.copyfile(frame_path(self.folder, frame_id), frame_path(folder, frame_id))
         shutil.copyfile(self.folder / FILE, folder / FILE)
+
+
+def moved_by(fix: BoardFix, base_from_board: pin.SE3, covariance: Vector) -> str | None:
+    """How far the board is seen from where it was, in words; None while that is within what two photographs differ."""
+    moved = difference(fix.base_from_board, base_from_board)
+    if float(moved @ np.linalg.solve(fix.covariance + covariance, moved)) <= MOVED:
+        return None
+    return f"{1e3 * np.linalg.norm(moved[:3]):.2f} mm and {np.degrees(np.linalg.norm(moved[3:])):.3f} deg"
 
 
 def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeometry, scan: ScanSection) -> Swath:
