@@ -9,11 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
+from pydantic import AfterValidator, SerializeAsAny, TypeAdapter, ValidationError, WrapValidator, model_validator
 
 from cell.addresses import Folder, Name, checked_endpoint, is_example
 from cell.device_config import (
@@ -125,8 +126,8 @@ class CellConfig(Table):
             make = self.make(name)
             if make.calibrated:
                 parts[name] = self.device(name).model_dump(include=set(make.calibrated))
-                if make not in BUILT_IN:
-                    parts[name] |= {"driver": f"{kind}.{make.name}"}
+            if make not in BUILT_IN:
+                parts[name] = {**parts.get(name, {}), "driver": f"{kind}.{make.name}"}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -158,6 +159,15 @@ def find_config(path: Path | None, *, simulated: bool = False) -> Path | None:
 def beside(path: Path | None) -> Path:
     """The folder of a configuration, where runs and calibrations go; without a file, the present folder."""
     return Path.cwd() if path is None else path.resolve().parent
+
+
+def runs_folder(path: Path | None) -> Path:
+    """Where a configuration says that runs go, however wrong the rest of it is: what goes on is ended all the same."""
+    runs = usual = str(CellSection.model_fields["runs"].default)
+    with suppress(ConfigError, ValidationError, AttributeError):
+        named = {} if path is None else read_toml(path, "configuration", "cell init").get("cell", {})
+        runs = TypeAdapter(Annotated[str, Folder]).validate_python(named.get("runs", usual))
+    return beside(path) / runs
 
 
 def load_config(path: Path | None) -> CellConfig:

@@ -225,7 +225,7 @@ class Cell:
     def clear_stop(self, by: str) -> None:
         """A person, `by` name, has seen that the cell may move again after a stop: direct commands pass again.
 
-        A new run needs no such word. `ConfigError` when nobody is named.
+        A new run needs no such word, and says it for nobody else. `ConfigError` when nobody is named.
         """
         if not by.strip():
             raise ConfigError("clear_stop needs the name of the person who has looked at the cell")
@@ -284,6 +284,11 @@ class Cell:
         if signals.number is not None:
             raise SignalInterrupt(signals.number)
 
+    @property
+    def stops(self) -> int:
+        """How often it was stopped so far; work that is prepared first hands this to `begin` or `perform`."""
+        return self._stops
+
     def begin(
         self,
         kind: str,
@@ -317,9 +322,10 @@ class Cell:
         work: Callable[[Hands], Made],
         observer: Observer | None = None,
         info: dict[str, Any] | None = None,
+        stops: int | None = None,
     ) -> Made:
-        """Do work outside a job, such as a jog, as a recorded run, and wait for its end."""
-        return self.begin(kind, lambda run: self._recorded(run, kind, work, info), observer).result()
+        """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
+        return self.begin(kind, lambda run: self._recorded(run, kind, work, info), observer, stops).result()
 
     def _recorded(
         self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
@@ -515,8 +521,9 @@ class Cell:
 
         `job` names the part that may be in the claw, so that it does not touch anything on the way.
         """
+        stops = self._stops
         load_job(job)
-        return self.begin("calibration", lambda run: self._calibrate(run, job), observer).result()
+        return self.begin("calibration", lambda run: self._calibrate(run, job), observer, stops).result()
 
     def _calibrate(self, run: Run[Any], job: str | Path) -> CellCalibration:
         part_of, _ = load_job(job)
@@ -526,7 +533,8 @@ class Cell:
 
         def work(hands: Hands) -> tuple[Observations, CellCalibration]:
             mover = self.mover(part_of, hands.safe_point)
-            self.devices.vehicle.brake()
+            # In command, so that one that somebody else moves or releases is noticed.
+            self.devices.vehicle.recover()
             given = self.config, self.devices, mover, hands.check
             scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
             target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
@@ -545,6 +553,7 @@ class Cell:
         Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
         seen. `job` names the part that may be in the claw and what the place error is reckoned for.
         """
+        stops = self._stops
         loaded, _ = load_job(job)
         calibration = self.calibration()
 
@@ -554,7 +563,7 @@ class Cell:
 
             def work(hands: Hands) -> Verification:
                 self.devices.interlocks.work_with(calibration.configuration)
-                self.devices.vehicle.brake()
+                self.devices.vehicle.recover()
                 mover = self.mover(loaded, hands.safe_point)
                 seen = collect_verification(
                     self.config, self.devices, mover, calibration, hands.check, tell, hands.keep
@@ -565,10 +574,11 @@ class Cell:
             tell(1.0, "done")
             return made
 
-        return self.begin("verification", verification, observer).result()
+        return self.begin("verification", verification, observer, stops).result()
 
     def home(self, device: str | None = None) -> None:
         """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        stops = self._stops
         if device not in (None, *HOMED):
             raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
@@ -576,7 +586,7 @@ class Cell:
             if device != "arm":
                 self.devices.rail.home().wait(60.0)
             if device != "rail":
-                self.devices.vehicle.brake()
+                self.devices.vehicle.recover()
                 self.mover(None, hands.safe_point).to_joints(HOME)
 
-        self.perform("homing", work)
+        self.perform("homing", work, stops=stops)

@@ -254,7 +254,9 @@ class ArmState:
 class ArmMotion(Motion, Protocol):
     """A motion of the arm; `contact` tells whether a guarded motion ended because the force limit was met."""
 
-    contact: bool
+    @property
+    def contact(self) -> bool:
+        """Whether it ended at its force limit."""
 
 
 class Arm(Device, Protocol):
@@ -315,8 +317,9 @@ class VehicleState:
 
     Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
     frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None as long as this
-    driver has not commanded the brake. `trouble` says in words what ends motion. `interruptions` counts how often
-    odometry lost its connection to where the vehicle was before, and `interruption` says why it did last.
+    driver has not commanded the brake, and when somebody else may have released it since. `trouble` says in words what
+    ends motion. `interruptions` counts how often odometry lost its connection to where the vehicle was before, and
+    `interruption` says why it did last.
     """
 
     stamp: float

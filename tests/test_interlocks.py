@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
+import os
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,14 +17,17 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.devices.gated_laser import UNATTENDED_S
+from cell.devices.interlocks import Command
 from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
+from cell.job import job_path
 from cell.run.folder import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock
-from drivers.errors import ConfigError, InterlockError
+from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
+from drivers.interfaces import Laser
 
 CONFIG = load_config(None)
 LASER = CONFIG.laser.output
@@ -118,7 +124,8 @@ def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devi
         pass
     with devices.interlocks.purpose("test"), devices.laser.lit():
         assert devices.laser.is_on
-        devices.vehicle.enable()
+        refused("laser_off_to_drive", devices.vehicle.enable, "the laser is on")
+        devices.vehicle.bare.enable()
         refused("laser_off_to_drive", lambda: devices.vehicle.drive(0.1, 0.0), "the laser is on")
     assert not devices.laser.is_on
 
@@ -135,6 +142,36 @@ def test_the_laser_goes_off_by_itself_when_its_owner_sleeps(world: VirtualCell, 
             assert not world.truth()["laser_on"]
         with devices.laser.lit():
             assert world.truth()["laser_on"]
+
+
+class Stubborn:
+    """A laser on its switch, of which the first attempts to switch it off fail."""
+
+    def __init__(self, bare: Laser, failures: list[Exception]) -> None:
+        self.bare, self.failures = bare, failures
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.bare, name)
+
+    def stop(self) -> None:
+        if self.failures:
+            raise self.failures.pop(0)
+        self.bare.stop()
+
+
+def test_a_laser_that_does_not_go_off_is_switched_off_again(world: VirtualCell, devices: Devices) -> None:
+    failures = [DeadlineError("arm", "no answer"), RuntimeError("unforeseen")]
+    devices.laser.bare = Stubborn(devices.laser.bare, failures)
+    with devices.interlocks.purpose("test"):
+        with pytest.raises(InterlockError, match="went off because"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 0.2)
+            assert world.truth()["laser_on"]
+            world.clock.sleep(1.5)
+            assert not world.truth()["laser_on"]
+        devices.laser.bare.failures += [DeadlineError("arm", "no answer")] * 99
+        with pytest.raises(InterlockError, match="was to go off, which is not confirmed"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 2.0)
+    assert not world.truth()["laser_on"]
 
 
 def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_end() -> None:
@@ -161,6 +198,174 @@ def test_the_claw_opens_at_contact_or_when_it_is_empty(world: VirtualCell, devic
     refused("claw_at_contact", devices.claw.release)
     devices.claw.bare.release()
     devices.claw.release()
+
+
+def at_contact(world: VirtualCell, devices: Devices) -> None:
+    """The arm's newest motion ends as the gripped part touches something, which pushes with 20 N."""
+    devices.interlocks.work_with(CONFIG.calibration_hash())
+    here, model = devices.arm.state().joints, world.arm.model
+    motion = devices.arm.follow(np.array([0.0, 4.0]), np.array([here, here + 0.02]), force_limit=10.0)
+    world.clock.sleep(1.0)
+    free = model.contact
+    model.contact = lambda flange: np.asarray(free(flange)) + np.array([0.0, 0.0, 20.0, 0.0, 0.0, 0.0])
+    motion.wait(30.0)
+    model.contact = free
+    assert motion.contact
+
+
+def test_the_claw_opens_where_contact_ended_and_not_once_the_arm_was_moved_from_there(
+    world: VirtualCell, devices: Devices
+) -> None:
+    at_contact(world, devices)
+    devices.arm.bare.move_joints(devices.arm.state().joints + 0.02, 0.5, 1.0).wait(30.0)
+    refused("claw_at_contact", devices.claw.release, "1.15 deg since its motion ended at contact", "0.29 deg")
+    assert devices.claw.holding
+    at_contact(world, devices)
+    devices.claw.release()
+    assert not devices.claw.holding
+
+
+def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
+    at_contact(world, devices)
+    bare = devices.arm.bare
+
+    class CutAsItBegins:
+        """The arm, whose link is lost once the request has gone out."""
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(bare, name)
+
+        def move_joints(self, *arguments: object) -> object:
+            bare.move_joints(*arguments)
+            raise DeviceFault("arm", "arm.link_lost", "the link is lost", recoverable=True, hint="Recover.")
+
+    devices.arm.bare = CutAsItBegins()
+    with pytest.raises(DeviceFault):
+        devices.arm.move_joints(devices.arm.state().joints + 0.001, 0.5, 1.0)
+    refused("claw_at_contact", devices.claw.release)
+    assert devices.claw.holding
+
+
+def test_a_recovery_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
+    at_contact(world, devices)
+    devices.arm.recover()
+    refused("claw_at_contact", devices.claw.release)
+
+
+def test_the_brake_opens_only_with_the_arm_at_rest_and_free(world: VirtualCell, devices: Devices) -> None:
+    motion = devices.arm.move_joints(HOME + 0.3, 0.5, 1.0)
+    world.clock.sleep(0.2)
+    refused("arm_still", devices.vehicle.enable, "the arm moves")
+    assert devices.vehicle.state().braked
+    motion.wait(30.0)
+    at_contact(world, devices)
+    refused("arm_still", devices.vehicle.enable, "ended at contact", "Move it away")
+    devices.arm.move_joints(HOME, 0.5, 1.0).wait(30.0)
+    devices.vehicle.enable()
+
+
+def test_two_commands_that_exclude_each_other_do_not_both_pass(devices: Devices) -> None:
+    """While one is being begun the other one waits, and is checked against what the first one made."""
+    gate, order = devices.gate, []
+    inside, go_on = threading.Event(), threading.Event()
+
+    def slowly() -> None:
+        inside.set()
+        go_on.wait(5)
+        order.append("first begun")
+
+    first = threading.Thread(target=lambda: gate.begin(Command("vehicle", "enable"), slowly, lambda: None))
+    second = threading.Thread(
+        target=lambda: gate.begin(Command("vehicle", "enable"), lambda: order.append("second begun"), lambda: None)
+    )
+    first.start()
+    assert inside.wait(5)
+    second.start()
+    second.join(0.2)
+    assert order == []
+    go_on.set()
+    first.join(5)
+    second.join(5)
+    assert order == ["first begun", "second begun"]
+
+
+def test_a_stop_does_not_wait_for_what_is_being_begun(devices: Devices) -> None:
+    inside, go_on, undone, said = threading.Event(), threading.Event(), threading.Event(), []
+
+    def slowly() -> None:
+        inside.set()
+        go_on.wait(5)
+
+    def begin() -> None:
+        with pytest.raises(InterlockError, match="after_a_stop"):
+            devices.gate.begin(Command("vehicle", "enable"), slowly, undone.set)
+        said.append("refused")
+
+    beginner = threading.Thread(target=begin)
+    beginner.start()
+    assert inside.wait(5)
+    assert devices.stop() == []
+    assert not go_on.is_set()
+    go_on.set()
+    beginner.join(5)
+    assert undone.is_set()
+    assert said == ["refused"]
+
+
+def test_a_drive_that_is_refused_ends_the_velocity_before_it(world: VirtualCell, devices: Devices) -> None:
+    devices.vehicle.enable()
+    devices.vehicle.drive(0.1, 0.0)
+    world.clock.sleep(0.1)
+    assert devices.vehicle.state().speed > 0.0
+    devices.arm.bare.move_joints(HOME + 0.2, 1.0, 2.0)
+    world.clock.sleep(0.2)
+    refused("arm_stowed", lambda: devices.vehicle.drive(0.1, 0.0), "the arm moves")
+    world.clock.sleep(0.2)
+    assert devices.vehicle.state().speed == 0.0
+
+
+class Fixed:
+    """A device of which only the newest state is asked."""
+
+    def __init__(self, name: str, state: object) -> None:
+        self.name, self.newest, self.asked = name, state, []
+
+    def state(self, max_age: float = 0.1) -> object:
+        self.asked.append(max_age)
+        return self.newest
+
+
+def test_driving_is_judged_by_the_newest_state_without_waiting_for_another(devices: Devices) -> None:
+    situation = devices.interlocks.situation
+    drive = Command("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
+    now = devices.arm.state()
+    shaken = dataclasses.replace(now, joint_speeds=np.full(6, 0.02), moving=True)
+    situation.arm = Fixed("arm", shaken)
+    devices.interlocks.require(drive)
+    assert set(situation.arm.asked) == {np.inf}
+    situation.arm = Fixed("arm", dataclasses.replace(shaken, joint_speeds=np.full(6, 0.08)))
+    refused("arm_stowed", lambda: devices.interlocks.require(drive), "the arm moves")
+    situation.arm = Fixed("arm", dataclasses.replace(now, stamp=now.stamp - 0.6))
+    with pytest.raises(DeadlineError, match=r"0\.60 s old, allowed 0\.50 s"):
+        devices.interlocks.require(drive)
+    situation.arm = Fixed("arm", dataclasses.replace(now, digital_outputs=1 << LASER))
+    refused("laser_off_to_drive", lambda: devices.interlocks.require(drive), "the laser is on")
+
+
+@pytest.mark.parametrize(
+    "joints", [np.full(6, np.nan), np.full(6, 1e6), np.zeros(5), ["a"] * 6], ids=["nan", "far", "five", "words"]
+)
+def test_what_no_arm_can_be_asked_is_a_limit_before_anything_is_reckoned(devices: Devices, joints: object) -> None:
+    arm, here = devices.arm, devices.arm.state().joints
+    for begin in (
+        lambda: arm.move_joints(joints, 0.5, 1.0),
+        lambda: arm.move_linear(joints, 0.1, 0.5),
+        lambda: arm.follow(np.array([0.0, 1.0]), [here, joints]),
+        lambda: arm.follow(np.empty(0), np.empty((0, 6))),
+    ):
+        with pytest.raises(LimitError, match="nothing was sent"):
+            begin()
+    assert np.array_equal(arm.state().joints, here)
 
 
 def test_what_rests_on_a_calibration_is_refused_without_one_that_fits(devices: Devices) -> None:
@@ -217,14 +422,51 @@ def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell)
     cell.stop()
     for begin in (
         lambda: rail.move_to(0.02), rail.home, lambda: arm.move_joints(HOME + 0.01, 0.5, 1.0), arm.recover,
-        cell.devices.vehicle.enable, cell.devices.claw.grip,
+        cell.devices.vehicle.enable, cell.devices.claw.grip, arm.zero_force, lambda: arm.set_payload(1.0, np.zeros(3)),
+        lambda: arm.set_digital_output(7, True),
     ):  # fmt: skip
         refused("after_a_stop", begin, "clear_stop(by)")
+    arm.set_digital_output(LASER, False)
+    cell.home("rail")
+    refused("after_a_stop", lambda: rail.move_to(0.02))
     with pytest.raises(ConfigError, match="name of the person"):
         cell.clear_stop(" ")
     cell.clear_stop("Anna")
     rail.move_to(0.02).wait(30.0)
     assert rail.state().position == pytest.approx(0.02, abs=1e-6)
+
+
+class ReadSlowly(os.PathLike[str]):
+    """A job's file that is read so slowly that a stop comes meanwhile."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+
+    def __fspath__(self) -> str:
+        self.cell.stop()
+        return str(job_path("pot"))
+
+
+def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> None:
+    stood = cell.devices.arm.state().joints
+    for begin in (
+        lambda job: cell.calibrate(job=job),
+        lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job),
+    ):
+        with pytest.raises(Aborted, match=r"was stopped before the .* began"):
+            begin(ReadSlowly(cell))
+    before = cell.stops
+    cell.stop()
+    with pytest.raises(Aborted, match="was stopped before the test began"):
+        cell.perform("test", lambda hands: None, stops=before)
+    assert np.array_equal(cell.devices.arm.state().joints, stood)
+
+
+def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(cell: Cell) -> None:
+    assert not cell.devices.vehicle.state().command_mode
+    cell.home("arm")
+    state = cell.devices.vehicle.state()
+    assert (state.command_mode, state.braked) == (True, True)
 
 
 def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(

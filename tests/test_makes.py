@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cell.config import CellConfig, default_toml, load_config
-from cell.devices.assembly import connect_one
+from cell.devices.assembly import connect_one, safe_off_outputs
 from cell.devices.built_in import BUILT_IN, TmclRailConfig
 from cell.devices.make import KINDS
 from cell.devices.makes import installed
@@ -91,6 +92,35 @@ def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(sit
     assert twin.calibration_hash() != own.calibration_hash()
 
 
+BEAM = """
+from typing import Literal
+from cell.devices.built_in import BUILT_IN, ArmOutputLaserConfig
+from cell.devices.make import Make
+
+class BeamConfig(ArmOutputLaserConfig):
+    driver: Literal["beam"] = "beam"
+
+MAKE = Make("laser", "beam", BeamConfig, BUILT_IN[4].connect, on_arm=True)
+"""
+"""A laser on the arm from another package, on whose values no calibration depends."""
+
+
+def test_a_make_of_which_nothing_is_calibrated_still_changes_what_a_calibration_fits(
+    site: Path, tmp_path: Path
+) -> None:
+    install(site, "beam", "1.0", "laser.beam = beam:MAKE", beam=BEAM)
+    before, laser, after = default_toml().partition("\n[laser]")
+    path = tmp_path / "beam.toml"
+    path.write_text(before + laser + after.replace('"arm_output"', '"beam"', 1))
+    beam = load_config(path)
+    without = {"calibration": beam.calibration.model_dump(include={"fine", "large"})}
+    for name in ("rail", "arm", "scan_camera", "target_camera"):
+        without[name] = beam.device(name).model_dump(include=set(beam.make(name).calibrated))
+    unnamed = hashlib.sha256(json.dumps(without, sort_keys=True).encode()).hexdigest()[:16]
+    assert beam.calibration_hash() not in (unnamed, load_config(None).calibration_hash())
+    assert safe_off_outputs(beam) == (beam.laser.output,)
+
+
 def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"rail\.belt: .*1 to 10 mm"):
         loaded(tmp_path, belt="30 mm")
@@ -112,8 +142,9 @@ def test_a_make_that_nothing_simulates_is_refused_in_a_simulated_cell(site: Path
         (RAIL.replace('"rail", "acme"', '"rail", "other"'), 'says that it is "rail.other"'),
         (RAIL.replace("(RailConfig)", "(__import__('pydantic').BaseModel)"), "does not derive from RailConfig"),
         (RAIL.replace('{"belt"}', '{"chain"}'), "its record has no chain"),
+        (RAIL.replace('frozenset({"belt"})', "frozenset(), on_arm=True"), "does not derive from OnArm"),
     ],
-    ids=["import", "exit", "no make", "another name", "another record", "unknown key"],
+    ids=["import", "exit", "no make", "another name", "another record", "unknown key", "on the arm"],
 )
 def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
     site: Path, tmp_path: Path, module: str, words: str

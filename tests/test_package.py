@@ -9,8 +9,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import typer
 
 import cell
+from cell.cli import main
 from drivers import errors
 
 
@@ -49,11 +51,21 @@ def test_the_command_line_tells_its_release_and_completes(
     assert shown in capsys.readouterr().out
 
 
-def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path: Path) -> None:
-    info = tmp_path / "broken-1.0.dist-info"
+MODULES = {
+    "absent": None,
+    "leaves": "raise SystemExit(0)",
+    "shadows": "def register(app):\n    app.command('abort')(lambda: print('mine'))\n",
+}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path: Path, module: str) -> None:
+    info = tmp_path / "odd-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[assembly_cell.commands]\nbroken = no_such_module:register\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[assembly_cell.commands]\nodd = {module}:register\n")
+    if (text := MODULES[module]) is not None:
+        (tmp_path / f"{module}.py").write_text(text)
     done = subprocess.run(
         [sys.executable, "-c", "from cell.cli import main; main()", "abort", "--help"],
         capture_output=True,
@@ -61,4 +73,18 @@ def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path:
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},
     )
     assert done.returncode == 0
-    assert "the commands of no_such_module:register cannot be used" in done.stderr
+    assert "End what is going on" in done.stdout or "abort" in done.stdout
+    assert f"the commands of {module}:register cannot be used" in done.stderr
+
+
+def test_a_prompt_that_nobody_answers_is_told_in_words(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unanswered(*_: object, **__: object) -> None:
+        raise typer.Abort
+
+    monkeypatch.setattr(typer.Typer, "__call__", unanswered)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    assert "a question was not answered" in capsys.readouterr().err

@@ -11,9 +11,12 @@ import can
 import numpy as np
 import pytest
 
+from cell.devices.interlocks import Command, Interlocks, Situation
+from cell.devices.rules import RULES
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
+from drivers.vehicle.can_link import load_database
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
@@ -156,6 +159,52 @@ def test_silence_ends_driving_and_an_old_reading_is_none(bench: Bench) -> None:
     assert caught.value.code == "vehicle.silent"
     with pytest.raises(DeadlineError, match="old, allowed"):
         bench.vehicle.state()
+
+
+def frame(bench: Bench, message: str, **signals: float) -> can.Message:
+    found = load_database().get_message_by_name(message)
+    return can.Message(arbitration_id=found.frame_id, data=found.encode(signals), is_extended_id=False)
+
+
+@pytest.mark.parametrize("take", ["brake", "recover"])
+def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench, take: str) -> None:
+    """Whether this program had taken command or has only braked."""
+    getattr(bench.vehicle, take)()
+    bench.until(lambda: bench.vehicle.state(1.0).braked is True)
+    with can.Bus(channel=bench.channel, interface="virtual") as other:
+        other.send(frame(bench, "BrakeCommand", Locked=0))
+        bench.until(lambda: bench.vehicle.state(1.0).braked is None)
+        bench.vehicle.recover()
+        assert bench.vehicle.state(1.0).braked is True
+
+
+def test_a_parked_vehicle_whose_feedback_is_late_holds_nothing_up_and_one_that_is_silent_does(bench: Bench) -> None:
+    """A program that computes reads late; the arm retreats all the same, as long as the brake is known to be locked."""
+    nothing = Situation(
+        None, bench.vehicle, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "", clock=bench.clock
+    )
+    interlocks = Interlocks(nothing, RULES)
+    move = Command("arm", "move_joints")
+    bench.vehicle.brake()
+    interlocks.require(move)
+    bench.bus.talking = False
+    time.sleep(0.6)
+    with pytest.raises(DeadlineError):
+        bench.vehicle.state(1.0)
+    interlocks.require(move)
+    time.sleep(QUIET_S)
+    with pytest.raises(DeviceFault, match="no feedback"):
+        interlocks.require(move)
+
+
+def test_a_vehicle_whose_brake_is_open_is_not_taken_as_parked_by_an_old_reading(bench: Bench) -> None:
+    nothing = Situation(
+        None, bench.vehicle, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "", clock=bench.clock
+    )
+    bench.bus.talking = False
+    time.sleep(0.6)
+    with pytest.raises(DeadlineError):
+        Interlocks(nothing, RULES).require(Command("arm", "move_joints"))
 
 
 def test_a_restart_is_noticed_although_another_node_keeps_talking(bench: Bench) -> None:

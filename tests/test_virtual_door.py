@@ -162,6 +162,25 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
     require_safe(dict(outcome.report))
 
 
+def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_the_run_is_not_forgotten() -> None:
+    with opened() as cell:
+        rail, moved = cell.devices.rail, []
+
+        def look(result: object) -> None:
+            rail.home().wait(60.0)
+            rail.move_to(0.01).wait(60.0)
+            moved.append(round(rail.state().position, 4))
+
+        cell.stop()
+        outcome = cell.run("pot.toml", script=Script(after={"drive_to_target": look}), until="drive_to_target")
+        assert (outcome.outcome, moved) == ("done", [0.01]), outcome.reason
+        with pytest.raises(InterlockError, match="after_a_stop"):
+            rail.move_to(0.02)
+        cell.clear_stop("Anna")
+        cell.run("pot.toml", until="drive_to_target")
+        rail.move_to(0.02).wait(60.0)
+
+
 @pytest.mark.parametrize("name", ["arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"])
 def test_a_fault_of_a_wire_is_refused_where_there_is_none(name: str) -> None:
     with opened() as cell, pytest.raises(ConfigError, match=r"fault of the wire.*use --clock wall"):

@@ -18,6 +18,7 @@ from cell.config import (
     load_config,
     require_confirm,
     require_real_addresses,
+    runs_folder,
 )
 from cell.devices.simulated import with_endpoints
 from cell.job import job_path
@@ -171,3 +172,18 @@ def test_the_configuration_that_ships_names_no_device() -> None:
         require_real_addresses(load_config(None))
     for key in ("arm.address", "scan_camera.address", "target_camera.address"):
         assert key in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "runs"),
+    [
+        ('[cell]\nname = "a"\nruns = "mine"\n[rail]\nlead = 2\n', "mine"),
+        ('[cell]\nruns = "../outside"\n', "runs"),
+        ("[cell]\nruns = 7\n", "runs"),
+        ("cell = 3\n", "runs"),
+        ("no toml at all", "runs"),
+    ],
+)
+def test_what_goes_on_is_found_however_wrong_the_configuration_has_become(tmp_path: Path, text: str, runs: str) -> None:
+    (tmp_path / "cell.toml").write_text(text)
+    assert runs_folder(tmp_path / "cell.toml") == tmp_path / runs

@@ -11,7 +11,7 @@ from cell.cli import calibrate, devices, export, run, setup, sim
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
-"""Entry points that add commands: called with the command line, a `typer.Typer`."""
+"""Entry points that add commands: called with a `typer.Typer`, whose commands and groups come to those of `cell`."""
 
 app = App(
     name="cell",
@@ -49,10 +49,30 @@ def _cell(
 for register in (run.register, export.register, calibrate.register, devices.register, setup.register):
     register(app)
 app.add_typer(sim.app, name="sim")
-# Whole groups of commands that stand beside the product, such as the laboratory's, bring themselves. One that is broken
-# must not take `cell abort` with it.
-for group in sorted(entry_points(group=COMMANDS), key=lambda found: found.name):
-    try:
-        group.load()(app)
-    except Exception as error:
-        typer.echo(f"warning: the commands of {group.value} cannot be used: {error}", err=True)
+
+
+def _add_groups() -> None:
+    """Add the groups of commands that bring themselves, such as the laboratory's.
+
+    One that is broken, or that takes the name of a command that is there, is left out: it must not take `cell abort`
+    with it.
+    """
+    for entry in sorted(entry_points(group=COMMANDS), key=lambda found: found.name):
+        own = typer.Typer()
+        try:
+            entry.load()(own)
+            if taken := _names(own) & _names(app):
+                raise ValueError(f"there is a command {', '.join(sorted(taken))} already")
+        except (Exception, SystemExit) as error:
+            typer.echo(f"warning: the commands of {entry.value} cannot be used: {error}", err=True)
+            continue
+        app.registered_commands += own.registered_commands
+        app.registered_groups += own.registered_groups
+
+
+def _names(commands: typer.Typer) -> set[str]:
+    shown = {command.name or getattr(command.callback, "__name__", "") for command in commands.registered_commands}
+    return shown | {str(group.name) for group in commands.registered_groups}
+
+
+_add_groups()

@@ -186,7 +186,7 @@ def abort(
     from cell.run.folder import list_runs, listens
     from drivers.errors import ConfigError
 
-    going = [run for run in list_runs(_runs_folder(config)) if listens(run)] if name is None else []
+    going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:
         _ask(name, config, "abort", reason, "asked {} to end")
     # Whoever says stop does not choose: everything that goes on here ends.
@@ -257,7 +257,7 @@ def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: 
 def _going(name: str | None, config: Path | None) -> Path:
     from cell.run.folder import find_going
 
-    return find_going(_runs_folder(config), name)
+    return find_going(_going_folder(config), name)
 
 
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
@@ -292,3 +292,10 @@ def _runs_folder(config: Path | None) -> Path:
 
     path = find_config(config, simulated=True)
     return beside(path) / load_config(path).cell.runs
+
+
+def _going_folder(config: Path | None) -> Path:
+    """As `_runs_folder`, for who ends or holds what goes on: the configuration may have become wrong meanwhile."""
+    from cell.config import find_config, runs_folder
+
+    return runs_folder(find_config(config, simulated=True))

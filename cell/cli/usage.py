@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from cell.cli import EXIT_USAGE
-from drivers.errors import ConfigError
+from drivers.errors import CellError, ConfigError
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Base of what typer raises for a wrong command line, whichever parser it carries."""
@@ -34,6 +34,10 @@ class App(typer.Typer):
             if text := in_words(error):
                 raise ConfigError(text) from error
             code = EXIT_USAGE
+        except typer.Abort as error:
+            raise CellError(
+                "a question was not answered, so nothing was done; answer it, or give it as an option"
+            ) from error
         sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from cell.config import DEVICES, CellConfig
-from cell.devices.built_in import ArmOutputLaserConfig, OnArm
+from cell.devices.built_in import OnArm
 from cell.devices.devices import Devices
 from cell.devices.gate import Gate
 from cell.devices.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
@@ -57,7 +57,7 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
 
 def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
     """The arm's outputs that have to go off when nobody watches them any more: the laser's, if it hangs on one."""
-    return (config.laser.output,) if isinstance(config.laser, ArmOutputLaserConfig) else ()
+    return (config.laser.output,) if isinstance(config.laser, OnArm) else ()
 
 
 def behind_gate(
@@ -81,9 +81,10 @@ def behind_gate(
         claw,
         {record.output: owner for record, owner in switched if isinstance(record, OnArm)},
         ways.clear,
-        ways.kinematics.fk,
+        ways.forward,
         {"HOME": HOME},
         config.calibration_hash(),
+        clock=clock,
     )
     gate = Gate(Interlocks(situation, RULES))
     return Devices(

@@ -9,7 +9,8 @@ devices behind the gate are in `cell.devices.gated`.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 from cell.devices.interlocks import Command, Interlocks
@@ -24,8 +25,8 @@ Bare = TypeVar("Bare", bound=Device)
 class Gate:
     """Counts the stops; each thread that works remembers the count at which it entered, and its token.
 
-    Threads that never entered, such as a script's own, are let through until the first stop; after it a new run has to
-    begin, or a person has to `clear` it.
+    Threads that never entered, such as a program's own, are let through until the first stop; after it a person has to
+    `clear` it. That somebody else began a new run does not let them through.
     """
 
     def __init__(self, interlocks: Interlocks) -> None:
@@ -33,16 +34,28 @@ class Gate:
         self._stops = 0
         self._cleared = 0
         self._entered = threading.local()
+        # One command is checked and begun at a time: else two that exclude each other could both pass. Stopping never
+        # takes this lock.
+        self._beginning = threading.RLock()
 
     def enter(self, token: CancelToken) -> None:
         """Begin new work in this thread, which `token` ends."""
-        self._cleared = self._stops
         self._entered.stops = self._stops
         self._entered.token = token
 
     def leave(self) -> None:
         """This thread's work has ended; it is now as one that never entered."""
         self._entered.stops = self._entered.token = None
+
+    @contextmanager
+    def entered(self, token: CancelToken) -> Iterator[None]:
+        """Inside this context this thread does work that `token` ends; afterwards it is what it was before."""
+        outer = getattr(self._entered, "stops", None), getattr(self._entered, "token", None)
+        self.enter(token)
+        try:
+            yield
+        finally:
+            self._entered.stops, self._entered.token = outer
 
     @property
     def stops(self) -> int:
@@ -52,6 +65,11 @@ class Gate:
     def clear(self, stops: int | None = None) -> None:
         """The stops so far, or the first `stops` of them, keep no one any more but the work that they ended."""
         self._cleared = self._stops if stops is None else max(stops, self._cleared)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether threads that never entered are let through."""
+        return self._cleared == self._stops
 
     def shut(self) -> None:
         """Bar all work that has entered so far. Comes before the devices are stopped."""
@@ -69,25 +87,28 @@ class Gate:
         stops: int | None = getattr(self._entered, "stops", None)
         if stops is not None and stops != self._stops:
             raise Aborted("the cell was stopped; nothing new is begun")
-        if stops is None and self._cleared != self._stops:
+        if stops is None and not self.is_open:
             raise InterlockError(
                 "cell",
                 "was stopped, and nothing begins after that by itself (interlock after_a_stop). See that it is safe, "
-                "then begin a run, or say so with clear_stop(by)",
+                "then say so with clear_stop(by), or begin a run",
             )
         if command is not None:
             self.interlocks.require(command)
 
     def begin(self, command: Command, start: Callable[[], Made], undo: Callable[[], None]) -> Made:
         """`start()`, if the command may pass; undone at once when the cell is stopped meanwhile."""
-        self.require(command)
-        made = start()
-        try:
+        with self._beginning:
+            self.require(command)
+            # The rules may have waited for a reading, and a stop have come meanwhile.
             self.require()
-        except (Aborted, InterlockError):
-            undo()
-            raise
-        return made
+            made = start()
+            try:
+                self.require()
+            except (Aborted, InterlockError):
+                undo()
+                raise
+            return made
 
 
 class Gated(Generic[Bare]):

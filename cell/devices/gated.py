@@ -6,11 +6,14 @@ Reading, stopping and closing always pass. What a make offers beyond its interfa
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 
+from cell.devices.arguments import checked_joints, checked_pose, checked_way
+from cell.devices.contact import GuardedMotion
 from cell.devices.gate import Gate, Gated
 from cell.devices.interlocks import Command
 from drivers.clock_map import Latch
+from drivers.errors import CellError
 from drivers.interfaces import (
     Arm,
     ArmMotion,
@@ -43,35 +46,48 @@ class GatedArm(Gated[Arm]):
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_joints`."""
-        command = Command("arm", "move_joints", {"joints": joints})
+        command = Command("arm", "move_joints", {"joints": checked_joints(self.name, joints)})
         return self._move(command, lambda: self.bare.move_joints(joints, speed, acceleration))
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_linear`."""
-        command = Command("arm", "move_linear", {"flange": flange})
+        command = Command("arm", "move_linear", {"flange": checked_pose(self.name, flange)})
         return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
 
     def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
         """See `Arm.follow`."""
-        command = Command("arm", "follow", {"joints": joints, "force_limit": force_limit})
-        return self._move(command, lambda: self.bare.follow(times, joints, force_limit))
+        way = checked_way(self.name, joints)
+        command = Command("arm", "follow", {"joints": way, "force_limit": force_limit})
+        if force_limit is None:
+            return self._move(command, lambda: self.bare.follow(times, joints))
+        return self._move(command, lambda: GuardedMotion(self.bare.follow(times, joints, force_limit), self.bare))
 
     def _move(self, command: Command, start: Callable[[], ArmMotion]) -> ArmMotion:
-        motion = self.gate.begin(command, start, self.bare.stop)
-        self.gate.interlocks.situation.last = motion
-        return motion
+        situation = self.gate.interlocks.situation
+
+        def begin() -> ArmMotion:
+            # Should the start fail, the arm may move all the same: what its motion before ended with holds no more.
+            situation.last = None
+            situation.last = motion = start()
+            return motion
+
+        return self.gate.begin(command, begin, self.bare.stop)
 
     def zero_force(self) -> None:
         """See `Arm.zero_force`."""
+        self.gate.require(Command("arm", "zero_force"))
         self.bare.zero_force()
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """See `Arm.set_payload`."""
+        self.gate.require(Command("arm", "set_payload"))
         self.bare.set_payload(mass, centre)
 
     def set_digital_output(self, index: int, value: bool) -> None:
-        """See `Arm.set_digital_output`."""
-        self.gate.interlocks.require(Command("arm", "set_digital_output", {"index": index, "value": value}))
+        """See `Arm.set_digital_output`. The laser is switched off also after a stop."""
+        command = Command("arm", "set_digital_output", {"index": index, "value": value})
+        if value or self.gate.interlocks.situation.outputs.get(index) != "laser":
+            self.gate.require(command)
         self.bare.set_digital_output(index, value)
 
     def digital_input(self, index: int) -> bool:
@@ -80,7 +96,12 @@ class GatedArm(Gated[Arm]):
 
     def recover(self, *, confirmed: bool = False) -> None:
         """See `Arm.recover`."""
-        self.gate.begin(Command("arm", "recover"), lambda: self.bare.recover(confirmed=confirmed), self.bare.stop)
+
+        def begin() -> None:
+            self.gate.interlocks.situation.last = None
+            self.bare.recover(confirmed=confirmed)
+
+        self.gate.begin(Command("arm", "recover"), begin, self.bare.stop)
 
 
 class GatedRail(Gated[Rail]):
@@ -133,9 +154,14 @@ class GatedVehicle(Gated[Vehicle]):
         self.gate.begin(Command("vehicle", "recover"), self.bare.recover, self.bare.brake)
 
     def drive(self, speed: float, yaw_rate: float) -> None:
-        """See `Vehicle.drive`."""
+        """See `Vehicle.drive`. One that is refused also ends the velocity that was set before."""
         command = Command("vehicle", "drive", {"speed": speed, "yaw_rate": yaw_rate})
-        self.gate.begin(command, lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
+        try:
+            self.gate.begin(command, lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
+        except CellError:
+            with suppress(CellError):
+                self.bare.drive(0.0, 0.0)
+            raise
 
     def brake(self) -> None:
         """See `Vehicle.brake`."""
@@ -147,13 +173,17 @@ class GatedClaw(Gated[Claw]):
 
     def grip(self, timeout: float = 2.0) -> None:
         """See `Claw.grip`."""
-        self.gate.require(Command("claw", "grip"))
-        self.bare.grip(timeout)
+        self._begin("grip", lambda: self.bare.grip(timeout))
 
     def release(self, timeout: float = 2.0) -> None:
         """See `Claw.release`."""
-        self.gate.require(Command("claw", "release"))
-        self.bare.release(timeout)
+        self._begin("release", lambda: self.bare.release(timeout))
+
+    def _begin(self, name: str, start: Callable[[], None]) -> None:
+        self.gate.require(Command("claw", name))
+        # The rules may have waited for a reading, and a stop have come meanwhile.
+        self.gate.require()
+        start()
 
     @property
     def holding(self) -> bool:

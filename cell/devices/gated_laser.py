@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from cell.devices.gate import Gate, Gated
 from cell.devices.interlocks import Command
 from drivers.clock import Clock
-from drivers.errors import CellError, InterlockError
+from drivers.errors import InterlockError
 from drivers.interfaces import Laser
 
 UNATTENDED_S = 20.0
 """Seconds on the wall for which the laser stays on when nobody renews it: eyes do not run faster with a simulation."""
+RETRY_S = 0.5
+"""Seconds on the wall after which a laser that could not be switched off is switched off again."""
 
 log = logging.getLogger(__name__)
 
@@ -25,15 +27,14 @@ class GatedLaser(Gated[Laser]):
         super().__init__(bare, gate)
         self._clock = clock
         self._renewed = 0.0
-        self._slept = False
+        self._slept = self._off = False
 
     @contextmanager
     def lit(self) -> Iterator[None]:
         """See `Laser.lit`. Goes off, and raises `InterlockError` at the end, when it is not renewed every 20 s."""
-        self.gate.require(Command("laser", "lit"))
-        with self.bare.lit():
-            self.gate.require()
-            self._renewed, self._slept = self._clock.now(), False
+        with ExitStack() as held:
+            self.gate.begin(Command("laser", "lit"), lambda: held.enter_context(self.bare.lit()), held.close)
+            self._renewed, self._slept, self._off = self._clock.now(), False, False
             with self._clock.alarm(self._limit, self._look):
                 yield
                 self.renew()
@@ -41,9 +42,10 @@ class GatedLaser(Gated[Laser]):
     def renew(self) -> None:
         """Its owner is awake. `InterlockError` when it had fallen asleep and the laser went off meanwhile."""
         if self._slept:
+            became = "went off" if self._off else "was to go off, which is not confirmed,"
             raise InterlockError(
                 self.name,
-                f"went off because nobody renewed it for {UNATTENDED_S:.0f} s (interlock laser_attended). Light it "
+                f"{became} because nobody renewed it for {UNATTENDED_S:.0f} s (interlock laser_attended). Light it "
                 "only while it is needed, and call renew() on it meanwhile",
             )
         self._renewed = self._clock.now()
@@ -58,13 +60,19 @@ class GatedLaser(Gated[Laser]):
         return UNATTENDED_S * self._clock.rate
 
     def _look(self) -> float | None:
-        """Called by the alarm: off when the owner sleeps, else in how many seconds to look again."""
+        """Called by the alarm: off when the owner sleeps, else in how many seconds to look again.
+
+        One that cannot be switched off is switched off again and again, until its owner's context ends.
+        """
         left = self._renewed + self._limit - self._clock.now()
         if left > 0:
             return left
         self._slept = True
         try:
             self.bare.stop()
-        except CellError as error:
+        # Whatever went wrong, the next attempt may do it.
+        except Exception as error:
             log.error("the laser's owner sleeps, and it could not be switched off: %s", error)
+            return RETRY_S * self._clock.rate
+        self._off = True
         return None

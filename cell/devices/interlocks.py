@@ -14,6 +14,7 @@ from typing import Any
 
 import pinocchio as pin
 
+from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
 from drivers.interfaces import Arm, ArmMotion, Claw, Laser, Vector, Vehicle
 
@@ -41,7 +42,8 @@ class Situation:
     pairs of bodies that the arm would bring together on the way that a command asks for, from where it stands (6,) in
     rad. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by name.
     `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is the
-    newest motion of the arm, `purposes` what this thread lights the laser for.
+    newest motion of the arm, None when it is not known how that went; `purposes` what this thread lights the laser for.
+    `clock` is the one that the devices share.
     """
 
     arm: Arm | None
@@ -57,6 +59,7 @@ class Situation:
     calibrated: str | None = None
     last: ArmMotion | None = None
     purposes: threading.local = field(default_factory=threading.local)
+    clock: Clock = field(default_factory=Clock)
 
     @property
     def purpose(self) -> str | None:

@@ -77,6 +77,7 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
 
     The vehicle is also jogged with the arm in the looking pose of `job`.
     """
+    stops = cell.stops
     loaded, _ = load_job(job)
 
     def work(hands: Hands) -> dict[str, str]:
@@ -89,7 +90,7 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
                 _name_look(cell, loaded)
                 return _jog_vehicle(cell, wish, hands.check)
 
-    return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()})
+    return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()}, stops=stops)
 
 
 def _name_look(cell: Cell, job: Job) -> None:
@@ -112,7 +113,7 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
     if "vehicle" in cell.devices:
-        cell.devices.vehicle.brake()
+        cell.devices.vehicle.recover()
     mover = cell.mover(None)
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1

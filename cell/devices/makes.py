@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from pydantic_core import InitErrorDetails
 
 from cell.device_config import DeviceConfig
-from cell.devices.built_in import BUILT_IN
+from cell.devices.built_in import BUILT_IN, OnArm
 from cell.devices.make import KINDS, AnyMake, Make
 from drivers.errors import ConfigError
 
@@ -121,6 +121,11 @@ def _load(entry: EntryPoint) -> AnyMake:
         raise _Unusable(f'broken: {entry.value} says that it is "{made.kind}.{made.name}"')
     if not issubclass(made.record, KINDS[kind]):
         raise _Unusable(f"broken: its record {made.record.__name__} does not derive from {KINDS[kind].__name__}")
+    if made.on_arm and not issubclass(made.record, OnArm):
+        raise _Unusable(
+            f"broken: it hangs on the arm, but its record {made.record.__name__} does not derive from OnArm, so nobody "
+            "knows which of the arm's outputs is its own"
+        )
     if unknown := made.calibrated - set(made.record.model_fields):
         raise _Unusable(f"broken: its record has no {', '.join(sorted(unknown))}, on which a calibration is to depend")
     return made

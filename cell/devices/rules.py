@@ -10,13 +10,23 @@ import math
 import numpy as np
 import pinocchio as pin
 
+from cell.devices.contact import GuardedMotion
 from cell.devices.gated_laser import UNATTENDED_S
 from cell.devices.interlocks import PURPOSES, Command, Rule, Situation
+from drivers.errors import DeadlineError
+from drivers.interfaces import Arm, ArmState, Vehicle, VehicleState
 
 PATIENCE_S = 1.0
 """How old a reading may be that a rule rests on: what it asks about does not change by itself."""
 STILL = 0.005
 """Speed in m/s and rad/s below which the vehicle stands: its feedback has steps of 0.001."""
+LATE_S = 0.5
+"""How long a reading of the vehicle is waited for, on the wall; and how old one of the arm may be, by which the vehicle
+is driven on: such a command must not wait, because the velocity before it is kept alive meanwhile."""
+TURNING = 0.05
+"""Speed of a joint in rad/s from which the arm moves by itself: the vehicle shakes it a little as it drives."""
+MOVED_RAD = 0.005
+"""Angle of a joint by which the arm may be off where contact ended: some mm at its reach."""
 POSTURE_RAD = math.radians(2.0)
 LOOK_M, LOOK_RAD = 0.03, math.radians(3.0)
 """How near the arm has to be to a transport pose. A looking pose is reckoned from the camera's mounting as configured
@@ -28,7 +38,7 @@ MOVES = ("arm.move_joints", "arm.move_linear", "arm.follow")
 def _parked(now: Situation, command: Command) -> str | None:
     if now.vehicle is None:
         return "the vehicle is not connected, so nobody knows whether it is parked. Open the cell with it"
-    state = now.vehicle.state(PATIENCE_S)
+    state = _newest(now, now.vehicle)
     if max(abs(state.speed), abs(state.yaw_rate)) > STILL:
         return f"the vehicle drives at {state.speed:.3f} m/s, {state.yaw_rate:.3f} rad/s. Call vehicle.brake() first"
     if not state.braked:
@@ -37,14 +47,57 @@ def _parked(now: Situation, command: Command) -> str | None:
     return None
 
 
+def _newest(now: Situation, vehicle: Vehicle) -> VehicleState:
+    """The vehicle's feedback. One that is late is waited for; of a braked vehicle that is not silent it will do."""
+    clock = now.clock
+    until = clock.now() + LATE_S * max(1.0, clock.rate)
+    while True:
+        try:
+            return vehicle.state(PATIENCE_S)
+        except DeadlineError:
+            if clock.now() < until:
+                clock.sleep(0.02)
+                continue
+            state = vehicle.state(math.inf)
+            if not state.braked:
+                raise
+            vehicle.check()
+            return state
+
+
+def _arm_now(now: Situation, arm: Arm) -> ArmState:
+    """The arm's newest state, without waiting for a newer one; `DeadlineError` when it is too old."""
+    state = arm.state(math.inf)
+    age, allowed = now.clock.now() - state.stamp, LATE_S * max(1.0, now.clock.rate)
+    if age > allowed:
+        raise DeadlineError(arm.name, f"its newest state is {age:.2f} s old, allowed {allowed:.2f} s. See its link")
+    return state
+
+
+def _moves(now: Situation, state: ArmState) -> str | None:
+    if (now.last is not None and not now.last.done) or np.abs(state.joint_speeds).max() > TURNING:
+        return "the arm moves. Wait for its motion first"
+    return None
+
+
+def _still(now: Situation, command: Command) -> str | None:
+    if now.arm is None:
+        return None
+    if (against := _moves(now, now.arm.state(PATIENCE_S))) is not None:
+        return against
+    if now.last is not None and now.last.contact:
+        return "the arm's last motion ended at contact, and it may still touch something. Move it away first"
+    return None
+
+
 def _stowed(now: Situation, command: Command) -> str | None:
     if not any(command.arguments.values()):
         return None
     if now.arm is None:
         return "the arm is not connected, so nobody knows how it stands. Open the cell with it"
-    state = now.arm.state(PATIENCE_S)
-    if state.moving:
-        return "the arm moves. Wait for its motion first"
+    state = _arm_now(now, now.arm)
+    if (against := _moves(now, state)) is not None:
+        return against
     off = {name: float(np.abs(state.joints - posture).max()) for name, posture in now.postures.items()}
     if min(off.values()) <= POSTURE_RAD:
         return None
@@ -62,9 +115,15 @@ def _stowed(now: Situation, command: Command) -> str | None:
 
 
 def _dark(now: Situation, command: Command) -> str | None:
-    if any(command.arguments.values()) and now.laser is not None and now.laser.is_on:
-        return "the laser is on. Switch it off first"
-    return None
+    driving = command.name == "drive"
+    if now.laser is None or (driving and not any(command.arguments.values())):
+        return None
+    output = next((index for index, owner in now.outputs.items() if owner == "laser"), None)
+    if driving and output is not None and now.arm is not None:
+        lit = bool(_arm_now(now, now.arm).digital_outputs >> output & 1)
+    else:
+        lit = now.laser.is_on
+    return "the laser is on. Switch it off first" if lit else None
 
 
 def _purpose(now: Situation, command: Command) -> str | None:
@@ -77,8 +136,16 @@ def _contact(now: Situation, command: Command) -> str | None:
     if now.claw is not None and not now.claw.holding:
         return None
     motion = now.last
-    if motion is not None and motion.done and motion.contact:
-        return None
+    if isinstance(motion, GuardedMotion) and motion.done and motion.contact:
+        if now.arm is None or motion.rest is None:
+            return "nobody has seen where the arm stood when its motion ended at contact. Wait for that motion's end"
+        moved = float(np.abs(now.arm.state().joints - motion.rest).max())
+        if moved <= MOVED_RAD:
+            return None
+        return (
+            f"a joint of the arm was moved by {math.degrees(moved):.2f} deg since its motion ended at contact, allowed "
+            f"{math.degrees(MOVED_RAD):.2f} deg, so the part would fall. Set it down with a force limit again"
+        )
     return (
         "the claw holds a part, and the arm's last motion did not end at contact, so the part would fall. Set it down "
         'with a force limit first; a person who holds it lifts this with maintenance(reason, lift=["claw_at_contact"])'
@@ -123,12 +190,18 @@ RULES = (
         "the arm is at rest in a transport pose: HOME, or the looking pose of the job that is run or named",
         _stowed,
     ),
-    Rule("laser_off_to_drive", ("vehicle.drive",), "the laser is off", _dark),
+    Rule(
+        "arm_still",
+        ("vehicle.enable",),
+        "the arm, where it is connected, is at rest, and its last motion did not end at contact",
+        _still,
+    ),
+    Rule("laser_off_to_drive", ("vehicle.enable", "vehicle.drive"), "the laser is off", _dark),
     Rule("laser_purpose", ("laser.lit",), f"it was said what for: {', '.join(PURPOSES)}", _purpose),
     Rule(
         "claw_at_contact",
         ("claw.release",),
-        "the arm's last motion ended at contact, or the claw shows no part; else on a person's word",
+        "the arm still stands where its last motion ended at contact, or the claw shows no part; else a person's word",
         _contact,
     ),
     Rule(
@@ -158,9 +231,11 @@ RULES = (
     ),
     Rule(
         "after_a_stop",
-        (*MOVES, "arm.recover", "rail.home", "rail.move_to", "rail.sweep", "vehicle.enable", "vehicle.recover",
-         "vehicle.drive", "laser.lit", "claw.grip", "claw.release"),
-        "a new run has begun, or a person has said `Cell.clear_stop(by)`; work that was going on begins nothing more",
+        (*MOVES, "arm.recover", "arm.zero_force", "arm.set_payload", "arm.set_digital_output", "rail.home",
+         "rail.move_to", "rail.sweep", "vehicle.enable", "vehicle.recover", "vehicle.drive", "laser.lit", "claw.grip",
+         "claw.release"),
+        "it belongs to a run that began later, or a person has said `Cell.clear_stop(by)`; work that was going on "
+        "begins nothing more; the laser's output may be switched off",
         None,
         liftable=False,
     ),

@@ -35,11 +35,19 @@ class Ways:
         self._config = config
         self._one_at_a_time = threading.Lock()
         self.kinematics = ArmKinematics()
+        # One of its own: where the arm stands is asked while a way is reckoned.
+        self._looking = threading.Lock()
+        self._standing = ArmKinematics()
 
     @cached_property
     def _bodies(self) -> CollisionModel:
         bodies = [*arm_bodies(), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
         return CollisionModel(self.kinematics, bodies, MARGIN_M)
+
+    def forward(self, joints: Vector) -> pin.SE3:
+        """base_from_flange at joint angles (6,) in rad; callable from any thread."""
+        with self._looking:
+            return self._standing.fk(joints)
 
     def clear(self, start: Vector, command: Command) -> list[Pair]:
         """The pairs that come closer than 2 mm on the way from `start`, (6,) rad; what touches there already may.

@@ -92,6 +92,33 @@ def _cells(measured: NDArray[np.bool_], steps: tuple[float, float], largest: flo
 
 
 @compiled
+def _solve(normal: Array, right: Array) -> bool:
+    """Solve a symmetric system, of which the lower triangle is given, into `right` by Cholesky's way; False when it is
+    not positive. Here because a compiled `np.linalg.solve` takes eight seconds to compile.
+    """
+    size = len(normal)
+    for a in range(size):
+        for b in range(a + 1):
+            for k in range(b):
+                normal[a, b] -= normal[a, k] * normal[b, k]
+            if b < a:
+                normal[a, b] /= normal[b, b]
+        if not normal[a, a] > 0.0:
+            return False
+        normal[a, a] = np.sqrt(normal[a, a])
+    for column in range(right.shape[1]):
+        for a in range(size):
+            for k in range(a):
+                right[a, column] -= normal[a, k] * right[k, column]
+            right[a, column] /= normal[a, a]
+        for a in range(size - 1, -1, -1):
+            for k in range(a + 1, size):
+                right[a, column] -= normal[k, a] * right[k, column]
+            right[a, column] /= normal[a, a]
+    return True
+
+
+@compiled
 def _interpolate(
     points: Array, spread: NDArray[np.float32], measured: NDArray[np.bool_], cells: Indices
 ) -> tuple[Array, Array, Array]:
@@ -138,10 +165,7 @@ def _interpolate(
         for a in range(6):
             # A window whose points lie on few lines leaves a coefficient open; it must not blow up the others.
             normal[a, a] *= 1.0 + 1e-9
-            for b in range(a):
-                normal[b, a] = normal[a, b]
-        solved = np.linalg.solve(normal, right)
-        if not solved[0, 0] > 0.0 or not np.isfinite(solved).all():
+        if not _solve(normal, right) or not right[0, 0] > 0.0:
             continue
         chi2, total = 0.0, 0.0
         made[n] = origin
@@ -151,8 +175,8 @@ def _interpolate(
                     weight = _weigh(spread[i, j], (i - line) / high, (j - row) / wide, basis)
                     fit, share = 0.0, 0.0
                     for a in range(6):
-                        fit += basis[a] * solved[a, 1]
-                        share += weight * basis[a] * solved[a, 0]
+                        fit += basis[a] * right[a, 1]
+                        share += weight * basis[a] * right[a, 0]
                     chi2 += weight * (_along(points[i, j], origin, way) - fit) ** 2 / (count - 6)
                     total += weight
                     for k in range(3):
@@ -162,7 +186,7 @@ def _interpolate(
             continue
         # What the surface has beyond a quadratic shows in the residuals, and does not average out in the hole.
         excess = max(0.0, chi2 - 1.0 - 2.0 * np.sqrt(2.0 / (count - 6)))
-        variances[n] = solved[0, 0] * max(1.0, chi2) + MISFIT * excess * count / total
+        variances[n] = right[0, 0] * max(1.0, chi2) + MISFIT * excess * count / total
         ways[n] = way
     return made, variances, ways
 

@@ -136,6 +136,7 @@ class JobRun:
     def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
         started = time.time()
         begun = self.devices.clock.now()
+        open_before = self.devices.gate.is_open
         witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames") as frames:
@@ -162,11 +163,13 @@ class JobRun:
                 recover=self._recover,
                 health=lambda: require_healthy(self.devices),
                 control=self.run.control,
-                script=self.script,
+                script=self._in_the_gate(self.script),
             )
             result = runner.run()
-        if result.outcome in (Outcome.PLACED, Outcome.DONE):
-            # The stop at the end of a good run keeps nobody from going on; one that a person asked for meanwhile does.
+        good = result.outcome in (Outcome.PLACED, Outcome.DONE)
+        if good and open_before:
+            # The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
+            # that a person asked for meanwhile.
             stops = self.devices.gate.stops
             if not self.run.control.late:
                 self.devices.gate.clear(stops)
@@ -209,6 +212,20 @@ class JobRun:
         write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
         write_json(folder / "job.json", self.job.model_dump(mode="json"))
         save_calibration(self.calibration, folder / "calibration.json")
+
+    def _in_the_gate(self, script: Script) -> Script:
+        """The script, whose calls enter the gate as work of this run: what they begin ends with the run, not before."""
+        gate, token = self.devices.gate, self.run.control.token
+
+        def entered(call: Callable[..., Any]) -> Callable[..., Any]:
+            def work(*arguments: object) -> Any:
+                with gate.entered(token):
+                    return call(*arguments)
+
+            return work
+
+        after = {name: entered(look) for name, look in script.after.items()}
+        return Script(after, None if script.on_refusal is None else entered(script.on_refusal))
 
     def _recover(self, error: BaseException, token: CancelToken, confirmed: bool) -> None:
         """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""

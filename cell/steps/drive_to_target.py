@@ -156,8 +156,7 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     vehicle = here.devices.vehicle
     if trouble := vehicle.state().trouble:
         context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
-    vehicle.enable()
-    vehicle.brake()
+    vehicle.recover()
     if not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)

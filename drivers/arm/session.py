@@ -11,7 +11,7 @@ from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import fault, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.link import ArmLink
-from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, PLAYING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.safing import Safing
 from drivers.arm.wrong_arm import Forward, flange_agrees, require_same_flange
 from drivers.clock import Clock
@@ -25,6 +25,8 @@ _STOP_S = 2.0
 _OUTPUT_S = 1.0
 _CLOSE_S = 4.0
 _TOOL_S = 0.5
+_STARTING_S = 0.5
+"""After connecting; a program that is ended later was not ended by the watchdog because the new child came late."""
 
 
 class ArmSession:
@@ -138,20 +140,26 @@ class ArmSession:
             self._require_open()
             self.dashboard.ask("stop")
             unlock(self._name, self.dashboard, self._clock, confirmed, lambda: self._require_no_stop_since(stops))
-            self._begin_anew(stops)
-            if not self.feed.fresh(0.1)[0].program_running:
+            if self._begin_anew(stops):
                 # On a busy machine the new child may come too late for the controller's watchdog: once more.
                 self.statistics.count("started again")
                 self._begin_anew(stops)
             self.require_ready()
             self._require_model()
 
-    def _begin_anew(self, stops: int) -> None:
+    def _begin_anew(self, stops: int) -> bool:
+        """Whether the new program has ended at once, and not because a person has paused or ended it at the pendant."""
         self.link.close(_CLOSE_S)
         self._on_broken(fault(self._name, "arm.program_stopped", "the arm was recovered"))
         self._safing.join()
         self.feed.forget()
-        self._reconnect(stops)
+        seen: list[int] = []
+        with self.feed.listening(lambda snapshot: seen.append(snapshot.runtime)):
+            self._reconnect(stops)
+            connected = time.monotonic()
+            running = self.feed.fresh(0.1)[0].program_running
+        at_once = time.monotonic() - connected < _STARTING_S
+        return not running and at_once and all(runtime <= PLAYING for runtime in seen)
 
     def _reconnect(self, stops: int) -> None:
         self._require_no_stop_since(stops)

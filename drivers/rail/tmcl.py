@@ -138,7 +138,7 @@ class TmclRail:
     def move_to(self, position: float, speed: float | None = None) -> RailMotion:
         """Move to `position` m at `speed` m/s (default the maximum); refused with `InterlockError` before homing."""
         check_range(self.name, "position", position, *self.travel, "m")
-        speed = check_positive(self.name, "speed", speed or self._max_speed, self._max_speed, "m/s")
+        speed = check_positive(self.name, "speed", self._max_speed if speed is None else speed, self._max_speed, "m/s")
         with self._starting:
             issued = self._free()
             duration = self._start(position, speed, issued)

@@ -2,7 +2,7 @@
 
 The set velocity is kept alive by a thread of the driver, which falls back to zero when nobody renews it; the vehicle
 itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last, and
-None before this driver has commanded it.
+None before this driver has commanded it, or when somebody else may have changed it since.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -66,6 +67,8 @@ class AgilexVehicle:
         self._renewed = -math.inf
         self._enabled = self._took_command = False
         self._braked: bool | None = None
+        self._interruptions = 0
+        """How many there had been when the brake was commanded: one more, and it may have been released since."""
         self._stopping = 0
         self._closed = threading.Event()
         self._open = partial(
@@ -109,7 +112,9 @@ class AgilexVehicle:
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old (see `Feedback.state`), else `DeadlineError`."""
         self._link.check()
-        return self._feedback.state(max_age, self._braked)
+        state = self._feedback.state(max_age, self._braked)
+        lost = self._enabled and not state.command_mode
+        return replace(state, braked=None) if lost or state.interruptions != self._interruptions else state
 
     def check(self) -> None:
         """Raise the `DeviceFault` that the vehicle shows now; see `Feedback.check`. Returns at once otherwise.
@@ -136,7 +141,7 @@ class AgilexVehicle:
         self._take_command()
         self._link.send("BrakeCommand", Locked=0)
         with self._command:
-            self._braked = False
+            self._braked, self._interruptions = False, self._feedback.interruptions
 
     def recover(self) -> None:
         """As `enable`, but with the brake locked throughout: the vehicle stays where it was measured."""
@@ -224,7 +229,7 @@ class AgilexVehicle:
         finally:
             # No drive() between the standstill and the brake.
             with self._command:
-                self._braked = True
+                self._braked, self._interruptions = True, self._feedback.interruptions
                 self._stopping -= 1
             self._link.send("BrakeCommand", Locked=1)
 

@@ -102,6 +102,12 @@ class Feedback:
             self._interruptions += 1
             self._interruption = why
 
+    @property
+    def interruptions(self) -> int:
+        """How often odometry lost its connection to where the vehicle was before."""
+        with self._news:
+            return self._interruptions
+
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what others did before."""
         with self._news:

@@ -98,7 +98,7 @@ class DirectRail:
     def move_to(self, position: float, speed: float | None = None) -> RailMove:
         """Move to `position` m; refused with `InterlockError` before homing."""
         within(self.name, "position", position, *self.travel, "m")
-        speed = self._checked(speed or self.setup.max_speed)
+        speed = self._checked(self.setup.max_speed if speed is None else speed)
         self._motion = RailMove(self, self._start(position, speed))
         return self._motion
 

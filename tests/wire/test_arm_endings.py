@@ -299,6 +299,23 @@ def test_a_recovery_ends_the_old_program_before_it_unlocks_even_if_its_process_h
     arm.recover()
 
 
+def test_a_program_that_a_person_pauses_as_it_has_been_recovered_is_not_begun_once_more(arm, bench):
+    before = arm._session.link._reader
+    said = []
+
+    def person(snapshot):
+        if not said and threading.current_thread() is not before:
+            said.append(dashboard(bench, "pause"))
+            Clock().sleep(0.3)
+
+    with arm._session.feed.listening(person), pytest.raises(DeviceFault) as caught:
+        arm.recover()
+    assert said == ["Pausing program"]
+    assert caught.value.code == "arm.program_stopped"
+    assert "started again" not in arm.statistics.errors
+    arm.recover()
+
+
 def test_a_motion_that_a_protective_stop_ended_does_not_go_on_when_it_is_unlocked_by_hand(arm, bench):
     moving = swinging(arm, bench)
     bench.ask("protective_stop")

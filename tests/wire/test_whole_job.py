@@ -24,6 +24,11 @@ def placed(supervised: Supervised) -> dict[str, Any]:
     return supervised.report
 
 
+def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervised) -> None:
+    assert supervised.printed.startswith("placed")
+    assert "mean D" in supervised.printed
+
+
 def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(placed: dict[str, Any]) -> None:
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
@@ -111,6 +116,7 @@ def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path) -> None
         assert not Path(f"/proc/{pid}").exists()
 
 
+@pytest.mark.campaign
 def test_two_dry_runs_at_once_do_not_disturb_each_other(place: Path) -> None:
     again = ("dry-run", "--seed", "3", "--until", "board_photo", "--json")
     with started(*again, folder=place) as first, started(*again, folder=place) as second:

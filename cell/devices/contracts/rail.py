@@ -71,7 +71,7 @@ class RailContract(DeviceContract):
         before = rail.state().position
         for beyond in (lambda: rail.move_to(high + 0.001), lambda: rail.move_to(low - 0.001),
                        lambda: rail.move_to(0.01, 100.0), lambda: rail.move_to(0.01, -0.01),
-                       lambda: rail.sweep_start(low, high, SPEED)):  # fmt: skip
+                       lambda: rail.move_to(0.01, 0.0), lambda: rail.sweep_start(low, high, SPEED)):  # fmt: skip
             with pytest.raises(LimitError):
                 beyond()
         assert rail.state().position == pytest.approx(before, abs=EXACT_M)

@@ -88,7 +88,10 @@ def campaign(folder: Path, count: int, seed: int, speed: float, progress: Callab
         work = WORK[(number // 2) % len(WORK)]
         way = "kill" if number % 2 == 0 else WAYS[1 + (number // 2) % (len(WAYS) - 1)]
         progress(number, f"{way} in {work}")
-        endings.append(_trial(folder, work, way, float(rng.uniform(0.0, _LASTS_S[work])), seed, speed))
+        ending = None
+        while ending is None:
+            ending = _trial(folder, work, way, float(rng.uniform(0.0, _LASTS_S[work])), seed, speed)
+        endings.append(ending)
         log.info("%s", json.dumps(asdict(endings[-1])))
     return endings
 
@@ -115,7 +118,8 @@ def summary(endings: list[Ending], seed: int, speed: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _trial(folder: Path, work: str, way: str, instant: float, seed: int, speed: float) -> Ending:
+def _trial(folder: Path, work: str, way: str, instant: float, seed: int, speed: float) -> Ending | None:
+    """One trial; None when the work had ended by itself before the instant."""
     with _world(folder, seed, speed) as truth_address:
         if work in JOGS:
             words = JOGS[work]
@@ -131,9 +135,11 @@ def _trial(folder: Path, work: str, way: str, instant: float, seed: int, speed: 
         )
         try:
             run = _begun(folder / "runs", before, work, process)
-            # Ends earlier by itself when the step was shorter than the instant: then nothing is left to end.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(instant / speed)
+                return None
+            if not is_going(run):
+                return None
             _end(process, run, way)
             rest, moved = _watch(truth_address)
             try:

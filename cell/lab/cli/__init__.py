@@ -22,7 +22,7 @@ from cell.lab.cli import (
 
 
 def register(app: typer.Typer) -> None:
-    """Add `cell bench` and `cell paper` to the command line `app`."""
+    """Add `cell bench` and `cell paper` to `app`."""
     bench = typer.Typer(
         help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
     )
