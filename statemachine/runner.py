@@ -212,8 +212,8 @@ class Runner:
     ) -> tuple[Failure | None, str | None]:
         """Clear a fault: why that ended the run, or None; and who has confirmed it, where that was needed."""
         self.sequence.fire(Trigger.FAULT)
-        # A device that is to be recovered may not have confirmed it; after the recovery all have to.
-        self._stop(f"fault in {step.name}", end)
+        # The failed attempt was stopped already. A device that is to be recovered may not have confirmed it; after the
+        # recovery all have to.
         by = None
         if end.needs_person:
             refused, by = self._person(step, end)
