@@ -5,6 +5,7 @@ A client that vanishes, floods or stops reading never stops the others.
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 from collections.abc import Iterator, Sequence
@@ -77,8 +78,12 @@ class TcpPorts:
     """Listening sockets on `ports` of one address in 127.0.0.0/8."""
 
     def __init__(self, ports: Sequence[int], host: str | None = None) -> None:
-        """Bind on `host`, or on the first of 127.0.0.2 … 127.0.0.254 where all ports are free; OSError if none is."""
-        hosts = [host] if host is not None else [f"127.0.0.{i}" for i in range(2, 255)]
+        """Bind on `host`, or on the first of 127.0.n.2 … 127.0.n.254 where all ports are free; OSError if none is.
+
+        n follows from the process: a client of an arm that has died must not find another one at its address.
+        """
+        net = os.getpid() % 250
+        hosts = [host] if host is not None else [f"127.0.{net}.{i}" for i in range(2, 255)]
         self._listeners: dict[int, tuple[int, socket.socket]] = {}
         error: OSError | None = None
         for candidate in hosts:

@@ -48,7 +48,7 @@ class RtdePeer:
     """The controller of one simulated arm on its own loopback address."""
 
     def __init__(self, model: ArmModel, clock: WorldClock, host: str | None = None) -> None:
-        """Bind the four ports on `host`, or on the first free 127.0.0.x from 127.0.0.2 upward.
+        """Bind the four ports on `host`, or on the first free address that `TcpPorts` finds.
 
         Raises OSError when an address or every address is taken.
         """
@@ -190,7 +190,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Serve one arm with exact kinematics until SIGINT, SIGTERM or the end of standard input (with --until-eof)."""
     parser = argparse.ArgumentParser(prog="python -m sim_backends.peers.rtde", description=main.__doc__)
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second")
-    parser.add_argument("--host", default=None, help="loopback address, default: the first free one from 127.0.0.2")
+    parser.add_argument("--host", default=None, help="loopback address, default: a free one")
     parser.add_argument("--model", choices=sorted(TABLES), default="UR10e", help="which arm")
     parser.add_argument("--unlock-delay", type=float, default=5.0, help="world seconds before a stop can be unlocked")
     parser.add_argument("--json", action="store_true", help="announce the address as one JSON line")
