@@ -7,7 +7,7 @@ import select
 import socket
 import threading
 
-PORTS = (30004, 30003, 30002, 29999)
+PORTS = (30004, 30003, 30002, 30001, 29999)
 
 
 class Cable:
