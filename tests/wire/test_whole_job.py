@@ -10,10 +10,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.wire.cells import Supervised, ask, assert_safe, cell, served, started, wait_for_step
+from tests.wire.cells import Supervised, assert_safe, cell, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 
@@ -131,23 +130,3 @@ def test_a_run_without_a_calibration_of_this_cell_is_refused(tmp_path: Path) -> 
         done = cell("run", "-c", "sim.toml", folder=tmp_path)
     assert done.returncode == 1
     assert "calibrat" in done.stderr
-
-
-def test_jogs_move_and_are_refused_outside_the_limits(tmp_path: Path) -> None:
-    with served(tmp_path, "--seed", "3") as endpoints:
-        before = np.array(ask(endpoints, op="truth")["truth"]["poses"]["base_from_flange"])
-        assert cell("jog", "arm", "z", "-10mm", "-c", "sim.toml", folder=tmp_path).returncode == 0
-        after = np.array(ask(endpoints, op="truth")["truth"]["poses"]["base_from_flange"])
-        assert after[2, 3] - before[2, 3] == pytest.approx(-0.010, abs=0.0005)
-        assert cell("jog", "rail", "+5mm", "-c", "sim.toml", folder=tmp_path).returncode == 0
-        assert ask(endpoints, op="truth")["truth"]["rail"]["carriage"] == pytest.approx(0.005, abs=0.0002)
-        start = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
-        refused = cell("jog", "vehicle", "+0.1m", "-c", "sim.toml", folder=tmp_path)
-        assert (refused.returncode, "arm_stowed" in refused.stderr) == (1, True)
-        word = ("--lift", "arm_stowed", "--reason", "the arm stands upright")
-        assert cell("jog", "vehicle", "+0.1m", *word, "-c", "sim.toml", folder=tmp_path).returncode == 0
-        end = np.array(ask(endpoints, op="truth")["truth"]["poses"]["world_from_vehicle"])
-        assert np.linalg.norm(end[:2, 3] - start[:2, 3]) == pytest.approx(0.1, abs=0.01)
-        refused = cell("jog", "rail", "-20mm", "-c", "sim.toml", folder=tmp_path)
-        assert refused.returncode == 1
-        assert "0 mm" in refused.stderr or "0 to 100" in refused.stderr
