@@ -53,17 +53,23 @@ GROUPS = (
     ("test_interlocks.py",),
     ("test_calibration.py",),
 )
-"""Groups of files in the order in which they begin; any other file is a group of its own, after them."""
+"""Groups of files in the order in which they begin. Other files over the wires end the first one; any other is a group
+of its own, after them."""
 
-_HERE = Path(__file__).parent
-_PLACES = {_HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
+HERE = Path(__file__).parent
+PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
 GIVES_WAY = 10
 """By how much what only computes is nicer than what keeps deadlines on the wall."""
 
 
+def place(file: Path) -> tuple[int, int]:
+    """Which group a file belongs to, and where in it it comes."""
+    return PLACES.get(file, (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what lasts longest."""
-    items.sort(key=lambda item: _PLACES.get(item.path, (len(GROUPS), 0)))
+    items.sort(key=lambda item: place(item.path))
 
 
 class Grouped(LoadFileScheduling):
@@ -71,8 +77,8 @@ class Grouped(LoadFileScheduling):
 
     def _split_scope(self, nodeid: str) -> str:
         file = super()._split_scope(nodeid)
-        place = _PLACES.get(self.config.rootpath / file)
-        return file if place is None else f"group {place[0]}"
+        group, _ = place(self.config.rootpath / file)
+        return file if group == len(GROUPS) else f"group {group}"
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling | None:
