@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -137,8 +136,7 @@ def test_cell_abort_ends_a_calibration(tmp_path: Path) -> None:
         assert work.returncode == 1, error
         assert "cell abort" in error
         assert_safe(endpoints)
-        runs = json.loads(cell("runs", "-c", "sim.toml", "--json", folder=tmp_path).stdout)
-    assert [run["outcome"] for run in runs] == ["aborted"]
+    assert [read_report(run)["outcome"] for run in list_runs(tmp_path / "runs")] == ["aborted"]
 
 
 def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(tmp_path: Path) -> None:

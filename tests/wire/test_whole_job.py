@@ -7,6 +7,7 @@ import os
 import signal
 import sqlite3
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +82,14 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
         assert_safe(endpoints)
 
 
-def test_cell_abort_ends_a_run_from_another_shell(place: Path) -> None:
+def test_cell_abort_ends_a_run_from_another_shell(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "drive_to_target")
-            held = cell("jog", "rail", "+1mm", "-c", "sim.toml", folder=place)
+            code, _, error = typed("jog", "rail", "+1mm", "-c", str(place / "sim.toml"))
             asked = cell("abort", "-c", "sim.toml", folder=place)
             out, err = run.communicate(timeout=30)
-        assert held.returncode == 1
-        assert "held by process" in held.stderr
+        assert (code, "held by process" in error) == (1, True), error
         assert asked.returncode == 0, asked.stderr
         assert run.returncode == 1, err
         assert json.loads(out)["outcome"] == "aborted"
