@@ -41,8 +41,9 @@ from cell.devices.stopping import require_healthy, require_no_emergency_stop, st
 from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.run.folder import CellLock, find_run
+from cell.run.folder import find_run
 from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.lock import CellLock
 from cell.run.maintenance import recorded_maintenance
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import UnfinishedRun, job_source

@@ -13,18 +13,9 @@ import pytest
 from cell import Cell
 from cell.cli.run import abort
 from cell.config import CellConfig, default_toml, load_config
-from cell.run.folder import (
-    CellLock,
-    Question,
-    awaited_word,
-    find_going,
-    find_run,
-    is_going,
-    list_runs,
-    new_run,
-    read_report,
-    write_json,
-)
+from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
+from cell.run.lock import CellLock
+from cell.run.reading import Question, awaited_word, read_report
 from drivers.errors import ConfigError, InterlockError
 from statemachine.journal import Journal
 

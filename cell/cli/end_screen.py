@@ -10,7 +10,7 @@ from typing import Any
 
 from cell.job import job_path, shipped_jobs
 from cell.report.figures import shown_limit, shown_value
-from cell.run.folder import wall_seconds
+from cell.run.reading import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""

@@ -29,8 +29,8 @@ class Demands:
     """What a scan has to be like to be believed.
 
     coverage: share of the surface that has points; share: points over the surface that fit it; rms: of those, m;
-    departed: share of the scanned area that may lie off the surface by more than the tolerances move it; dissent: how far
-    from the whole's place a quarter of the surface may put it, beyond three standard deviations, in tolerances.
+    departed: share of the scanned area that may lie off the surface by more than the tolerances move it; dissent: how
+    far from the whole's place a quarter of the surface may put it, beyond three standard deviations, in tolerances.
     """
 
     coverage: float = 0.35
