@@ -195,7 +195,10 @@ def abort(
         try:
             _ask(str(run), config, "abort", reason, "asked {} to end")
         except ConfigError as error:
-            unasked.append(str(error))
+            if listens(run):
+                unasked.append(str(error))
+            else:
+                typer.echo(f"{run.name} has ended meanwhile")
     if unasked:
         raise ConfigError("not asked to end: " + "; ".join(unasked))
 
