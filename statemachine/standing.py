@@ -33,7 +33,10 @@ def hold(sequence: Sequence, watchman: Watchman) -> tuple[Failure | None, Except
 
 
 def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | None, str | None]:
-    """Wait until a person has confirmed the fault `end`: why that ended the run, or None; and who it was."""
+    """Wait until a person has confirmed the fault `end`: why that ended the run, or None; and who it was.
+
+    A fault that no recovery can clear, such as an emergency stop, ends the wait and the run.
+    """
     policy, control, tell = watchman.policy, watchman.control, watchman.teller.tell
     if policy.simulated_person:
         by = "the simulated person"
@@ -43,8 +46,8 @@ def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | 
         try:
             until = time.monotonic() + policy.confirm_deadline_s
             while (found := control.answer()) is None:
-                if (asked := watchman.wait_briefly()) is not None:
-                    return asked, None
+                if (worse := watchman.wait_briefly() or _worse(watchman)) is not None:
+                    return worse, None
                 if time.monotonic() > until:
                     text = f"{end.reason}; nobody confirmed within {policy.confirm_deadline_s:g} s"
                     return replace(end, outcome=Outcome.FAULTED, reason=text), None
@@ -53,3 +56,11 @@ def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | 
             control.asked_no_more()
     tell(Event("confirmed", step.name, {"by": by, "reason": end.reason}))
     return None, by
+
+
+def _worse(watchman: Watchman) -> Failure | None:
+    """What ails the cell and no recovery can clear; the fault that a person is asked about can be cleared."""
+    if (error := watchman.examine()) is None or watchman.classified(error).recoverable:
+        return None
+    watchman.error = error
+    return watchman.judge(error)

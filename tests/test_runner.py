@@ -13,6 +13,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
+from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
@@ -448,6 +449,21 @@ def test_who_asks_for_the_end_as_a_run_comes_to_a_good_one_is_not_lost(tmp_path)
     assert bench.runner.control.late
 
 
+def test_who_asks_for_the_end_just_as_the_run_has_it_is_late():
+    """The run comes to its end while it is being asked to: between the two nothing is lost."""
+
+    class EndsMeanwhile(CancelToken):
+        def cancel(self, reason):
+            control.over = True
+            assert super().cancel("the run has ended")
+            return super().cancel(reason)
+
+    control = RunControl()
+    control.token = EndsMeanwhile()
+    control.abort("Cell.stop()")
+    assert control.late
+
+
 def test_who_ended_a_run_did_not_come_late(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.abort("enough"))
     assert bench.run().outcome is Outcome.ABORTED
@@ -669,6 +685,28 @@ def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(t
     (fault,) = result.faults
     assert (fault.step, fault.attempt, fault.code) == ("laser_sweep", 1, "fault")
     assert fault.remedy == "confirmed by Ann, recovered"
+
+
+def test_an_emergency_stop_ends_the_wait_for_a_persons_word(tmp_path):
+    def health():
+        if pressed.is_set():
+            raise OSError("the emergency stop is pressed")
+        if bench.log[-1:] == ["stop: laser_sweep failed"]:
+            raise ConnectionRefusedError("protective stop")
+
+    def observe(event):
+        if event.kind == "confirm_needed":
+            pressed.set()
+
+    pressed = threading.Event()
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.observer, bench.runner.health = observe, health
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.FAULTED, "the emergency stop is pressed")
+    assert "recover" not in bench.log
+    assert not bench.runner.control.confirm("too late")
 
 
 def test_nobody_confirms_and_the_run_ends_without_a_recovery(tmp_path):
