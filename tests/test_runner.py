@@ -701,6 +701,7 @@ def test_an_emergency_stop_ends_the_wait_for_a_persons_word(tmp_path):
     pressed = threading.Event()
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.policy = replace(bench.runner.policy, confirm_deadline_s=5.0)
     bench.runner.observer, bench.runner.health = observe, health
     bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
     result = bench.run()
