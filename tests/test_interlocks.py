@@ -22,7 +22,7 @@ from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock

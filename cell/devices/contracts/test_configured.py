@@ -18,7 +18,7 @@ from cell.devices.contracts.camera import CameraContract
 from cell.devices.contracts.rail import RailContract
 from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from drivers.clock import Clock
 
 pytestmark = pytest.mark.skipif(
