@@ -45,7 +45,8 @@ class Faults(Protocol):
         """Cause the fault with this code, such as `arm.protective_stop`, now."""
 
     def clear(self) -> None:
-        """Take away whatever causes faults: the button is released, the motor is well again."""
+        """Take away whatever causes faults: the button is released, the motor is well again, an arm that the device
+        hangs on is ready again."""
 
 
 @dataclass(eq=False)

@@ -22,6 +22,7 @@ from cell.devices.contracts.vehicle import VehicleContract
 from cell.devices.truth_link import cause_fault, clear_faults
 from cell.run.folder import CellLock
 from drivers.clock import Clock
+from drivers.interfaces import Arm
 
 pytestmark = pytest.mark.skipif(
     "CELL_CONTRACTS" not in os.environ, reason="CELL_CONTRACTS names no configuration: no device is touched"
@@ -39,9 +40,10 @@ def configured() -> Iterator[CellConfig]:
 
 @dataclass(frozen=True)
 class ServedFaults:
-    """The faults of a served simulated cell, through its truth endpoint."""
+    """The faults of a served simulated cell, through its truth endpoint; `arm` is what the device hangs on, if any."""
 
     address: str
+    arm: Arm | None
 
     def cause(self, name: str) -> None:
         """Cause one."""
@@ -50,6 +52,8 @@ class ServedFaults:
     def clear(self) -> None:
         """Take them all away."""
         clear_faults(self.address)
+        if self.arm is not None:
+            self.arm.recover(confirmed=True)
 
 
 def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
@@ -62,7 +66,7 @@ def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
             over.callback(arm.close)
         motion = float(os.environ.get("CELL_CONTRACTS_MOTION", "0.2"))
         linked = not config.make(name).on_arm
-        faults = ServedFaults(config.cell.truth) if config.cell.truth else None
+        faults = ServedFaults(config.cell.truth, arm) if config.cell.truth else None
         bench = Bench(lambda: connect_one(config, name, clock, arm=arm), clock, motion, linked, faults)
         over.callback(bench.over)
         yield bench
