@@ -27,7 +27,7 @@ EFFORTS = (
     Effort(4, 1.2, 0.02, 12000),
     Effort(5, 7.0, 0.02, 16000),
 )
-"""The searches, one after the other until a way is found that stays free between its steps; 2 s when none is."""
+"""The searches, one after the other until a way is found that stays free between its steps."""
 
 
 class Planner:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cell.motion.kinematics import Joints
 
-BRANCH = 3.0
+BRANCH = 1.5
 """Longest branch in rad that the search adds at once."""
 _one_at_a_time = threading.Lock()
 """The library has one source of seeds for the whole process."""
@@ -81,7 +81,7 @@ def search(
         path = problem.getSolutionPath()
         simplifier = geometric.PathSimplifier(info)
         simplifier.reduceVertices(path)
-        simplifier.partialShortcutPath(path, 40, 20)
+        simplifier.ropeShortcutPath(path)
         simplifier.reduceVertices(path)
         return np.array([start, *[_joints(state) for state in path.getStates()[1:-1]], end])
 
