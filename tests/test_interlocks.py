@@ -23,7 +23,7 @@ from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
 from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock

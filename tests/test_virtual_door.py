@@ -206,6 +206,18 @@ def test_a_protective_stop_waits_for_a_persons_word() -> None:
     assert outcome.report["faults"][0]["remedy"] == "confirmed by the test, recovered"
 
 
+@pytest.mark.parametrize("button", ["arm", "vehicle"])
+def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str) -> None:
+    with opened() as cell:
+        assert cell.simulated is not None
+        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
+        upto(run, ConfirmNeeded)
+        cell.simulated.fault({"arm": "arm.emergency_stop", "vehicle": "vehicle.emergency_stop"}[button])
+        outcome = run.result(60.0)
+    assert (outcome.outcome, outcome.report["code"]) == ("faulted", f"{button}.emergency_stop")
+    assert [fault["code"] for fault in outcome.report["faults"]] == [f"{button}.emergency_stop"]
+
+
 def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
     with opened() as cell:
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])

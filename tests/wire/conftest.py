@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cell.run.folder import list_runs, read_report
+from cell.run.folder import list_runs
+from cell.run.reading import read_report
 from tests.test_readme import block
 from tests.wire.cells import Supervised
 from tests.wire.heartbeat import Heartbeat

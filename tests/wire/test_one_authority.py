@@ -15,7 +15,8 @@ import pytest
 from cell import Cell, RunOutcome
 from cell.devices.truth_link import ask_truth
 from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
-from cell.run.folder import is_going, list_runs, read_report
+from cell.run.folder import is_going, list_runs
+from cell.run.reading import read_report
 from cell.run.run import Run
 from drivers.clock import Clock
 from drivers.errors import InterlockError

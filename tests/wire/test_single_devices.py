@@ -9,7 +9,7 @@ import pytest
 
 from cell.config import default_toml, load_config
 from cell.devices.assembly import connect
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from drivers.errors import InterlockError, NotConnectedError
 from tests.packages import RAIL, install, with_acme_rail
 from tests.wire.cells import ask, cell, served

@@ -20,7 +20,7 @@ from cell.devices.contracts.rail import RailContract
 from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
 from cell.devices.truth_link import cause_fault, clear_faults
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.interfaces import Arm
 
