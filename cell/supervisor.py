@@ -175,7 +175,7 @@ class Cell:
 
         `hold` is called before each free motion: a paused run waits in it.
         """
-        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold)
+        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks)
 
     @property
     def current(self) -> Run[Any] | None:
