@@ -53,9 +53,10 @@ class CellCalibration:
         target: list[TargetObservation],
         identities: dict[str, str],
         config: CellConfig,
+        kinematics: str = "",
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"

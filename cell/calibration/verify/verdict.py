@@ -138,8 +138,8 @@ class Verification:
         text = f"the calibration of {self.date} is good: nothing has changed that shows"
         if np.isfinite(self.hidden):
             text += (
-                f", and what moves the place by more than {1e3 * self.hidden:.2f} mm would have shown in {DETECTED:.0%} "
-                f"of checks like this one (allowed at the place are {allowed})"
+                f", and what moves the place by more than {1e3 * self.hidden:.2f} mm would have shown in "
+                f"{DETECTED:.0%} of checks like this one (allowed at the place are {allowed})"
             )
         hiding = [
             f"{d.change.part}, {d.change.kind} ({_size(d)}, {1e3 * effect:.2f} mm at the place)"
