@@ -5,6 +5,7 @@ The decision itself is `cell.calibration.verify.decision`'s, the pictures are ta
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +24,9 @@ from cell.report.html import table
 from cell.steps.camera_poses import centre_of
 from cell.vision import parse_board
 
-SHARE = 1 / 3
-"""Of the place's tolerance: what moves the place by less is told and not called bad."""
+SHARE = 0.3
+"""Of the place's tolerance: what moves the place by less is told and not called bad. A third, with room for an estimate
+that falls a little short."""
 SURE = 0.95
 """How sure a change's effect is below what is stated as the most."""
 _DRAWS = 100
@@ -48,17 +50,7 @@ class Verification:
     @classmethod
     def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Verification:
         """Compare what was seen with the calibration, and reckon the effect for a job."""
-        verdict = verify(calibration.scan, calibration.target, seen)
-        board = parse_board(job.board.spec)
-        camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
-        place = (camera_from_board * job.place_from_board.inverse()).translation
-
-        def effect(chain: str, change: Array) -> float:
-            if chain == "target":
-                return target_effect(calibration.target, change, place)
-            # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
-            half = 0.5 * job.scan.length
-            return scan_effect(calibration.scan, change, job.scan.stand_off, (-half, half))
+        verdict, effect = verify(calibration.scan, calibration.target, seen), at_place(calibration, job)
 
         def at_most(suspect: Suspect) -> float:
             drawn = np.random.default_rng(0).normal(size=(_DRAWS, suspect.spread.shape[1])) @ suspect.spread.T
@@ -196,6 +188,22 @@ class Verification:
                 for f in v.figures
             ],
         }
+
+
+def at_place(calibration: CellCalibration, job: Job) -> Callable[[str, Array], float]:
+    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m."""
+    board = parse_board(job.board.spec)
+    camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
+    place = (camera_from_board * job.place_from_board.inverse()).translation
+
+    def effect(chain: str, change: Array) -> float:
+        if chain == "target":
+            return target_effect(calibration.target, change, place)
+        # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
+        half = 0.5 * job.scan.length
+        return scan_effect(calibration.scan, change, job.scan.stand_off, (-half, half))
+
+    return effect
 
 
 _DECK = {
