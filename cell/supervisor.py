@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from cell.calibration import sessions
 from cell.calibration.archive import Observations
-from cell.calibration.sessions import serial_numbers
+from cell.calibration.sessions import arm_table, serial_numbers
 from cell.calibration.store import (
     CellCalibration,
     find_calibration,
@@ -469,6 +469,7 @@ class Cell:
             serial_numbers(self.devices),
             self.config.calibration_hash(),
             self.config.calibration.max_age,
+            arm_table(self.config, self.devices),
         )
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:

@@ -12,6 +12,7 @@ from cell.calibration.verify.views import collect_verification
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.job import Job
+from cell.motion.arm_models import kinematics_name
 from cell.run.recorded_work import Hands
 from cell.steps.moves import Mover
 
@@ -28,6 +29,11 @@ def serial_numbers(devices: Devices) -> dict[str, str]:
     }
 
 
+def arm_table(config: CellConfig, devices: Devices) -> str:
+    """What the kinematics is called that the arm's controller computes with, and the cell after it."""
+    return kinematics_name(config.arm.model, devices.arm.link_table())
+
+
 def calibrate(
     config: CellConfig, devices: Devices, mover: Mover, hands: Hands, tell: Progress
 ) -> tuple[Observations, CellCalibration]:
@@ -38,7 +44,7 @@ def calibrate(
     scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
     target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
     tell(0.96, "solving")
-    observations = gathered(scan, target, serial_numbers(devices), config)
+    observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices))
     return observations, solve_observations(observations).calibration
 
 

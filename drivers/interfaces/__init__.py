@@ -16,6 +16,7 @@ from drivers.interfaces.device import Device, Identity, LinkStatistics, Motion, 
 from drivers.interfaces.rail import Rail, RailState, Sweep
 from drivers.interfaces.switches import Claw, Laser
 from drivers.interfaces.vehicle import Vehicle, VehicleState
+from drivers.link_table import LinkTable
 
 __all__ = [
     "Arm",
@@ -32,6 +33,7 @@ __all__ = [
     "Laser",
     "Latch",
     "LinkStatistics",
+    "LinkTable",
     "Motion",
     "Rail",
     "RailState",

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from drivers.clock_map import Latch
 from drivers.interfaces.device import Device, Motion, Vector
+from drivers.link_table import LinkTable
 
 
 class ArmSafety(Enum):
@@ -52,6 +53,9 @@ class ArmMotion(Motion, Protocol):
 
 class Arm(Device, Protocol):
     """A six-axis arm with zero TCP: all Cartesian poses are of the flange in the base."""
+
+    def link_table(self) -> LinkTable | None:
+        """The table that its controller computes with, calibrated in the factory; None where it does not tell."""
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` seconds old, else `DeadlineError`."""
