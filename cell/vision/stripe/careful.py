@@ -1,0 +1,256 @@
+"""The stripe of pictures that are not ordinary: colour, deep, wide, textured, with scenery, of an unknown profile.
+
+Slower than the search and fit of ordinary pictures: the plane is chosen in which the laser stands out, the stripe is
+followed as a line, its profile learned, and the deviation told from what surrounds it. `extract` comes here by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
+from cell.vision.stripe.learning import FREE_SCALE, learn_profile
+from cell.vision.stripe.planes import MIXES, Laser, Picture
+from cell.vision.stripe.shape import Shape
+from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, fit_shape
+from cell.vision.stripe.surroundings import around, carried, wander
+
+if TYPE_CHECKING:
+    from cell.vision.stripe.profile import StripeSettings
+
+Array = NDArray[np.float64]
+
+COARSE_ROWS, COARSE_COLUMNS = 160, 1400
+BINNED_WIDTH = 4.0
+"""A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
+CLEARLY_BETTER = 1.15
+"""By which factor a mix of colours has to do better than grey or than one before it."""
+MOST_WANDER = 2.5
+SURE = 3.5
+"""Least amplitude of a stripe in its standard deviations."""
+LEAST_SCORE = 0.35
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a picture taught that holds for others of the same set-up: the `mix` of colours, the `scale` that answers
+    (σ in px), the profile's `shape` in pixels of `binned` px, its `spread` from line to line, and the `noise`."""
+
+    mix: str
+    scale: float
+    binned: int
+    shape: Shape
+    spread: float
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class Careful:
+    """What `read_carefully` found, arrays (lines,) as in `StripeProfile`; `rival` is how high the next best peak of a
+    line is over the stripe's, 0 where there is none, and `misfit` χ² over what is usual in the picture."""
+
+    centres: Array
+    sigma: Array
+    amplitude: Array
+    width: Array
+    saturated: NDArray[np.bool_]
+    rival: Array
+    misfit: Array
+    learned: Learned | None
+
+
+def read_carefully(
+    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None = None,
+    starts: Array | None = None,
+) -> Careful:  # fmt: skip
+    """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
+
+    `starts` (lines,) in px, NaN where there is none, spare the following.
+    """
+    lines = picture.value.shape[0]
+    mix = like.mix if like is not None else choose_mix(picture, off, laser)
+    value, usable, shade = _difference(picture, off, mix)
+    rival = np.zeros(lines)
+    if starts is None:
+        found, chain, scale = _follow(value, like)
+        if not len(chain.rows):
+            return _nothing(lines)
+        place = np.full(lines, np.nan)
+        place[chain.rows] = found.place[chain.rows, chain.which]
+        rival = _rivals(found, chain)
+        place = _bridge(place)
+    else:
+        place, scale = starts, like.scale if like is not None else SCALES[2]
+    rows = np.flatnonzero(np.isfinite(place))
+    k = like.binned if like is not None else max(1, int(scale / BINNED_WIDTH))
+    plane = binned(Plane(value, usable, shade, _albedo(shade, usable)), k)
+    at = (place[rows] - 0.5 * (k - 1)) / k
+    noise = Noise(settings.read_noise_dn**2 / k, settings.gain_dn / k * float(np.abs(MIXES[mix]).sum()))
+    if like is None:
+        variance, _, level = around(plane, rows, at, 4 * scale / k)
+        noise = Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)
+        shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
+        learned = Learned(mix, shape.width * k, k, shape, spread, noise)
+    else:
+        learned = like
+    shape, noise = learned.shape, learned.noise
+    fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
+    variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
+    sigma = carried(fitted, variance, correlation)
+    out = _believed(fitted, sigma, at, shape, k, lines, plane)
+    # A surface may be rough: lines that wander tell of errors only where something is there to make them.
+    unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
+    factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
+    return Careful(
+        out.centres, out.sigma * factor, out.amplitude, out.width, out.saturated, rival, out.misfit, learned
+    )  # fmt: skip
+
+
+def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
+    """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names."""
+    if not picture.coloured or laser is not Laser.AUTO:
+        return laser.value if picture.coloured else "grey"
+    best, chosen = -np.inf, "grey"
+    for mix in MIXES:
+        score = coarse(_difference(picture, off, mix)[0]).score
+        if score > (best * CLEARLY_BETTER if best > 0 else best):
+            best, chosen = score, mix
+    return chosen
+
+
+def coarse(value: NDArray[np.float32]) -> Chain:
+    """The chain through some rows of a plane (lines, n), of pixels so large that it has no more than COARSE_COLUMNS."""
+    step = max(1, len(value) // COARSE_ROWS)
+    part: NDArray[np.float32] = np.ascontiguousarray(value[::step])
+    shrink = -(-part.shape[1] // COARSE_COLUMNS)
+    if shrink > 1:
+        size = (part.shape[1] // shrink, len(part))
+        part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    found = candidates(part, np.arange(0, len(part)), SCALES)
+    return follow(Candidates(found.rows * step, found.place * shrink, found.response, found.clear, found.scale), step)
+
+
+def _difference(
+    picture: Picture, off: Picture | None, mix: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32] | None]:
+    """The plane, the pixels that can be used, and what was taken off it."""
+    value, usable = picture.plane(mix)
+    if off is None:
+        return value, usable, None
+    shade, fine = off.plane(mix)
+    return value - shade, usable & fine, shade
+
+
+def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float]:
+    """Candidates and chain in all rows, and the scale in px that answers most."""
+    scales = np.asarray(SCALES)
+    typical = like.scale if like is not None else 0.0
+    if not typical:
+        step = max(1, len(value) // COARSE_ROWS)
+        rows = np.arange(0, len(value), step)
+        found = candidates(value, rows, SCALES)
+        chain = follow(found, float(step))
+        if not len(chain.rows) or chain.score < LEAST_SCORE:
+            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0
+        typical = float(np.median(found.scale[chain.rows, chain.which]))
+    near = scales[np.abs(np.log(scales / typical)) < 0.75]
+    found = candidates(value, np.arange(len(value)), tuple(near))
+    chain = follow(found)
+    if not len(chain.rows):
+        return found, chain, typical
+    return found, chain, float(np.median(found.scale[chain.rows, chain.which]))
+
+
+def _bridge(place: Array) -> Array:
+    """Places also in the gaps of the chain that are short and go on at the other side."""
+    there = np.flatnonzero(np.isfinite(place))
+    if len(there) < 2:
+        return place
+    before, after = there[:-1], there[1:]
+    size = after - before
+    smooth = (size > 1) & (size <= 24) & (np.abs(place[after] - place[before]) < 1.0 * size + 2)
+    filled = place.copy()
+    for first, last in zip(before[smooth], after[smooth], strict=True):
+        filled[first : last + 1] = np.interp(np.arange(first, last + 1), (first, last), (place[first], place[last]))
+    return filled
+
+
+def _rivals(found: Candidates, chain: Chain) -> Array:
+    """Response of the best candidate beside the chain over the chain's, of each row (m,), 0 where none is clear."""
+    rival = np.zeros(len(found.rows))
+    own = found.response[chain.rows, chain.which]
+    away = np.abs(found.place[chain.rows] - found.place[chain.rows, chain.which][:, None])
+    beside = (away > 3 * found.scale[chain.rows, chain.which][:, None]) & (found.clear[chain.rows] > 6)
+    beside &= np.arange(CANDIDATES) != chain.which[:, None]
+    rival[chain.rows] = np.where(beside, found.response[chain.rows], 0.0).max(axis=1) / np.maximum(own, 1e-6)
+    return rival
+
+
+def binned(plane: Plane, k: int) -> Plane:
+    """The plane of pixels that are `k` px wide, each the mean of what it holds; the last ones may fall away."""
+    if k == 1:
+        return plane
+    n = plane.value.shape[1] // k
+
+    def mean(part: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        if part is None:
+            return None
+        return np.asarray(part[:, : n * k].reshape(len(part), n, k).mean(axis=2), dtype=np.float32)
+
+    value = mean(plane.value)
+    assert value is not None
+    usable = np.asarray(plane.usable[:, : n * k].reshape(len(value), n, k).all(axis=2))
+    return Plane(value, usable, mean(plane.shade), mean(plane.albedo))
+
+
+BRIGHT, SMOOTH_PX = 25.0, 31
+"""DN of a picture without the laser from which it tells the albedo, and the px over which that is taken to be 1."""
+
+
+def _albedo(shade: NDArray[np.float32] | None, usable: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+    """How much lighter each pixel is than its surroundings in the picture without the laser; None where it is dark."""
+    if shade is None or float(np.median(shade)) < BRIGHT:
+        return None
+    here: Array = np.asarray(cv2.GaussianBlur(shade, (3, 3), 0), dtype=np.float64)
+    surroundings: Array = np.asarray(cv2.blur(here, (SMOOTH_PX, SMOOTH_PX)), dtype=np.float64)
+    relative = np.where(usable & (surroundings > BRIGHT), here / np.maximum(surroundings, 1.0), 1.0)
+    return np.asarray(np.clip(relative, 0.1, 4.0), dtype=np.float32)
+
+
+def _believed(
+    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane
+) -> Careful:  # fmt: skip
+    """The fits that are a stripe, in px of the picture and lines of all of it."""
+    width = shape.width
+    keep = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    keep &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
+    keep &= sigma < np.maximum(1.0, 0.7 * width)
+    if keep.any():
+        usual = float(np.median(fitted.log_scale[keep]))
+        keep &= np.abs(fitted.log_scale - usual) < 0.8
+    n = plane.value.shape[1]
+    keep &= (fitted.centre > 1.0) & (fitted.centre < n - 2.0)
+    out = {name: np.full(lines, np.nan) for name in ("centres", "sigma", "amplitude", "width", "misfit")}
+    rows = fitted.lines[keep]
+    out["centres"][rows] = k * fitted.centre[keep] + 0.5 * (k - 1)
+    out["sigma"][rows] = k * sigma[keep]
+    out["amplitude"][rows] = fitted.amplitude[keep]
+    out["width"][rows] = k * width * np.exp(fitted.log_scale[keep])
+    usual = float(np.median(fitted.chi2[keep])) if keep.any() else 1.0
+    out["misfit"][rows] = fitted.chi2[keep] / max(usual, 1e-6)
+    saturated = np.zeros(lines, np.bool_)
+    inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
+    saturated[rows] = inside[keep].any(axis=1)
+    return Careful(
+        out["centres"], out["sigma"], out["amplitude"], out["width"], saturated, np.zeros(lines), out["misfit"], None
+    )  # fmt: skip
+
+
+def _nothing(lines: int) -> Careful:
+    none, no = np.full(lines, np.nan), np.zeros(lines, np.bool_)
+    return Careful(none, none.copy(), none.copy(), none.copy(), no, np.zeros(lines), none.copy(), None)
