@@ -7,7 +7,7 @@ followed as a line, its profile learned, and the deviation told from what surrou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
 from cell.vision.stripe.learning import FREE_SCALE, learn_profile
 from cell.vision.stripe.planes import MIXES, Laser, Picture
-from cell.vision.stripe.shape import Shape
+from cell.vision.stripe.shape import Shape, gaussian
 from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, fit_shape
 from cell.vision.stripe.surroundings import around, carried, wander
 
@@ -26,10 +26,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 COARSE_ROWS, COARSE_COLUMNS = 160, 1400
+ALONG, FAR_ALONG, WEAK_SCORE = 0.8, 3.0, 8.0
+"""Rows are blurred by the first before the line is looked for in them, in px; by the second where it scores less."""
 BINNED_WIDTH = 4.0
 """A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
-CLEARLY_BETTER = 1.15
-"""By which factor a mix of colours has to do better than grey or than one before it."""
+ABOUT_AS_WELL = 0.75
+"""Mixes of colours that show the line by this share of the best are compared by what they know of its centres."""
+KNOWN_PX = 0.03
 MOST_WANDER = 2.5
 SURE = 3.5
 """Least amplitude of a stripe in its standard deviations."""
@@ -39,7 +42,8 @@ LEAST_SCORE = 0.35
 @dataclass(frozen=True)
 class Learned:
     """What a picture taught that holds for others of the same set-up: the `mix` of colours, the `scale` that answers
-    (σ in px), the profile's `shape` in pixels of `binned` px, its `spread` from line to line, and the `noise`."""
+    (σ in px), the profile's `shape` in pixels of `binned` px, its `spread` from line to line, the `noise`, and by how
+    many px rows were blurred `along` the line to find it."""
 
     mix: str
     scale: float
@@ -47,6 +51,7 @@ class Learned:
     shape: Shape
     spread: float
     noise: Noise
+    along: float
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def read_carefully(
     value, usable, shade = _difference(picture, off, mix)
     rival = np.zeros(lines)
     if starts is None:
-        found, chain, scale = _follow(value, like)
+        found, chain, scale, along = _follow(value, like)
         if not len(chain.rows):
             return _nothing(lines)
         place = np.full(lines, np.nan)
@@ -85,17 +90,16 @@ def read_carefully(
         rival = _rivals(found, chain)
         place = _bridge(place)
     else:
-        place, scale = starts, like.scale if like is not None else SCALES[2]
+        place, scale, along = starts, like.scale if like is not None else SCALES[2], ALONG
     rows = np.flatnonzero(np.isfinite(place))
     k = like.binned if like is not None else max(1, int(scale / BINNED_WIDTH))
     plane = binned(Plane(value, usable, shade, _albedo(shade, usable)), k)
     at = (place[rows] - 0.5 * (k - 1)) / k
     noise = Noise(settings.read_noise_dn**2 / k, settings.gain_dn / k * float(np.abs(MIXES[mix]).sum()))
     if like is None:
-        variance, _, level = around(plane, rows, at, 4 * scale / k)
-        noise = Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)
+        noise = surrounded(plane, rows, at, 4 * scale / k, noise)
         shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
-        learned = Learned(mix, shape.width * k, k, shape, spread, noise)
+        learned = Learned(mix, shape.width * k, k, shape, spread, noise, along)
     else:
         learned = like
     shape, noise = learned.shape, learned.noise
@@ -112,27 +116,80 @@ def read_carefully(
 
 
 def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
-    """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names."""
+    """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names.
+
+    Of the mixes that show it about as well, the one in which its centres are known best: a channel in which the core is
+    saturated, or the noise or the texture strong, gives way to another.
+    """
     if not picture.coloured or laser is not Laser.AUTO:
         return laser.value if picture.coloured else "grey"
-    best, chosen = -np.inf, "grey"
-    for mix in MIXES:
-        score = coarse(_difference(picture, off, mix)[0]).score
-        if score > (best * CLEARLY_BETTER if best > 0 else best):
-            best, chosen = score, mix
-    return chosen
+    looks = {mix: coarse(_difference(picture, off, mix)[0]) for mix in MIXES}
+    best = max(look.chain.score for look in looks.values())
+    shown = [m for m, look in looks.items() if look.chain.score >= ABOUT_AS_WELL * best and len(look.chain.rows)]
+    if len(shown) < 2:
+        return shown[0] if shown else "grey"
+    return max(
+        shown, key=lambda mix: _knowledge(*_difference(picture, off, mix), looks[mix].found, looks[mix].chain, mix)
+    )
 
 
-def coarse(value: NDArray[np.float32]) -> Chain:
-    """The chain through some rows of a plane (lines, n), of pixels so large that it has no more than COARSE_COLUMNS."""
+def _knowledge(
+    value: NDArray[np.float32], usable: NDArray[np.bool_], shade: NDArray[np.float32] | None, found: Candidates,
+    chain: Chain, mix: str,
+) -> float:  # fmt: skip
+    """How much the lines of a chain say about their centres, in 1/px², the sum of all that are worth a fit."""
+    rows, at = found.rows[chain.rows], found.place[chain.rows, chain.which]
+    scale = float(np.median(found.scale[chain.rows, chain.which]))
+    k = max(1, int(scale / BINNED_WIDTH))
+    plane, at, width = binned(Plane(value, usable, shade), k), (at - 0.5 * (k - 1)) / k, scale / k
+    noise = surrounded(plane, rows, at, 4 * width, Noise(0.1, 1 / 40 * float(np.abs(MIXES[mix]).sum())))
+    fitted = fit_shape(plane, rows, at, gaussian(width, 4 * width + 3), noise, FREE_SCALE)
+    good = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
+    variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
+    sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
+    # A line that is known very well says no more than that it is.
+    return float(np.sum(1 / (KNOWN_PX**2 + sigma**2)))
+
+
+def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:
+    """The noise with the floor that the surroundings of the lines show, no less than it has."""
+    variance, _, level = around(plane, rows, at, reach)
+    return Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)
+
+
+class Look(NamedTuple):
+    """What a coarse look at a plane gave: candidates, the chain through them, and by how many px rows were blurred."""
+
+    found: Candidates
+    chain: Chain
+    along: float
+
+
+def coarse(value: NDArray[np.float32]) -> Look:
+    """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels.
+
+    Where there is hardly a line to see, rows are blurred more: what is noisy is often straight.
+    """
+    look = _coarse(value, ALONG)
+    if look.chain.score > WEAK_SCORE:
+        return look
+    further = _coarse(value, FAR_ALONG)
+    return further if further.chain.score > 1.2 * look.chain.score else look
+
+
+def _coarse(value: NDArray[np.float32], along: float) -> Look:
     step = max(1, len(value) // COARSE_ROWS)
-    part: NDArray[np.float32] = np.ascontiguousarray(value[::step])
+    calm = cv2.GaussianBlur(value, (1, 2 * int(2.5 * along) + 1), sigmaX=0.0, sigmaY=along)
+    part: NDArray[np.float32] = np.ascontiguousarray(calm[::step], dtype=np.float32)
     shrink = -(-part.shape[1] // COARSE_COLUMNS)
     if shrink > 1:
         size = (part.shape[1] // shrink, len(part))
         part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    found = candidates(part, np.arange(0, len(part)), SCALES)
-    return follow(Candidates(found.rows * step, found.place * shrink, found.response, found.clear, found.scale), step)
+    found = candidates(part, np.arange(0, len(part)), SCALES, along=0.0)
+    place = found.place * shrink + 0.5 * (shrink - 1)
+    found = Candidates(found.rows * step, place, found.response, found.clear, found.scale * shrink)
+    return Look(found, follow(found, step), along)
 
 
 def _difference(
@@ -146,24 +203,21 @@ def _difference(
     return value - shade, usable & fine, shade
 
 
-def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float]:
-    """Candidates and chain in all rows, and the scale in px that answers most."""
+def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float, float]:
+    """Candidates and chain in all rows, the scale in px that answers most, and by how many px rows were blurred."""
     scales = np.asarray(SCALES)
-    typical = like.scale if like is not None else 0.0
+    typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
     if not typical:
-        step = max(1, len(value) // COARSE_ROWS)
-        rows = np.arange(0, len(value), step)
-        found = candidates(value, rows, SCALES)
-        chain = follow(found, float(step))
+        found, chain, along = coarse(value)
         if not len(chain.rows) or chain.score < LEAST_SCORE:
-            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0
+            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         typical = float(np.median(found.scale[chain.rows, chain.which]))
     near = scales[np.abs(np.log(scales / typical)) < 0.75]
-    found = candidates(value, np.arange(len(value)), tuple(near))
+    found = candidates(value, np.arange(len(value)), tuple(near), along)
     chain = follow(found)
     if not len(chain.rows):
-        return found, chain, typical
-    return found, chain, float(np.median(found.scale[chain.rows, chain.which]))
+        return found, chain, typical, along
+    return found, chain, float(np.median(found.scale[chain.rows, chain.which])), along
 
 
 def _bridge(place: Array) -> Array:

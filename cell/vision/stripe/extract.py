@@ -20,7 +20,7 @@ from cell.vision.stripe.profile import Image as Image
 from cell.vision.stripe.profile import Method as Method
 from cell.vision.stripe.profile import StripeProfile as StripeProfile
 from cell.vision.stripe.profile import StripeSettings as StripeSettings
-from cell.vision.stripe.quick import read_quickly, refuse_white
+from cell.vision.stripe.quick import Verdict, read_quickly, refuse_white
 from cell.vision.stripe.rivals import DOUBLE
 
 TRUSTED_SHARE = 0.98
@@ -45,8 +45,8 @@ def extract(
     the compiler, as "auto" does where there is none. `like` is the profile of an earlier picture of the same scene,
     whose noise, speckle and profile hold for this one as far as it has them; None: they are measured, where the
     settings do not declare them. An ordinary grey 8-bit picture takes .5 ms; what is not ordinary is read carefully
-    and takes a hundred times that. Raises ValueError for an image of another type, a dark frame of another size, an unknown method or
-    laser, `PictureRefused` for a picture that is blinded.
+    and takes a hundred times that. Raises ValueError for an image of another type, a dark frame of another size, an
+    unknown method or laser, `PictureRefused` for a picture that is blinded.
     """
     settings = settings or StripeSettings()
     method, laser = Method(method), Laser(laser)
@@ -61,13 +61,14 @@ def extract(
             return _carefully(picture, dark, axis, settings, laser, like, None)
         image, dark = _one_plane(picture, dark, laser, settings)
     quick = compiled.AVAILABLE and engine != "numpy"
-    profile, ordinary = read_quickly(image, dark, axis, settings, method, quick, like)
-    if ordinary or not likelihood:
+    profile, verdict = read_quickly(image, dark, axis, settings, method, quick, like)
+    if verdict is Verdict.ORDINARY or not likelihood:
         return profile
     starts = profile.centres if _trusted(profile) else None
     careful = _carefully(as_picture(image, settings.saturation_dn), dark, axis, settings, laser, like, starts)
-    # What the careful look does not find is no better found by the quick one, unless there is next to nothing to see.
-    return careful if careful.valid.sum() >= 0.5 * profile.valid.sum() else profile
+    # Clear peaks that make no line, such as those of a comb, are what they are.
+    alone = verdict is Verdict.UNMISTAKABLE and careful.valid.sum() < 0.5 * profile.valid.sum()
+    return profile if alone else careful
 
 
 def _trusted(profile: StripeProfile) -> bool:
@@ -102,8 +103,8 @@ def _same_range(dark: Any, picture: Picture, settings: StripeSettings) -> Pictur
     if dark.dtype in (np.uint8, np.uint16):
         off = as_picture(dark, settings.saturation_dn, picture.full)
     else:
-        white: NDArray[np.bool_] = np.greater_equal(dark, settings.saturation_dn)
-        off = Picture(dark.astype(np.float32), white, True, FULL)
+        value: NDArray[np.float32] = dark.astype(np.float32)
+        off = Picture(value, value >= settings.saturation_dn, True, FULL)
     if off.coloured == picture.coloured:
         return off
     if picture.coloured:

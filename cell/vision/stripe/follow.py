@@ -35,6 +35,9 @@ AGAINST = 0.5
 """How much the strongest thing beside the chain in each row counts against it."""
 LEAST_SCORE, LEAST_ROWS = 60.0, 8
 """Of a piece of the chain that is believed."""
+UNLIKE, FAINTER, OUTDONE = 1.4, 0.25, 0.5
+"""A piece belongs to the line if it is about as wide, in the logarithm, at least this share as clear as the best, and
+if in no more than this share of its rows something beside it is clearer."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray
     Rows are blurred by `along` px.
     """
     across = cv2.getGaussianKernel(2 * int(np.ceil(2 * max(0.5, 0.6 * scale))) + 1, max(0.5, 0.6 * scale))
-    rows = cv2.getGaussianKernel(5 if along else 1, along or 1.0)
+    rows = cv2.getGaussianKernel(2 * int(2.5 * along) + 1, along or 1.0)
     smooth = cv2.sepFilter2D(picture, cv2.CV_32F, across, rows, borderType=cv2.BORDER_REPLICATE)
     away = max(2, round(SIDES * scale))
     padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, cv2.BORDER_REPLICATE)
@@ -74,10 +77,13 @@ def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray
     return np.asarray(smooth - np.maximum(padded[:, :n], padded[:, 2 * away :]), dtype=np.float32)
 
 
-def candidates(picture: NDArray[np.float32], rows: NDArray[np.intp], scales: tuple[float, ...]) -> Candidates:
-    """What looks like a stripe of one of `scales` in the `rows` (m,) of `picture` (lines, n), in DN."""
-    whole = len(rows) == len(picture)
-    part = picture if whole else np.ascontiguousarray(picture[rows])
+def candidates(
+    part: NDArray[np.float32], rows: NDArray[np.intp], scales: tuple[float, ...], along: float
+) -> Candidates:
+    """What looks like a stripe of one of `scales` in the rows of `part` (m, n), in DN, which are `rows` of the picture.
+
+    Neighbouring rows are blurred by `along` px.
+    """
     n = part.shape[1]
     best = np.full(part.shape, -np.inf, np.float32)
     answer = np.zeros(part.shape, np.float32)
@@ -85,7 +91,7 @@ def candidates(picture: NDArray[np.float32], rows: NDArray[np.intp], scales: tup
     for k, scale in enumerate(scales):
         if 6 * scale > n:
             continue
-        response = respond(part, scale, 0.8 if whole else 0.0)
+        response = respond(part, scale, along)
         clear = response / _noise(response)
         better = clear > best
         best[better], answer[better], of[better] = clear[better], response[better], k
@@ -137,12 +143,18 @@ def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
         return Chain(rows, which, piece, 0.0)
     said = np.minimum(found.clear[rows, which], MOST) - LEAST
     keep = np.zeros(len(rows), np.bool_)
-    for one in np.unique(piece):
-        here = piece == one
-        keep |= here & (said[here].sum() > LEAST_SCORE) & (here.sum() >= LEAST_ROWS)
-    rows, which, piece, said = rows[keep], which[keep], piece[keep], said[keep]
+    scale = found.scale[rows, which]
     others = found.clear.copy()
     others[rows, which] = 0.0
+    outdone = others[rows].max(axis=1) > np.maximum(found.clear[rows, which], 2 * LEAST)
+    pieces = [piece == one for one in np.unique(piece)]
+    main = max(pieces, key=lambda here: float(said[here].sum()))
+    for here in pieces:
+        alike = abs(np.log(np.median(scale[here]) / np.median(scale[main]))) < UNLIKE
+        alike = alike and outdone[here].mean() < OUTDONE and said[here].mean() > FAINTER * said[main].mean()
+        if alike and said[here].sum() > LEAST_SCORE and here.sum() >= LEAST_ROWS:
+            keep |= here
+    rows, which, piece, said = rows[keep], which[keep], piece[keep], said[keep]
     rivals = np.clip(others.max(axis=1) - 2 * LEAST, 0.0, MOST).sum()
     score = float(said.sum() - JUMP * len(np.unique(piece)) - AGAINST * rivals)
     return Chain(rows, which, piece, score / len(found.rows))

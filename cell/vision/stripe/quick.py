@@ -5,6 +5,7 @@ Says also whether the picture is an ordinary one; if not, `careful.py` has the w
 
 from __future__ import annotations
 
+from enum import Enum
 from math import sqrt
 from typing import Any
 
@@ -32,13 +33,23 @@ NO_LAGS = np.zeros(0, np.float32)
 # Propagation is linear in the speckle's contrast C; what it leaves out grows as C⁴, and was taken from simulation.
 SECOND_ORDER = 3.0
 BLINDED_SHARE = 0.6
+MISTAKABLE = 0.02
+"""Share of the lines with a second peak from which the quick search may have followed the wrong one."""
+
+
+class Verdict(Enum):
+    """What the quick way says of its own result."""
+
+    ORDINARY = "nothing more to be said"
+    UNMISTAKABLE = "no other peaks than the stripe's, but it is wide, broken, textured or no Gaussian"
+    NOT_ORDINARY = "to be looked at more closely"
 
 
 def read_quickly(
     image: Image, dark: Any, axis: Axis, settings: StripeSettings, method: Method, quick: bool,
     like: StripeProfile | None,
-) -> tuple[StripeProfile, bool]:  # fmt: skip
-    """The profile by search and fit of a Gaussian, and whether the picture is one for which this is enough."""
+) -> tuple[StripeProfile, Verdict]:  # fmt: skip
+    """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
     noise = like.noise if like is not None else None
@@ -85,16 +96,19 @@ def read_quickly(
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
     profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
     if like is not None and (like.learned is not None or like.speckle is not None):
-        return profile, like.learned is None
+        return profile, Verdict.ORDINARY if like.learned is None else Verdict.NOT_ORDINARY
     if like is not None and not profile.valid.any() and not like.valid.any():
-        return profile, True
+        return profile, Verdict.ORDINARY
     ordinary = (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
         and is_profile_gaussian(work, shade, fitted, start)
         and not is_textured(seen)
     )
-    return profile, bool(ordinary)
+    if ordinary:
+        return profile, Verdict.ORDINARY
+    second = float(np.mean(start[profile.valid, 1, find.ENERGY] > 0)) if profile.valid.any() else 1.0
+    return profile, Verdict.UNMISTAKABLE if second < MISTAKABLE else Verdict.NOT_ORDINARY
 
 
 def _lines(part: Any, axis: Axis) -> Any:
