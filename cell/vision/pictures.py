@@ -37,6 +37,8 @@ class Reason(StrEnum):
     OBLIQUE = "oblique"
     RESIDUAL = "residual"
     NO_POSE = "no_pose"
+    DUPLICATE = "duplicate"
+    LASER_PICTURE = "laser_picture"
 
 
 class PictureRefused(RefusedError):

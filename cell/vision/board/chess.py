@@ -85,9 +85,9 @@ def _view(
         raise PictureRefused(
             Reason.NO_BOARD, f"only {good.sum()} of the {len(lattice)} corners of {spec.name} could be measured"
         )
-    known = PlaneMap.fit(flat[good], measured[good], 3.0, spec.name)
-    _check_none_beyond(image, spec, known, 0.4 * float(np.median(contrast[good])))
-    check_chess_ends(image, spec, known)
+    seen = PlaneMap.fit(flat[good], measured[good], 3.0, spec.name)
+    _check_none_beyond(image, spec, seen, 0.4 * float(np.median(contrast[good])))
+    check_chess_ends(image, spec, seen)
     ids = np.flatnonzero(good)
     size = (image.shape[1], image.shape[0])
     return BoardView(spec, size, ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX), spec.symmetric)
