@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.calibration.recorded.listing import PICTURES, Listing
 from cell.calibration.recorded.matching import frame_key
@@ -32,8 +33,10 @@ from drivers.errors import ConfigError
 LASER_OVER_WHITE = 1.2
 LEAST_SMOOTH_ROWS = 30
 LEAST_SMOOTH_SHARE = 0.05
-# A board's sheet reaches about so many pitches beyond its outermost points.
-AROUND = 1.5
+# What is flat with the board reaches about so many pitches beyond its outermost points. There the stripe is straight,
+# to so many px but for a lens, in so many of its rows.
+AROUND = 5.0
+STRAIGHT_PX, LEAST_STRAIGHT = 3.0, 0.6
 # Two pictures show the board at one place when its points differ by no more than this.
 SAME_PLACE_PX = 2.0
 LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
@@ -188,7 +191,9 @@ def find_stripe(image: Image, view: BoardView) -> StripeProfile | None:
         lit = board[at[:, 1], at[:, 0]] > 0
         on_board = np.zeros(len(profile.centres), dtype=np.bool_)
         on_board[profile.rows[lit]] = True
-        smooth = int(np.sum((np.abs(np.diff(profile.centres, 2)) < 1.0) & on_board[1:-1]))
+        follows = np.zeros(len(on_board), dtype=np.bool_)
+        follows[1:-1] = (np.abs(np.diff(profile.centres, 2)) < 1.0) & on_board[1:-1]
+        smooth = _straight(profile.centres, follows)
         level = float(np.median(image[at[lit, 1], at[lit, 0]])) if lit.any() else 0.0
         enough = smooth > max(LEAST_SMOOTH_ROWS, LEAST_SMOOTH_SHARE * len(profile.centres))
         if enough and level > min(LASER_OVER_WHITE * white + 5, 250) and (best is None or smooth > best[0]):
@@ -196,13 +201,22 @@ def find_stripe(image: Image, view: BoardView) -> StripeProfile | None:
     return None if best is None else best[1]
 
 
+def _straight(centres: Array, follows: NDArray[np.bool_]) -> int:
+    """How many of the rows (n,) that follow their neighbours lie on one line; 0 where that is not most of them."""
+    rows = np.flatnonzero(follows)
+    if len(rows) < LEAST_SMOOTH_ROWS:
+        return 0
+    points = np.column_stack([rows, centres[rows]]).astype(np.float32)
+    dx, dy, x, y = cv2.fitLine(points, cv2.DIST_WELSCH, 0, 0.01, 0.01).ravel()
+    near = int((np.abs((points[:, 0] - x) * dy - (points[:, 1] - y) * dx) < STRAIGHT_PX).sum())
+    return near if near > LEAST_STRAIGHT * len(rows) else 0
+
+
 def _sheet(image: Image, view: BoardView) -> Image:
     """Mask (h, w) of the board with what is around its points: outer squares and margin."""
     flat = view.object_points[:, :2] / view.spec.pitch
     homography, _ = cv2.findHomography(flat, view.pixels)
     mask = np.zeros(image.shape, np.uint8)
-    if homography is None:
-        return mask
     (x0, y0), (x1, y1) = flat.min(axis=0) - AROUND, flat.max(axis=0) + AROUND
     corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], dtype=np.float64)
     cv2.fillConvexPoly(mask, np.round(cv2.perspectiveTransform(corners, homography)[0]).astype(np.int32), 1)
