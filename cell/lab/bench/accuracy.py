@@ -28,7 +28,7 @@ from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.report.bound import part_points
 from cell.report.truth import pose_of
 from drivers.interfaces import Vector
-from sim_backends.world.levels import deviations
+from sim_backends.world.levels import assumed_noise
 
 LIMITS: dict[str, dict[str, float]] = {
     "sensor_scan_mm": {"mean": 0.06, "p85": 0.08},
@@ -181,7 +181,7 @@ def summed_up(runs: Sequence[dict[str, Any]], level: str) -> dict[str, Any]:
             for name in ("calibration", "target", "registration")
         },
         "outcomes": _outcomes(runs),
-        "assumed_noise": deviations(level).assumed_noise(),
+        "assumed_noise": assumed_noise(level),
     }
     if level == "nominal":
         result["limits"] = {**LIMITS, "coverage_95": {"low": COVERAGE[0], "high": COVERAGE[1]}}
