@@ -68,7 +68,7 @@ class LightPlane:
     @property
     def along(self) -> Array:
         """Unit vector (3,) along the stripe, across the optical axis."""
-        return np.array([-self.normal[1], self.normal[0], 0.0]) / np.hypot(self.normal[0], self.normal[1])
+        return np.asarray(np.array([-self.normal[1], self.normal[0], 0.0]) / np.hypot(self.normal[0], self.normal[1]))
 
     def shape(self, points: ArrayLike) -> Array:
         """(t·P)²/P_z (n,) in m of points or rays (n, 3): how far a bow of 1 lifts the sheet off its plane there."""

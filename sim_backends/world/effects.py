@@ -67,13 +67,12 @@ class Effects:
         return tuple(f.name for f in dataclasses.fields(cls))
 
     def assumed_noise(self) -> dict[str, dict[str, float | str]]:
-        """Every effect that is on, with its size, unit, meaning and source."""
+        """Every effect that is on, with its size, unit and meaning."""
         return {
             f.name: {
                 "sigma": getattr(self, f.name),
                 "unit": f.metadata["unit"],
                 "of": f.metadata["meaning"],
-                "source": f.metadata["source"],
             }
             for f in dataclasses.fields(self)
             if getattr(self, f.name)

@@ -75,6 +75,7 @@ class ScanCalibration:
     covariance: Array
     quality: Quality
     reference: Reference | None = None
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:

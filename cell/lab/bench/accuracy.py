@@ -40,7 +40,7 @@ LIMITS: dict[str, dict[str, float]] = {
 COVERAGE = (0.90, 0.98)
 COVERAGE_RUNS = 20
 """Fewer runs cannot tell 90 % from 98 %, and their coverage is not held against the limit."""
-_SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def campaign(
@@ -52,7 +52,7 @@ def campaign(
     """
     load_job(job)
     # One thread a process: the sums, and so the figures, are then the same on every machine and the cores are full.
-    for name in _SINGLE_THREADED:
+    for name in SINGLE_THREADED:
         os.environ.setdefault(name, "1")
     runs: list[dict[str, Any]] = []
     pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))

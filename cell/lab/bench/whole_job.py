@@ -50,9 +50,9 @@ class JobRecord:
     """How one simulated cell did: `outcome` is placed, refused, faulted or aborted, `stage` what it came to.
 
     `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `kinematic` is the
-    configured (6, 6) covariance of a place that the arm goes to; `rests` (n, 6) the joint angles at the end of each
-    motion, rad; `shots` the truth at each line of the cloud, sweep after sweep. `wall_s` are seconds on the wall by
-    stage.
+    configured (6, 6) covariance of a place that the arm goes to, `placing` that of the flange each time it comes to
+    rest; `rests` (n, 6) the joint angles at the end of each motion, rad; `shots` the truth at each line of the cloud,
+    sweep after sweep. `wall_s` are seconds on the wall by stage.
     """
 
     seed: int
@@ -66,6 +66,7 @@ class JobRecord:
     at_sweep: dict[str, Any] | None = None
     at_end: dict[str, Any] | None = None
     kinematic: Vector | None = None
+    placing: Vector | None = None
     rests: Vector | None = None
     shots: list[Shot] = field(default_factory=list)
     wall_s: dict[str, float] = field(default_factory=dict)
@@ -79,17 +80,19 @@ def run_whole_job(
     level: str,
     progress: Progress | None = None,
     calibrated: JobRecord | None = None,
+    stood: float = 0.0,
 ) -> JobRecord:
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
-    `calibrated` is a record of the same cell, whose calibration is used again.
+    `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s
+    before the job.
     """
     cell = VirtualCell(config, seed, level, Path(job.surface.mesh).stem)
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:
         with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
-            Run("job", lambda run: whole.perform(run, Path(folder), calibrated)).result()
+            Run("job", lambda run: whole.perform(run, Path(folder), calibrated, stood)).result()
     except CellError as error:
         failure = classify(error)
         record.outcome, record.reason = failure.outcome.value, failure.reason
@@ -110,7 +113,7 @@ class _WholeJob:
     record: JobRecord
     tell: Progress
 
-    def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None) -> None:
+    def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None, stood: float) -> None:
         """Fill the record; runs go to `folder`."""
         record, devices = self.record, self.cell.devices
         if calibrated is not None:
@@ -122,9 +125,11 @@ class _WholeJob:
         assert record.calibration is not None
         whereabouts = Whereabouts(devices.vehicle)
         whereabouts.say_at_start()
-        record.kinematic = Workplace(
+        workplace = Workplace(
             self.config, self.job, self.nominal, record.calibration, devices, NoFrames(), folder, whereabouts
-        ).kinematic
+        )
+        record.kinematic, record.placing = workplace.kinematic, workplace.repeatability
+        self.cell.world.stand(stood)
         job_run = JobRun(
             run,
             self.config,
