@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from pydantic import AfterValidator, model_validator
 
 from cell.toml_file import Table
@@ -168,10 +169,19 @@ class CameraConfig(DeviceConfig):
 
 
 class LaserConfig(DeviceConfig):
-    """The line laser with its nominal place in the scan camera's frame."""
+    """The line laser with its nominal place in the scan camera's frame.
+
+    `witness`: where the rail shows the scan camera the line on a plate that is fixed to the claw; None without one.
+    """
 
     baseline: Annotated[float, quantity("mm", 5, 500)]
     tan_theta: Annotated[float, number(0.2, 20)]
+    witness: Annotated[float, quantity("mm", -2000, 2000)] | None = None
+
+    @property
+    def exit_point(self) -> NDArray[np.float64]:
+        """The laser's exit point (3,) in the scan camera's frame as drawn, m."""
+        return np.array([-self.baseline, 0.0, 0.0])
 
 
 class ClawConfig(DeviceConfig):

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.store import (
     CellCalibration,
     find_calibration,
@@ -537,9 +538,10 @@ class Cell:
             self.devices.vehicle.recover()
             given = self.config, self.devices, mover, hands.check
             scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
+            witness = look_at_witness(self.config, self.devices, hands.keep)
             target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
             tell(0.96, "solving")
-            observations = gathered(scan, target, self._identities(), self.config)
+            observations = gathered(scan, target, self._identities(), self.config, witness)
             return observations, solve_observations(observations).calibration
 
         observations, calibration = self._recorded(run, "calibration", work)

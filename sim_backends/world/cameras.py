@@ -37,6 +37,7 @@ Picture = NDArray[np.uint8]
 SCAN_TRANSMISSION = 0.4
 """Share of the ambient light that the scan camera's narrow-band filter lets through; the laser passes."""
 TABLE_ALBEDO = 0.45
+WITNESS_ALBEDO = 0.5
 SURFACE_ALBEDO = 0.6
 BOW_AT = (0.130, 0.018)
 """Where the sheet's bow is told: from the laser, and beside the fan's middle, m."""
@@ -88,17 +89,28 @@ class Cameras:
         exposure: float,
         warm: float = 0.0,
         t: float = 0.0,
+        camera_from_flange: Pose | None = None,
     ) -> Picture:
         """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses.
 
         `warm` is how far, of 0 to 1, laser and cameras have warmed up; `t` the world time, s, by which the sun moves.
+        With `camera_from_flange` the plate on the claw is shown where it comes into view.
         """
         optics = self._warmed(camera, warm)
         camera_from_world = inverse(world_from_camera)
         objects = self._objects(camera, camera_from_world, world_from_base)
+        if camera == "scan" and camera_from_flange is not None:
+            objects += self._witness(camera_from_flange)
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
             return render(optics, objects, lit, exposure, self._rng[camera], self._sunny(camera_from_world, t))
+
+    def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
+        """The plate on the claw, if the camera sees any of it."""
+        pose = camera_from_flange @ nominal.FLANGE_FROM_WITNESS
+        corners, optics = _witness_corners(pose), self._cold["scan"]
+        left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
+        return [PlaneInstance(pose, nominal.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
 
     def lens(self, camera: str, warm: float) -> Lens:
         """The lens with the shift and zoom of what is `warm`, 0 to 1."""
@@ -153,6 +165,12 @@ class Cameras:
             placed.append((shown, camera_from_surface, self._mesh_radius))
         optics = self._cold[camera]
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, _FAR[camera])]
+
+
+def _witness_corners(pose: Pose) -> Pose:
+    half = np.array(nominal.WITNESS_SIZE) / 2.0
+    corners = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+    return corners @ pose[:3, :3].T + pose[:3, 3]
 
 
 def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, far: float) -> bool:

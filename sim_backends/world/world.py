@@ -19,6 +19,7 @@ from sim_backends.world.cameras import Cameras
 from sim_backends.world.collisions import ArmPoints, Collisions
 from sim_backends.world.contact import PartContact
 from sim_backends.world.effects import WARMING_S
+from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Lens, draw, rotation
 from sim_backends.world.surfaces import surface as named_surface
 
@@ -105,7 +106,10 @@ class World:
         world_from_flange = world_from_base @ self.arm.base_from_flange(t)
         world_from_camera = world_from_flange @ self.flange_from_camera(camera, t)
         lit = self.laser.at(t)
-        return self._cameras.picture(camera, world_from_camera, world_from_base, lit, exposure, self.warmth(t), t)
+        camera_from_flange = inverse(self.flange_from_camera(camera, t))
+        return self._cameras.picture(
+            camera, world_from_camera, world_from_base, lit, exposure, self.warmth(t), t, camera_from_flange
+        )
 
     def warmth(self, t: float) -> float:
         """How far, of 0 to 1, laser and cameras have warmed up since they were switched on, at world time `t`."""

@@ -22,6 +22,7 @@ from cell.calibration.solve.joint import (
     solve_staged,
 )
 from cell.calibration.solve.reference import Reference
+from cell.calibration.witness import Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
@@ -68,7 +69,9 @@ class ScanCalibration:
     plane's tilts are about the tangents of `cell.calibration.solve.blocks.tangents`, the hand-eye's are (translation,
     rotation) in flange axes. `reference` is what a verification compares with; files of older programs have none.
     `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain` (21,) how the
-    other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual.
+    other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual. With a
+    `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
+    camera's frame.
     """
 
     camera: CameraModel
@@ -81,6 +84,9 @@ class ScanCalibration:
     bow_sigma: float = 0.0
     bow_gain: Array = field(default_factory=lambda: np.zeros(KEPT))
     notes: tuple[str, ...] = ()
+    witness: Witness | None = None
+    pointing: Pointing | None = None
+    exit_point: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:
@@ -108,6 +114,11 @@ class ScanCalibration:
         """What triangulation needs."""
         return ScanGeometry(self.camera, self.light_plane, self.rail_direction, self.flange_from_camera)
 
+    def pointed(self, pointing: Pointing, exit_point: Array) -> ScanCalibration:
+        """With the light plane as the laser points now; `exit_point` (3,) of the laser in m, camera frame, as drawn."""
+        plane = turned(self.light_plane, exit_point, pointing.turn)
+        return replace(self, light_plane=plane, pointing=pointing, exit_point=exit_point)
+
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
         state = State(
@@ -132,6 +143,9 @@ class ScanCalibration:
             )
             assert moved.plane is not None
             made.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
+        if self.pointing is not None:
+            plane = turned(self.light_plane, self.exit_point, self.pointing.sigma)
+            made.append(replace(self.geometry(), light_plane=plane))
         return made
 
     def as_dict(self) -> dict[str, Any]:
@@ -151,6 +165,7 @@ class ScanCalibration:
             "quality": vars(self.quality),
             "reference": None if self.reference is None else self.reference.as_dict(),
             "notes": list(self.notes),
+            "witness": None if self.witness is None else self.witness.as_dict(),
         }
 
     @classmethod
@@ -168,6 +183,7 @@ class ScanCalibration:
             float(plane.get("bow_sigma", 0.0)),
             np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
             tuple(data.get("notes", ())),
+            Witness.read(data.get("witness")),
         )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
 from cell.devices.direct import VirtualCell
@@ -156,12 +157,13 @@ class _WholeJob:
         devices, tell = self.cell.devices, self.tell
         given, keep = (self.config, devices, mover, hands.check), NoFrames().keep
         scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
+        witness = look_at_witness(self.config, devices, keep)
         target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
         self.record.observations = (scan, target)
         tell(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
-        return CellCalibration.solve(scan, target, identities, self.config)
+        return CellCalibration.solve(scan, target, identities, self.config, witness)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""
