@@ -143,7 +143,10 @@ class VehicleConfig(DeviceConfig):
 
 
 class CameraConfig(DeviceConfig):
-    """A camera with its nominal optics and mounting."""
+    """A camera with its nominal optics and mounting.
+
+    `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    """
 
     width: Pixels
     height: Pixels
@@ -151,6 +154,7 @@ class CameraConfig(DeviceConfig):
     focal_length: Annotated[float, quantity("mm", 1, 200)]
     flange_from_camera: Mounting
     photo_exposure: PhotoExposure
+    late: Annotated[float, quantity("ms", 0, 100)] = 0.002
 
     @model_validator(mode="after")
     def _sees(self) -> Self:

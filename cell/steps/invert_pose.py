@@ -19,6 +19,7 @@ from cell.steps.reconstruct import Reconstruction
 from cell.steps.step import JobStep
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
+from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 from statemachine.policy import Step
 from statemachine.runner import StepContext
@@ -66,9 +67,19 @@ def invert_pose(
             sweeps=sweeps,
         )
 
-    found = registered(scan.by_poses, kinematic)
-    rocking = None if taken is None else find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)
+    found: PlacePose | RefusedError
+    try:
+        found = registered(scan.by_poses, kinematic)
+        pose = found.base_from_surface
+    except RefusedError as refused:
+        # A vehicle that rocks bends the surface, and may be all that is wrong.
+        found, pose = refused, refused.seen.get("pose")
+    rocking = None
+    if taken is not None and isinstance(pose, pin.SE3):
+        rocking = find_rocking(scan.cloud, nominal, pose, taken.times)
     if rocking is None or taken is None:
+        if isinstance(found, RefusedError):
+            raise found
         return found
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 
@@ -76,7 +87,7 @@ def invert_pose(
         shaken = rocking_motions(scan.cloud, lines, rows, vehicle, times, hz)
         return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
-    unknown = rocking_covariance(rocking, vehicle, found.base_from_surface.translation)
+    unknown = rocking_covariance(rocking, vehicle, expected.translation)
     return replace(registered(by_poses, kinematic + unknown), notes=(words(rocking),))
 
 

@@ -128,6 +128,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             here.config.calibration.rail_sigma,
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
+            here.config.scan_camera.late,
         ),
         here.mover,
         devices,
