@@ -42,6 +42,7 @@ from cell.devices.stopping import require_healthy, require_no_emergency_stop, st
 from cell.devices.truth_link import ask_truth
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
+from cell.motion.arm_models import kinematics_name
 from cell.run.folder import CellLock, find_run
 from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.maintenance import recorded_maintenance
@@ -504,7 +505,11 @@ class Cell:
             self._identities(),
             self.config.calibration_hash(),
             self.config.calibration.max_age,
+            self._kinematics(),
         )
+
+    def _kinematics(self) -> str:
+        return kinematics_name(self.config.arm.model, self.devices.arm.link_table())
 
     def _identities(self) -> dict[str, str]:
         return {
@@ -541,7 +546,8 @@ class Cell:
             witness = look_at_witness(self.config, self.devices, hands.keep)
             target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
             tell(0.96, "solving")
-            observations = gathered(scan, target, self._identities(), self.config, witness)
+            known = self._identities(), self.config, self._kinematics(), witness
+            observations = gathered(scan, target, *known)
             return observations, solve_observations(observations).calibration
 
         observations, calibration = self._recorded(run, "calibration", work)

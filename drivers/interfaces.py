@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock_map import Latch as Latch
+from drivers.link_table import LinkTable as LinkTable
 
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""
@@ -261,6 +262,9 @@ class ArmMotion(Motion, Protocol):
 
 class Arm(Device, Protocol):
     """A six-axis arm with zero TCP: all Cartesian poses are of the flange in the base."""
+
+    def link_table(self) -> LinkTable | None:
+        """The table that its controller computes with, calibrated in the factory; None where it does not tell."""
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` seconds old, else `DeadlineError`."""

@@ -28,6 +28,7 @@ from cell.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser
+from sim_backends.models.arm_kinematics import Kinematics
 
 CONFIG = load_config(None)
 LASER = CONFIG.laser.output
@@ -512,3 +513,21 @@ def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell:
     jogged("vehicle", "-0.1m")
     moved = jogged("arm", "z", "+10mm")["flange"].split("moved ")[1]
     assert float(moved.removesuffix(" mm")) == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])
+def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
+    world: VirtualCell, devices: Devices, row: int, column: int, by: float
+) -> None:
+    devices.arm.move_joints(HOME + 0.01, 0.5, 1.0).wait(60.0)
+    before = devices.arm.state()
+    table = world.world.arm.params.dh.copy()
+    table[row, column] += by
+    world.world.arm.kinematics = world.world.arm.drive.kinematics = Kinematics(table)
+    for begin in (
+        lambda: devices.arm.move_joints(HOME, 0.5, 1.0),
+        lambda: devices.arm.move_linear(before.flange, 0.05, 0.5),
+        lambda: devices.arm.follow(np.array([0.0, 1.0]), np.stack([before.joints, HOME])),
+    ):
+        refused("same_kinematics", begin, "mm and", "mrad away", "port 30001")
+    assert np.array_equal(devices.arm.state().joints, before.joints)

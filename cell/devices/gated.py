@@ -27,10 +27,15 @@ from drivers.interfaces import (
     Vehicle,
     VehicleState,
 )
+from drivers.link_table import LinkTable
 
 
 class GatedArm(Gated[Arm]):
     """The arm, its motions and its recovery begun through a gate."""
+
+    def link_table(self) -> LinkTable | None:
+        """See `Arm.link_table`."""
+        return self.bare.link_table()
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""

@@ -16,11 +16,13 @@ import pinocchio as pin
 from cell.config import CellConfig
 from cell.devices.interlocks import Command
 from cell.geometry.poses import from_ur
+from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import arm_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionModel, Pair
-from cell.motion.kinematics import ArmKinematics, Joints
+from cell.motion.kinematics import Joints
 from cell.steps.moves import deck_plates
 from drivers.interfaces import Vector
+from drivers.link_table import LinkTable
 
 MARGIN_M = 0.002
 """Less than the planner keeps, so that what it finds free is not refused for a rounding."""
@@ -29,19 +31,19 @@ LINE_STEP_M, LINE_STEP_RAD = 0.01, 0.03
 
 
 class Ways:
-    """The arm's ways through its own cell."""
+    """The ways of an arm whose controller told `table`, or none, through its own cell."""
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, table: LinkTable | None = None) -> None:
         self._config = config
         self._one_at_a_time = threading.Lock()
-        self.kinematics = ArmKinematics()
+        self.kinematics = arm_kinematics(config.arm.model, table)
         # One of its own: where the arm stands is asked while a way is reckoned.
         self._looking = threading.Lock()
-        self._standing = ArmKinematics()
+        self._standing = arm_kinematics(config.arm.model, table)
 
     @cached_property
     def _bodies(self) -> CollisionModel:
-        bodies = [*arm_bodies(), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
+        bodies = [*arm_bodies(self._config.arm.model), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
         return CollisionModel(self.kinematics, bodies, MARGIN_M)
 
     def forward(self, joints: Vector) -> pin.SE3:

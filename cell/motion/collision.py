@@ -110,5 +110,5 @@ def _may_touch(first: Body, second: Body) -> bool:
     # The table of links ends with the flange, which turns with joint 6.
     links = (low, min(high, 6))
     if low == BASE:
-        return {first.name, second.name} != {"base", "upper arm"}
+        return {first.name, second.name} not in ({"base", "upper arm"}, {"base", "shoulder joint"})
     return links[1] - links[0] > 1

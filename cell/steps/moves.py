@@ -10,9 +10,10 @@ import pinocchio as pin
 from cell.config import ArmConfig, CellConfig
 from cell.geometry.poses import from_parts
 from cell.job import Job
+from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionModel, Pair
-from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from cell.steps.camera_poses import centre_of
@@ -51,10 +52,10 @@ class Mover:
         self._clock = clock
         self._settle_time = config.arm.settle_time
         self._tool_speed = config.arm.max_tool_speed
-        self.kinematics = ArmKinematics(limits=_joint_limits(config.arm))
+        self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
         grasp = None if job is None else job.grasp
         part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
-        self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
+        self._moving = [*arm_bodies(config.arm.model), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
         self._planner = self._plan_among([])
 
     def meet_station(

@@ -20,6 +20,12 @@ def _row(unit: str, meaning: str, source: str) -> float:
 class Effects:
     """The size of every effect, SI; 0 is off. What is drawn at random is drawn to this size from the world's seed."""
 
+    factory_arm: float = _row(
+        "m",
+        "1 sigma of the link lengths that the controller knows and the maker's table does not; 2 mrad per mm of twists "
+        "and zeros, and 50 mm per mm of the offsets that cancel along the parallel axes",
+        "factory tables of three arms in the tests of the maker's ur_calibration",
+    )
     joint_harmonics: float = _row(
         "rad",
         "RMS error of each joint's angle, in sines of one and two turns of the joint",
@@ -81,6 +87,7 @@ class Effects:
 
 NONE = Effects()
 WORKSHOP = Effects(
+    factory_arm=1e-3,
     joint_harmonics=0.07e-3,
     path_memory=0.5,
     sag=3e-6,

@@ -42,6 +42,9 @@ class Deviations:
     rail_homing: float = _of("m", "home position, anew at each homing")
     arm_repeatability: float = _of("m", "radial (1/√3 of it per axis), anew each time the arm settles")
     arm_repeatability_rotation: float = _of("rad", "per axis, anew each time the arm settles")
+    arm_factory_length: float = _of("m", "each link length and offset that the controller knows and the drawing not")
+    arm_factory_angle: float = _of("rad", "each joint's zero and twist that the controller knows and the drawing not")
+    arm_factory_slide: float = _of("m", "offsets of joints 2 and 3 in the controller's table, taken back by joint 4's")
     arm_dh_length: float = _of("m", "each link length and offset")
     arm_dh_angle: float = _of("rad", "each joint's zero")
     arm_force_noise: float = _of("N", "measured force, per axis")
@@ -87,6 +90,9 @@ NOMINAL = Deviations(
     rail_homing=5e-6,
     arm_repeatability=0.04e-3,
     arm_repeatability_rotation=0.08e-3,
+    arm_factory_length=0.0,
+    arm_factory_angle=0.0,
+    arm_factory_slide=0.0,
     arm_dh_length=0.03e-3,
     arm_dh_angle=0.02e-3,
     arm_force_noise=0.3,
@@ -115,10 +121,13 @@ LEVELS = {"ideal": IDEAL, "nominal": NOMINAL, "harsh": HARSH, "workshop": NOMINA
 
 def deviations(level: str) -> Deviations:
     """The table of `level`, or of a level with effects as in "nominal+grasp". Raises ValueError that lists them."""
-    table, effects = LEVELS[_parts(level)[0]], effects_of(level)
-    if not effects.grasp:
-        return table
-    return dataclasses.replace(table, grasp_translation=effects.grasp, grasp_rotation=10.0 * effects.grasp)
+    rows: dict[str, float] = {}
+    effects = effects_of(level)
+    if effects.grasp:
+        rows |= {"grasp_translation": effects.grasp, "grasp_rotation": 10.0 * effects.grasp}
+    if length := effects.factory_arm:
+        rows |= {"arm_factory_length": length, "arm_factory_angle": 2.0 * length, "arm_factory_slide": 50.0 * length}
+    return dataclasses.replace(LEVELS[_parts(level)[0]], **rows)
 
 
 def effects_of(level: str) -> Effects:

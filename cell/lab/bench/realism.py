@@ -34,6 +34,7 @@ PLANE = np.array([0, 1, 5])
 """Of a part's pose: x, y and the turn about z. Contact decides over the others."""
 ALONE, TOGETHER = "nominal", "workshop"
 WORDS: dict[str, tuple[str, ...]] = {
+    "factory_arm": ("kinematics", "arm"),
     "joint_harmonics": ("joint", "arm"),
     "path_memory": ("repeat", "arm"),
     "sag": ("sag", "arm"),

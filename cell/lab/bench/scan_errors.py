@@ -112,11 +112,12 @@ def own_base(record: JobRecord) -> pin.SE3:
     assert record.rests is not None
     pose = record.results.get("place")
     scene = draw(record.seed, record.level)
-    flanges = np.array([Kinematics(UR10E_DH).forward(q) for q in record.rests])
+    told = UR10E_DH + scene.dh_factory
+    flanges = np.array([Kinematics(told).forward(q) for q in record.rests])
     wanted = (pose if pose is not None else record.results["laser_sweep"]).base_from_flange.homogeneous
     away = np.abs(flanges - wanted).reshape(len(flanges), -1).max(axis=1)
     nearest = int(np.argmin(away))
-    kinematics = Kinematics(UR10E_DH + scene.dh_error)
+    kinematics = Kinematics(told + scene.dh_error)
     bent = JointErrors(kinematics, scene.workshop.harmonics, scene.effects.sag, ArmParams.carried)
     true = kinematics.forward(bent.true(record.rests[nearest]))
     return from_matrix(flanges[nearest]) * from_matrix(true).inverse()
