@@ -7,6 +7,7 @@ laser, the product by that along the camera's axis.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ NOISE = Noise()
 BESIDE, DEPTH = 0.018, 0.130
 
 
+@cache
 def solved(off: float, seed: int) -> tuple[HeadWorld, Joint]:
     """A head whose sheet is `off` m away from its plane at the place where bows are told, and its calibration."""
     rng = np.random.default_rng(seed)
@@ -50,13 +52,12 @@ def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int
 
 
 def test_a_flat_sheet_stays_flat() -> None:
-    for seed in (3, 4):
-        _, joint = solved(0.0, seed)
-        assert joint.adjusted.bow is None
+    _, joint = solved(0.0, 3)
+    assert joint.adjusted.bow is None
 
 
 def test_points_are_measured_on_the_bowed_sheet() -> None:
-    world, joint = solved(50e-6, 5)
+    world, joint = solved(50e-6, 1)
     calibration = ScanCalibration.of(joint)
     assert "bowed" in calibration.notes[0]
     rows = np.arange(20.0, 460.0, 20.0)
@@ -74,7 +75,7 @@ def test_points_are_measured_on_the_bowed_sheet() -> None:
 
 
 def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation() -> None:
-    _, joint = solved(30e-6, 6)
+    _, joint = solved(50e-6, 1)
     calibration = ScanCalibration.of(joint)
     again = ScanCalibration.from_dict(calibration.as_dict())
     assert again.light_plane == calibration.light_plane
