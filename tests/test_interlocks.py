@@ -22,7 +22,8 @@ from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
-from cell.run.folder import CellLock
+from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
+from cell.run.lock import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock
@@ -397,6 +398,50 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
     refused("way_clear", lambda: devices.arm.move_linear(onto_the_deck, 0.05, 0.5), "claw and deck")
     assert np.array_equal(devices.arm.state().joints, stood.joints)
     assert world.world.collisions.found == ()
+
+
+def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:
+    stood = devices.arm.state().joints
+    down = shifted(devices, 0.0, 0.0, -0.05)
+    tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
+    table = block("table", BASE, tip.translation - [0.3, 0.3, 0.2], tip.translation + np.array([0.3, 0.3, -0.03]))
+    devices.interlocks.stand_before([table])
+    refused("way_clear", lambda: devices.arm.move_linear(down, 0.05, 0.5), "claw and table")
+    assert np.array_equal(devices.arm.state().joints, stood)
+    devices.interlocks.carry(tool_bodies((0.07, 0.036, 0.025), from_parts((0.0, 0.0, 0.145)))[-1:])
+    near = shifted(devices, 0.0, 0.0, -0.01)
+    refused("way_clear", lambda: devices.arm.move_linear(near, 0.05, 0.5), "part and table")
+    devices.vehicle.enable()
+    devices.vehicle.brake()
+    devices.arm.move_linear(down, 0.05, 0.5).wait(30.0)
+
+
+def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
+    arm, interlocks = devices.arm, devices.interlocks
+    post = from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.2))
+    interlocks.stand_before([block("post", BASE, post.translation - 0.02, post.translation + 0.02)])
+    interlocks.carry([block("part", FLANGE, (-0.2, -0.01, 0.145), (0.2, 0.01, 0.165))])
+    up_and_down = [arm.state().joints, arm.state().joints + np.array([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])]
+    refused("way_clear", lambda: arm.follow(np.array([0.0, 9.0]), np.array(up_and_down)), "part")
+    with interlocks.lifted(["claw_at_contact"]):
+        devices.claw.release()
+    assert interlocks.situation.part == ()
+
+
+def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Devices) -> None:
+    arm = devices.arm
+    tip = (from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.145))).translation
+    devices.interlocks.stand_before([block("shelf", BASE, tip - [0.3, 0.3, 0.1], tip + np.array([0.3, 0.3, -0.001]))])
+    refused("way_clear", lambda: arm.move_linear(shifted(devices, 0, 0, -0.0006), 0.01, 0.5), "claw and shelf")
+    up = shifted(devices, 0.0, 0.0, 0.01)
+    here = arm.state().joints
+    arm.move_linear(up, 0.02, 0.5).wait(30.0)
+    higher = arm.state().joints
+    refused("way_clear", lambda: arm.move_joints(here, 0.2, 0.5), "claw and shelf")
+    arm.bare.move_joints(here, 0.2, 0.5).wait(30.0)
+    up_and_down = np.array([here, higher, here])
+    refused("way_clear", lambda: arm.follow(np.array([0.0, 3.0, 6.0]), up_and_down), "claw and shelf")
+    arm.follow(np.array([0.0, 3.0]), up_and_down[:2]).wait(30.0)
 
 
 def test_an_output_that_another_device_owns_is_switched_by_that_device(devices: Devices) -> None:

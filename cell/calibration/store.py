@@ -54,10 +54,11 @@ class CellCalibration:
         target: list[TargetObservation],
         identities: dict[str, str],
         config: CellConfig,
+        kinematics: str = "",
         witness: Witness | None = None,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config, witness=witness)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics, witness)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"

@@ -15,7 +15,7 @@ from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.motion.arm_models import arm_kinematics
-from cell.motion.bodies import arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
@@ -30,7 +30,6 @@ from cell.steps.camera_poses import (
     target_calibration_views,
 )
 from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates
-from cell.steps.place import TOUCHES
 from cell.vision import parse_board
 from drivers.interfaces import Vector
 

@@ -171,7 +171,9 @@ def _calibrated(now: Situation, command: Command) -> str | None:
 def _clear(now: Situation, command: Command) -> str | None:
     if now.arm is None:
         return None
-    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command)
+    empty = bool(now.part) and now.claw is not None and not now.claw.holding
+    others = (*(() if empty else now.part), *now.station)
+    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, others)
     if not pairs:
         return None
     return f"{', '.join(f'{a} and {b}' for a, b in pairs)} would collide on the way. Go another way, or plan it"
@@ -241,7 +243,8 @@ RULES = (
     Rule(
         "way_clear",
         MOVES,
-        "arm, tool, vehicle and the boards on the deck stay apart all the way; what touches already may",
+        "arm, tool, vehicle, boards on the deck, and part and station where a run has told of them, stay apart all the "
+        "way; what is near at the beginning may part, but not come nearer",
         _clear,
     ),
     Rule(

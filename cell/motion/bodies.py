@@ -20,6 +20,10 @@ FLANGE = 7
 """Parent of what the flange carries: poses are in the flange frame. 1 … 6 are the frames that turn with a joint."""
 
 
+TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
+"""What comes near on purpose while the part is set down."""
+
+
 @dataclass(frozen=True)
 class Body:
     """A box (`size` x, y, z) or, when `radius` is given, a capsule along its z axis with a core of length `size[2]`."""

@@ -14,6 +14,7 @@ import numpy as np
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.collect.witness import look_at_witness
+from cell.calibration.sessions import arm_table
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
 from cell.devices.direct import VirtualCell
@@ -163,7 +164,8 @@ class _WholeJob:
         tell(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
-        return CellCalibration.solve(scan, target, identities, self.config, witness)
+        known = identities, self.config, arm_table(self.config, self.cell.devices), witness
+        return CellCalibration.solve(scan, target, *known)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""
