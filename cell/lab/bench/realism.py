@@ -51,7 +51,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "sheet_ends": ("covers", "points"),
     "sunlight": ("light",),
 }
-"""A refusal or a flag with one of these words names the effect."""
+"""A refusal with one of these words names the effect."""
 
 
 def campaign(
@@ -126,14 +126,15 @@ def _part(record: JobRecord, config: CellConfig, job: Job) -> dict[str, Any]:
 
 
 def verdict(run: dict[str, Any]) -> str:
-    """Inside what was stated; or named: refused or flagged by the effect's name; or refused otherwise; or outside."""
+    """Inside what was stated; or named: refused by the effect's name; or refused otherwise; or outside.
+
+    What was placed outside is outside, whatever was noted: a note says what the measurements have allowed for.
+    """
+    if run["outcome"] == "placed":
+        return "inside" if run["pose_inside"] and run["part_inside"] else "outside"
     names = Effects.names() if run["effect"] == TOGETHER else (run["effect"],)
     words = [word for name in names for word in WORDS.get(name, ())]
-    if run["outcome"] != "placed":
-        return "named" if any(word in run["reason"] for word in words) else "refused"
-    if run["pose_inside"] and run["part_inside"]:
-        return "inside"
-    return "named" if any(word in flag for flag in run["flags"] for word in words) else "outside"
+    return "named" if any(word in run["reason"] for word in words) else "refused"
 
 
 def summed_up(effect: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -30,8 +30,8 @@ def realism(
 ) -> None:
     """Put each effect of a workshop into simulated cells and see whether what is stated of the part still holds.
 
-    An effect is well when at least 90 % of its worlds lie inside the stated 95 % ellipsoid or are refused or flagged
-    by the effect's name. Exit code 1 when one is not, or a part was placed outside the job's tolerance.
+    An effect is well when at least 90 % of its worlds lie inside the stated 95 % ellipsoid or are refused by the
+    effect's name. Exit code 1 when one is not, or a part was placed outside the job's tolerance.
     """
     from rich.console import Console
 
@@ -41,7 +41,8 @@ def realism(
     from sim_backends.world.effects import Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
-    chosen = list(dict.fromkeys(effect or known))
+    # A rolling shutter is no part of the workshop: a scan camera needs a global one.
+    chosen = list(dict.fromkeys(effect or [name for name in known if name != "rolling_shutter"]))
     if unknown := [name for name in chosen if name not in known]:
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
     if picture is not None and picture.suffix != ".png":
@@ -80,7 +81,7 @@ def _table(console: Any, result: Mapping[str, Any]) -> None:
         for text in (*entry["reasons"], *entry["flags"]):
             console.print(f"{name}: {text}", markup=False, soft_wrap=True)
     console.print(
-        "inside: pose and part within the stated 95 % ellipsoids; named: refused or flagged by the effect's name. The "
+        "inside: pose and part within the stated 95 % ellipsoids; named: refused by the effect's name. The "
         "part is judged in the surface's plane: contact decides over the rest.",
         soft_wrap=True,
     )
