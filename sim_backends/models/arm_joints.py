@@ -1,7 +1,8 @@
 """What an arm's joints are off: angles that its encoders do not see, from uneven gears and from the weight it carries.
 
-Gears and ring encoders repeat once and twice a turn of the joint. Under a weight each joint gives way by its compliance
-times the torque about its axis; gravity is along the base's -z.
+A strain wave gear repeats its error once and twice a turn of the motor, which turns some hundred times as often as the
+joint: over the whole workspace it looks like noise, and yet is the same wherever a joint comes back. Under a weight
+each joint gives way by its compliance times the torque about its axis; gravity is along the base's -z.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ import numpy as np
 from sim_backends.models.arm_kinematics import Kinematics, Matrix, Vector
 
 GRAVITY = 9.81
+GEAR_RATIO = 101.0
 
 
 @dataclass(frozen=True, eq=False)
 class JointErrors:
-    """`harmonics` (6, 4): sine and cosine of one turn, then of two, rad; `compliance` of each joint in rad/(N m).
+    """`harmonics` (6, 4): sine and cosine of one turn of the motor, then of two, rad; `compliance` in rad/(N m).
 
     The flange carries `mass` kg at its origin.
     """
@@ -29,8 +31,9 @@ class JointErrors:
 
     def true(self, q: Vector) -> Vector:
         """The angles (6,), rad, at which the joints truly stand when their encoders read `q` (6,)."""
-        h = self.harmonics
-        off = h[:, 0] * np.sin(q) + h[:, 1] * np.cos(q) + h[:, 2] * np.sin(2 * q) + h[:, 3] * np.cos(2 * q)
+        h, motor = self.harmonics, GEAR_RATIO * q
+        off = h[:, 0] * np.sin(motor) + h[:, 1] * np.cos(motor)
+        off = off + h[:, 2] * np.sin(2.0 * motor) + h[:, 3] * np.cos(2.0 * motor)
         if self.compliance > 0.0:
             _, jacobian = self.kinematics.forward_with_jacobian(q)
             off = off - (self.compliance * self.mass * GRAVITY) * jacobian[2]

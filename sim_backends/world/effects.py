@@ -28,9 +28,9 @@ class Effects:
     )
     joint_harmonics: float = _row(
         "rad",
-        "RMS error of each joint's angle, in sines of one and two turns of the joint",
-        "strain wave gears and ring encoders: Tuttle, Understanding and modeling the behavior of a harmonic drive gear "
-        "transmission, MIT 1992; size assumed",
+        "RMS error of each joint's angle, in sines of one and two turns of its motor",
+        "strain wave gears repeat with the wave generator: Tuttle, Understanding and modeling the behavior of a "
+        "harmonic drive gear transmission, MIT 1992; size assumed",
     )
     path_memory: float = _row(
         "rad",
