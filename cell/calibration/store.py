@@ -133,6 +133,7 @@ class CellCalibration:
                 "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation],
             },
             "target_quality": _quality(target.quality),
+            "notes": list(scan.notes),
         }
 
 

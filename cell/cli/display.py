@@ -173,5 +173,7 @@ def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
         shown = ["" if q.get(key) is None else f"{q[key]:.4f}" for key in keys]
         fit.add_row(camera, str(q["views"]), f"{q['chi2_per_dof']:.3f}", *shown)
     console.print(fit)
+    for note in summary["notes"]:
+        console.print(note, markup=False, soft_wrap=True)
     if where is not None:
         console.print(f"stored in {where}", markup=False, soft_wrap=True)

@@ -136,7 +136,10 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.check,
         context.progress,
     )
-    return replace(record, pointing=pointing)
+    record = replace(record, pointing=pointing)
+    for note in record.notes:
+        context.note(text=note)
+    return record
 
 
 def _pointing(here: Workplace, context: StepContext) -> Pointing | None:
