@@ -254,6 +254,7 @@ def find_calibration(
         raise CalibrationStale(
             f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
             + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + _exchanged(found, identities)
             + "; run `cell calibrate`"
         )
     current = [entry for entry in own if entry.configuration == configuration]
@@ -283,6 +284,20 @@ def find_calibration(
             "set this machine's clock, or run `cell calibrate`"
         )
     return newest
+
+
+def _exchanged(found: list[CellCalibration], identities: dict[str, str]) -> str:
+    """Which devices the calibration that is nearest to these was made with instead, in words."""
+
+    def others(entry: CellCalibration) -> list[str]:
+        names = sorted(entry.identities.keys() | identities.keys())
+        return [name for name in names if entry.identities.get(name) != identities.get(name)]
+
+    if not found:
+        return ""
+    nearest = min(found, key=lambda entry: (len(others(entry)), -entry.made))
+    instead = ", ".join(f"{name} {nearest.identities.get(name, 'none')}" for name in others(nearest))
+    return f". That of {nearest.date} was made with another one: {instead}"
 
 
 def _lens(camera: CameraModel) -> dict[str, float]:

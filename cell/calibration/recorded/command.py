@@ -67,10 +67,11 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     if pairs and not listing.pictures:
         return calibrate_pairs(pairs)
     series, links, unread = read_series(listing)
+    belonging, strange = match_series(series, listing, links)
     frames = read_frames(listing, spec, links)
     result = empty_result(spec)
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
-    _from_frames(frames, match_series(series, listing, links), options, result)
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
+    _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
@@ -95,13 +96,15 @@ def _from_frames(
         if s.name in (understood.about["source"] or [])
         for r in s.alone
     ]
-    if found is None or options.plan:
+    if found is None:
         return
     chosen, plain = found
     posed = [f for f in used(frames) if f.base_from_flange is not None]
     if len(posed) >= LEAST_POSES:
         settle_orders(posed, chosen.camera)
         posed = refuse_misplaced(refuse_odd_ones(posed, chosen.camera), chosen.camera)
+    if options.plan:
+        return
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = _camera(frames)
