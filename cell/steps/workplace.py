@@ -65,13 +65,29 @@ class Workplace:
     def repeatability(self) -> Vector:
         """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""
         arm = self.config.arm
-        return self._scatter**2 * np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+        return self._scattered(arm.repeatability, arm.repeatability_angle)
 
     @property
     def kinematic(self) -> Vector:
         """Covariance (6, 6) of a measured place in the base that the arm realises when it goes there, m² and rad²."""
         arm = self.config.arm
-        return self._scatter**2 * np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+        return self._scattered(arm.kinematic_sigma, arm.kinematic_sigma_angle)
+
+    def _scattered(self, translation: float, rotation: float) -> Vector:
+        """What is configured, as far as the calibration bore it out; more scatter comes from the joints.
+
+        The same angle of a joint moves the flange the farther the farther the arm reaches out.
+        """
+        angle = self._scatter
+        shift = angle if angle == 1.0 else angle * self._farther_out
+        return np.diag([(shift * translation) ** 2] * 3 + [(angle * rotation) ** 2] * 3)
+
+    @property
+    def _farther_out(self) -> float:
+        """How many times as far as over the calibration board the arm reaches out over the place; at least 1."""
+        place_from_base = self.job.approach.target.se3() * self.config.arm.vehicle_from_base.se3()
+        board = self.config.calibration.fine.base_from_board.se3()
+        return max(1.0, float(np.linalg.norm(place_from_base.translation) / np.linalg.norm(board.translation)))
 
     @property
     def _scatter(self) -> float:

@@ -60,11 +60,11 @@ class CameraClock:
 class Workshop:
     """What was drawn of the workshop's effects; all 0 where they are off.
 
-    `harmonics` (6, 4): each joint's sine and cosine of one turn of its motor, then of two, rad. `sheet_bow`: how far
-    the sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of the light
-    plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal points, px;
-    `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,), rad. `sun_start`
-    in m.
+    `harmonics` (6, 4): each joint's sine and cosine of one turn of its motor, then of two, rad. `sheet_bow`: how
+    far the light sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of
+    the light plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal
+    points, px; `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,),
+    rad. `sun_start` in m.
     """
 
     harmonics: Vector
