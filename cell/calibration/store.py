@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from cell.calibration.archive import SUFFIX, Observations, write_archive
 from cell.calibration.solve.faults import refuse_wrong_lead
 from cell.calibration.solve.joint import Joint
 from cell.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
+from cell.calibration.witness import Witness
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.report.html import table
@@ -54,9 +55,10 @@ class CellCalibration:
         identities: dict[str, str],
         config: CellConfig,
         kinematics: str = "",
+        witness: Witness | None = None,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config, kinematics)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics, witness)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"
@@ -149,6 +151,7 @@ def gathered(
     identities: dict[str, str],
     config: CellConfig,
     kinematics: str = "",
+    witness: Witness | None = None,
 ) -> Observations:
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
@@ -167,6 +170,7 @@ def gathered(
         config.calibration_hash(),
         time.time(),
         kinematics,
+        witness,
     )
 
 
@@ -174,7 +178,7 @@ def solve_observations(observations: Observations) -> Solved:
     """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
     o = observations
     scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
-    head = ScanCalibration.of(scan)
+    head = replace(ScanCalibration.of(scan), witness=o.witness)
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
     made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made, o.kinematics)

@@ -67,10 +67,11 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     if pairs and not listing.pictures:
         return calibrate_pairs(pairs)
     series, links, unread = read_series(listing)
+    belonging, strange = match_series(series, listing, links)
     frames = read_frames(listing, spec, links)
     result = empty_result(spec)
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
-    _from_frames(frames, match_series(series, listing, links), options, result)
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
+    _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result

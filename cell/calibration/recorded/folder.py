@@ -79,7 +79,7 @@ def read_frames(listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str
         except PictureRefused as refused:
             frame.refuse(refused.reason, str(refused))
         if frame.reason not in (Reason.UNREADABLE, Reason.CUT):
-            digest = hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
+            digest = frame_key(frame.name) + hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
             if digest in seen:
                 frame.refuse(Reason.DUPLICATE, f"the same file as {seen[digest]}")
             seen.setdefault(digest, frame.name)

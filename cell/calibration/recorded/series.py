@@ -72,17 +72,25 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             alone = sum(r.field == record.field for r in content.records) == 1
             source = (record.path.parent / series_name(record.path.name)) if alone else record.path
             source_name = listing.name(source)
-            groups.setdefault((source_name, record.field, len(record.numbers)), []).append(record)
+            place = "" if alone and record.field in ("row", "matrix") else record.field
+            groups.setdefault((source_name, place, len(record.numbers)), []).append(record)
     found = [
         Series(f"{source}:{place}" if place not in ("", "row", "matrix") else source, records)
         for (source, place, _), records in groups.items()
     ]
     links = [link for content in contents.values() for link in content.links]
+    few = [s for s in found if len(s.records) < LEAST]
+    unread += [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in few]
     return [s for s in found if len(s.records) >= LEAST], links, unread
 
 
-def match_series(series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]) -> list[Series]:
-    """The series that belong to pictures. Raises ConfigError for a folder with several recordings in it."""
+def match_series(
+    series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]
+) -> tuple[list[Series], list[tuple[str, str]]]:
+    """The series that belong to pictures, and the names of the others with the reason.
+
+    Raises ConfigError for a folder with several recordings in it.
+    """
     names = [listing.name(p) for p in listing.pictures]
     linked = _linked(names, links)
     for one in series:
@@ -104,7 +112,12 @@ def match_series(series: Sequence[Series], listing: Listing, links: Sequence[dic
         one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
     belonging = [s for s in series if s.of]
     _refuse_several(belonging, listing)
-    return belonging
+    strange = [
+        (s.name, f"{len(s.records)} poses for {len(names)} pictures, and none says which picture it belongs to")
+        for s in series
+        if not s.of
+    ]
+    return belonging, strange if names else []
 
 
 def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, str]:
