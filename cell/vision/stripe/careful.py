@@ -32,8 +32,8 @@ BINNED_WIDTH = 4.0
 """A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
 ABOUT_AS_WELL = 0.75
 """Mixes of colours that show the line by this share of the best are compared by what they know of its centres."""
-KNOWN_PX = 0.03
-MOST_WANDER = 2.5
+KNOWN_PX, FLANKS_ALONE = 0.03, 0.5
+MOST_WANDER = 8.0
 SURE = 3.5
 """Least amplitude of a stripe in its standard deviations."""
 LEAST_SCORE = 0.35
@@ -148,8 +148,9 @@ def _knowledge(
     good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
     sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
-    # A line that is known very well says no more than that it is.
-    return float(np.sum(1 / (KNOWN_PX**2 + sigma**2)))
+    # A line that is known very well says no more than that it is; flanks are a poorer witness than a whole profile.
+    hidden = ((np.abs(fitted.x) < width) & np.isinf(fitted.variance)).any(axis=1)[good]
+    return float(np.sum((1 - FLANKS_ALONE * hidden) / (KNOWN_PX**2 + sigma**2)))
 
 
 def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:

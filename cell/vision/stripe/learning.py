@@ -23,6 +23,7 @@ FAINT = 0.012
 """Of the peak: below this share a halo has ended."""
 BETTER, SURE = 0.01, 4.0
 """Held-out lines have to fit better by this share, and by so many standard deviations, for a profile to be believed."""
+FAINT_SPECKLE = 0.03
 FREE_SCALE, SHARED_SCALE, LEAST_SCALE = 0.25, 0.15, 0.001
 """Standard deviations of the logarithm of a line's scale: before it is known, and the least ever assumed."""
 
@@ -65,8 +66,13 @@ def learn_profile(
     )
     if not _better(of_taught, of_plain):
         return plain, spread, noise
-    shape, fitted, clear = _rounds(plane, lines, starts, width, reach, noise)
-    noise = speckled(fitted, clear, noise, shape)
+    # What a Gaussian misfits by looked like speckle: with the profile's own residuals once more, from none on.
+    noise = Noise(noise.floor, noise.gain)
+    for _ in range(2):
+        shape, fitted, clear = _rounds(plane, lines, starts, width, reach, noise)
+        noise = speckled(fitted, clear, noise, shape)
+        if noise.contrast < FAINT_SPECKLE:
+            break
     freely = fit_shape(plane, lines, starts, shape, noise, FREE_SCALE)
     return shape, _spread(freely, clear & _clear(freely, plane)), noise
 
