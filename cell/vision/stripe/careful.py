@@ -149,7 +149,8 @@ def _knowledge(
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
     sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
     # A line that is known very well says no more than that it is; flanks are a poorer witness than a whole profile.
-    hidden = ((np.abs(fitted.x) < width) & np.isinf(fitted.variance)).any(axis=1)[good]
+    core = np.abs(fitted.x[good]) < width
+    hidden = np.asarray(core & np.isinf(fitted.variance[good])).any(axis=1)
     return float(np.sum((1 - FLANKS_ALONE * hidden) / (KNOWN_PX**2 + sigma**2)))
 
 
