@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from pydantic import AfterValidator, model_validator
 
 from cell.toml_file import Table
@@ -98,18 +99,26 @@ class RailConfig(DeviceConfig):
         return self
 
 
+MOST_PAYLOAD = {
+    "UR3": 3.0, "UR5": 5.0, "UR10": 10.0, "UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5,
+    "UR16e": 16.0, "UR20": 20.0, "UR30": 30.0,
+}  # fmt: skip
+"""What each model carries, kg, by the maker's data sheets."""
 Centre = Annotated[float, quantity("mm", -500, 500)]
 
 
 class ArmConfig(DeviceConfig):
-    """The arm and where it stands on the vehicle; the cell plans with the kinematics of `model`."""
+    """The arm and where it stands on the vehicle.
 
-    model: Literal["UR10e"] = "UR10e"
+    The cell plans with the table that the arm's controller tells; it has to be that of an arm of `model`.
+    """
+
+    model: Literal["UR3", "UR5", "UR10", "UR3e", "UR5e", "UR7e", "UR10e", "UR12e", "UR16e", "UR20", "UR30"] = "UR10e"
     max_joint_speed: Annotated[float, quantity("deg/s", 1, 120)]
     max_joint_acceleration: Annotated[float, quantity("deg/s^2", 1, 800)]
     max_joint_jerk: Annotated[float, quantity("deg/s^3", 10, 40_000)]
     max_tool_speed: Annotated[float, quantity("mm/s", 1, 1500)]
-    payload: Annotated[float, quantity("kg", 0, 12.5)]
+    payload: Annotated[float, quantity("kg", 0, 30)]
     payload_centre: tuple[Centre, Centre, Centre]
     vehicle_from_base: Pose
     settle_time: Annotated[float, quantity("s", 0, 5)]
@@ -117,6 +126,12 @@ class ArmConfig(DeviceConfig):
     repeatability_angle: AngleScatter
     kinematic_sigma: Annotated[float, quantity("mm", 0, 10)]
     kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
+
+    @model_validator(mode="after")
+    def _carries(self) -> Self:
+        if self.payload > (most := MOST_PAYLOAD[self.model]):
+            raise ValueError(f"payload {self.payload:g} kg: a {self.model} carries up to {most:g} kg")
+        return self
 
     @model_validator(mode="after")
     def _on_the_vehicle(self) -> Self:
@@ -142,7 +157,10 @@ class VehicleConfig(DeviceConfig):
 
 
 class CameraConfig(DeviceConfig):
-    """A camera with its nominal optics and mounting."""
+    """A camera with its nominal optics and mounting.
+
+    `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    """
 
     width: Pixels
     height: Pixels
@@ -150,6 +168,7 @@ class CameraConfig(DeviceConfig):
     focal_length: Annotated[float, quantity("mm", 1, 200)]
     flange_from_camera: Mounting
     photo_exposure: PhotoExposure
+    late: Annotated[float, quantity("ms", 0, 100)] = 0.002
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
@@ -168,10 +187,19 @@ class CameraConfig(DeviceConfig):
 
 
 class LaserConfig(DeviceConfig):
-    """The line laser with its nominal place in the scan camera's frame."""
+    """The line laser with its nominal place in the scan camera's frame.
+
+    `witness`: where the rail shows the scan camera the line on a plate that is fixed to the claw; None without one.
+    """
 
     baseline: Annotated[float, quantity("mm", 5, 500)]
     tan_theta: Annotated[float, number(0.2, 20)]
+    witness: Annotated[float, quantity("mm", -2000, 2000)] | None = None
+
+    @property
+    def exit_point(self) -> NDArray[np.float64]:
+        """The laser's exit point (3,) in the scan camera's frame as drawn, m."""
+        return np.array([-self.baseline, 0.0, 0.0])
 
 
 class ClawConfig(DeviceConfig):

@@ -20,6 +20,7 @@ import pinocchio as pin
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
+from cell.calibration.witness import Witness
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
@@ -37,7 +38,8 @@ class Observations:
     """All that a cell's calibration is solved from.
 
     The cameras as drawn, the noise assumed beforehand, the rail's lead as configured in m per turn, and whose they are:
-    serial numbers by device name, the hash of the configuration, the time in seconds since the epoch.
+    serial numbers by device name, the hash of the configuration, the time in seconds since the epoch, and the name of
+    the arm's table.
     """
 
     scan: list[ScanObservation]
@@ -49,6 +51,8 @@ class Observations:
     identities: dict[str, str]
     configuration: str
     made: float
+    kinematics: str = ""
+    witness: Witness | None = None
 
 
 def write_archive(path: Path, observations: Observations) -> None:
@@ -59,6 +63,7 @@ def write_archive(path: Path, observations: Observations) -> None:
         "made": o.made,
         "identities": o.identities,
         "configuration": o.configuration,
+        "kinematics": o.kinematics,
         "rail_lead": o.rail_lead,
         "priors": {name: getattr(o.priors, name) for name in PRIORS},
         "scan_camera": _camera_dict(o.scan_camera),
@@ -69,6 +74,9 @@ def write_archive(path: Path, observations: Observations) -> None:
     arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
     arrays["scan_same_rest"] = np.array([s.same_rest for s in o.scan], dtype=np.bool_)
     arrays |= _profiles([s.profile for s in o.scan])
+    if o.witness is not None:
+        arrays |= {"witness_columns": o.witness.columns, "witness_sigma": o.witness.sigma}
+        about["witness_rail"] = o.witness.rail
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
@@ -117,11 +125,22 @@ def read_archive(path: Path) -> Observations:
             {str(name): str(serial) for name, serial in about["identities"].items()},
             str(about["configuration"]),
             float(about["made"]),
+            str(about.get("kinematics", "")),
+            _read_witness(data, about),
         )
     except KeyError as error:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error
     except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
+
+
+def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness | None:
+    if "witness_rail" not in about:
+        return None
+    columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
+    if columns.ndim != 1 or columns.shape != sigma.shape:
+        raise ValueError("the witness needs a deviation for each of its columns")
+    return Witness(float(about["witness_rail"]), columns, sigma)
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:

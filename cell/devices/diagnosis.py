@@ -15,7 +15,7 @@ import numpy as np
 from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
 from cell.devices.simulated import SimulatedCell, with_endpoints
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
@@ -128,8 +128,9 @@ def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -
 
 
 def _arm_state(arm: Arm) -> str:
-    state = arm.state()
-    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg"
+    state, table = arm.state(), arm.link_table()
+    own = "own kinematics not told" if table is None else f"own kinematics {table.hash()}"
+    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg, {own}"
 
 
 def _rail_state(rail: Rail) -> str:

@@ -1,7 +1,8 @@
 """The simulated arm: joints, safety system, inputs and outputs, true and reported poses; physics only, no bytes.
 
-What the arm reports comes from its joint encoders and the nominal kinematics. Where the flange truly is differs by
-the errors of its Denavit-Hartenberg table and by a repeatability error that is drawn anew for every rest.
+What the arm reports comes from its joint encoders and the table that its controller was given in the factory. Where the
+flange truly is differs by what that calibration has left, and by a repeatability error that is drawn anew for every
+rest.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sim_backends.clock import WorldClock
+from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
 from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
 from sim_backends.models.arm_truth import TruePose
@@ -50,14 +52,21 @@ class Power(IntEnum):
 class ArmParams:
     """What one particular arm is like.
 
-    `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad; the error is the true table less
-    the nominal one. `repeatability` holds standard deviations per axis in m and rad; `force_noise` in N and N·m;
-    `force_limit` in N is where a protective stop comes; `unlock_delay` in s is how long it cannot be unlocked.
+    `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad. `dh` is what the controller
+    computes with and tells; the error is the true table less that one. `repeatability` holds standard deviations
+    per axis in m and rad; `force_noise` in N and N·m; `force_limit` in N is where a protective stop comes;
+    `unlock_delay` in s is how long it cannot be unlocked. `memory` in rad is the joints' way over which the
+    error of repeatability lasts (0: drawn at each rest); for `harmonics` and `compliance` see `JointErrors`; `carried`
+    in kg.
     """
 
     dh: Matrix = field(default_factory=lambda: UR10E_DH.copy())
     dh_error: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
     repeatability: tuple[float, float] = (0.0, 0.0)
+    memory: float = 0.0
+    harmonics: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
+    compliance: float = 0.0
+    carried: float = 2.1
     blend_time: float = 0.3
     joint_limit: float = 2 * math.pi
     speed_limits: Vector = field(default_factory=lambda: np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]))
@@ -72,7 +81,7 @@ class ArmParams:
     @classmethod
     def of(cls, model: str, **others: Any) -> ArmParams:
         """Those of the maker's `model`, a key of `TABLES`, with `others` as given."""
-        return cls(dh=TABLES[model].copy(), model=model, **others)
+        return cls(dh=others.pop("dh", TABLES[model]).copy(), model=model, **others)
 
 
 class ArmModel:
@@ -82,6 +91,7 @@ class ArmModel:
         """Stands at `params.initial_q`, powered, brakes released, safety normal."""
         self.params = params
         self.kinematics = Kinematics(params.dh)
+        self._drawn = Kinematics(TABLES[params.model])
         self.drive = Drive(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
         self.power = Power.RUNNING
         self.safety = Safety.NORMAL
@@ -101,7 +111,10 @@ class ArmModel:
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
-        self._truth = TruePose(Kinematics(params.dh + params.dh_error), params.repeatability, params.blend_time, rng)
+        true = Kinematics(params.dh + params.dh_error)
+        bends = params.harmonics.any() or params.compliance > 0.0
+        joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
+        self._truth = TruePose(true, params.repeatability, params.blend_time, rng, joints, params.memory)
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     # --- the world's side ---
@@ -134,6 +147,15 @@ class ArmModel:
     def base_from_flange(self, t: float) -> Matrix:
         """True flange pose (4, 4) in the base at world time `t` (the last 10 s are kept)."""
         return self._truth.at(t)
+
+    def body_frames(self) -> Matrix:
+        """The frames (7, 4, 4) of base, links and flange as the maker draws them, now; those of the links to some mm.
+
+        A factory's table has them where its common normals happen to lie, which may be far from the links.
+        """
+        frames = self._drawn.frames(self.drive.q)
+        frames[6] = self.reported_flange()
+        return frames
 
     def reported_flange(self) -> Matrix:
         """Flange pose (4, 4) in the base as the controller computes it from the encoders, now."""

@@ -47,10 +47,10 @@ class Chain:
     left_out: Flatness | None
 
 
-def solve_chain(frames: Sequence[RecordedFrame]) -> Chain:
-    """Staged and joint solution with the camera on the flange, or before it, whichever fits."""
+def solve_chain(frames: Sequence[RecordedFrame], known: str | None = None) -> Chain:
+    """Staged and joint solution with the camera as `known`, on the flange or before it, or whichever fits."""
     best: tuple[float, str, list[ScanObservation], Staged] | None = None
-    for setup in ("eye_in_hand", "eye_to_hand"):
+    for setup in ("eye_in_hand", "eye_to_hand") if known is None else (known,):
         observations = [_observation(f, invert=setup == "eye_to_hand") for f in frames]
         lit = sum(o.profile is not None for o in observations) >= 2
         staged = None
@@ -84,7 +84,7 @@ def solve_chain(frames: Sequence[RecordedFrame]) -> Chain:
 def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
     assert frame.base_from_flange is not None
     pose = frame.base_from_flange.inverse() if invert else frame.base_from_flange
-    return ScanObservation(frame.view, frame.profile, pose, 0.0, frame.path.name)
+    return ScanObservation(frame.view, frame.profile, pose, 0.0, frame.name)
 
 
 def report_chain(chain: Chain, frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
@@ -137,7 +137,7 @@ def report_chain(chain: Chain, frames: Sequence[RecordedFrame], result: dict[str
             "cross_ratio_check_mm": None if chain.staged.paper is None else finite_mm(chain.staged.paper.cross_ratio_m),
         },
     }
-    names = [f.path.name for f in frames]
+    names = [f.name for f in frames]
     rows = chain.staged.plane.rows
     result["stripe_points"] = {n: len(r) for n, r in zip(names, rows, strict=True)}
     if chain.flat is not None:

@@ -13,10 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from cell.calibration.recorded.attach import LEAST_POSES, Options, attach_poses
 from cell.calibration.recorded.chain import report_chain, solve_chain
-from cell.calibration.recorded.folder import RecordedFrame, poses_without_frame, read_frames, read_pose_pairs, used
+from cell.calibration.recorded.conventions import check_reading
+from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs, used
+from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import empty_result, frame_dict, intrinsics_dict, plane_dict, seen_depths
+from cell.calibration.recorded.series import Series, match_series, read_series
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens
 from cell.calibration.solve.starts import plane_from_board, stripe_pixels
@@ -28,16 +32,18 @@ from drivers.errors import ConfigError, RefusedError
 
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
 ODD_RATIO, ODD_PX = 3.5, 0.4
-LEAST_POSES = 3
 OBLIQUE = math.radians(75.0)
 
 
-def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
+def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | None = None) -> dict[str, Any]:
     """Calibrate from the pictures of a folder, or from its pairs of poses when `spec` is None or there are no pictures.
 
     Keys, all lengths in mm and angles in deg unless the key says otherwise, None for what the folder does not tell:
 
-    - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `stripe_points`;
+    - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `pose_from`, `stripe`,
+      `stripe_from`;
+    - `poses`: how the flange poses were read: `source`, `reading`, `unit`, `setup`, `matched_by`, `evidence`;
+    - `unread`: `name` and `reason` of each file that was not understood;
     - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
       it), `held_out_rms_px`, `sigma_px`; `intrinsics_without_distortion`, `intrinsics_from_pictures` likewise;
     - `hand_eye`: `method`, `setup` (eye_in_hand, eye_to_hand), `translation_mm`, `rotation` (3×3),
@@ -50,48 +56,62 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None) -> dict[str, Any]:
 
     Raises ConfigError when there is nothing to read.
     """
+    options = options or Options()
+    check_reading(options.poses)
     pairs = read_pose_pairs(folder) if folder.is_dir() else []
     if spec is None:
         if not pairs:
             raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
         return calibrate_pairs(pairs)
-    try:
-        frames = read_frames(folder, spec)
-    except ConfigError:
-        if pairs:
-            return calibrate_pairs(pairs)
-        raise
+    listing = list_folder(folder)
+    if pairs and not listing.pictures:
+        return calibrate_pairs(pairs)
+    series, links, unread = read_series(listing)
+    belonging, strange = match_series(series, listing, links)
+    frames = read_frames(listing, spec, links)
     result = empty_result(spec)
-    result["notes"] += [
-        f"{name} is not used: no picture has its number" for name in poses_without_frame(folder, frames)
-    ]
-    _from_frames(frames, result)
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
+    _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
 
 
-def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
+def _from_frames(
+    frames: list[RecordedFrame], series: Sequence[Series], options: Options, result: dict[str, Any]
+) -> None:
     notes: list[str] = result["notes"]
+    found: tuple[Intrinsics, Intrinsics] | None = None
     try:
-        chosen, plain = _camera(frames)
+        found = _camera(frames)
     except RefusedError as error:
         notes.append(f"no intrinsics: {error}")
+    understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
+    result["poses"] = understood.about
+    notes += understood.notes
+    notes += [
+        f"{r.path.name if r.label is None or r.label[:1] != '[' else f'{r.path.name} {r.label}'} is not used: no "
+        "picture belongs to it"
+        for s in series
+        if s.name in (understood.about["source"] or [])
+        for r in s.alone
+    ]
+    if found is None or options.plan:
         return
+    chosen, plain = found
     posed = [f for f in used(frames) if f.base_from_flange is not None]
     if len(posed) >= LEAST_POSES:
         settle_orders(posed, chosen.camera)
-        before = len(posed)
         posed = refuse_misplaced(refuse_odd_ones(posed, chosen.camera), chosen.camera)
-        if len(posed) < before:
-            try:
-                chosen, plain = _camera(frames)
-            except RefusedError as error:
-                notes.append(f"no intrinsics: {error}")
-                return
-            posed = [f for f in posed if f.reason is None]
+    if len(used(frames)) < len(chosen.view_rms):
+        try:
+            chosen, plain = _camera(frames)
+        except RefusedError as error:
+            notes.append(f"no intrinsics: {error}")
+            return
+        posed = [f for f in posed if f.reason is None]
     rest = used(frames)
-    result["frames_rms"] = {f.path.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
+    result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
     result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
     result["intrinsics_without_distortion"] = intrinsics_dict(plain)
     if len(posed) >= LEAST_POSES:
@@ -99,14 +119,10 @@ def _from_frames(frames: list[RecordedFrame], result: dict[str, Any]) -> None:
         if without_pose:
             notes.append(f"{without_pose} used frames have no flange pose: they count for the intrinsics only")
         try:
-            report_chain(solve_chain(posed), posed, result)
+            report_chain(solve_chain(posed, understood.setup), posed, result)
             return
         except (RefusedError, np.linalg.LinAlgError) as error:
             notes.append(f"no hand-eye: {error}")
-    else:
-        notes.append(
-            f"{len(posed)} used frames have a flange pose, at least {LEAST_POSES} are needed: no hand-eye, no flatness"
-        )
     _report_plane(rest, chosen.camera, result)
 
 
@@ -157,4 +173,4 @@ def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: 
         "depth_range_mm": seen_depths(plane.plane, camera, seen),
         "method": "fit on the board's poses",
     }
-    result["stripe_points"] = {f.path.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
+    result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}

@@ -23,6 +23,7 @@ from cell.geometry.covariance import covariance_root
 from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.lab.bench.contact import mean_after_contact
 from cell.lab.bench.scan_errors import by_pose
 from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction import Cloud, calibration_motions, flange_motions
@@ -31,6 +32,7 @@ from cell.report.bound import part_points
 from cell.steps.sweep_record import SweepRecord
 from drivers.interfaces import Vector
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+from sim_backends.world.scene import draw
 
 POINTS = 1500
 _STEP = 1e-6
@@ -42,9 +44,9 @@ class Expected:
     """Covariances (6, 6) of (translation, rotation) in base axes about the surface's origin, m² and rad².
 
     `absolute`: of the surface in the arm's true base. `own`: in the base as the arm itself realises it where it places.
-    `placing`: of the part on the surface, with all that placing adds. The mean distances to expect of them over
-    the part's 45 points are `absolute_m`, `own_m` and `placing_m`; `sensor_m` that of single points in the camera's
-    frame at rail zero.
+    `placing`: of the part in the air, with all that placing adds. The mean distances to expect of them over the part's
+    45 points are `absolute_m`, `own_m` and, once contact has let the part rest, `placing_m`; `sensor_m` that of single
+    points in the camera's frame at rail zero.
     """
 
     absolute: Vector
@@ -63,7 +65,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     cloud: Cloud = record.results["reconstruct"].cloud
     sweep: SweepRecord = record.results["laser_sweep"]
     pose = record.results["invert_pose"]
-    kinematics = _Kinematics(record.rests)
+    kinematics = _Kinematics(record.rests, UR10E_DH + draw(record.seed, record.level).dh_factory)
     shared, by_kinematics = _calibration(record, config, noise, kinematics)
     rest = np.diag([noise["arm_repeatability"] ** 2 / 3] * 3 + [noise["arm_repeatability_rotation"] ** 2] * 3)
     head = _Head(record, cloud, [rest] * len(sweep.swaths), nominal, pose.base_from_surface)
@@ -88,7 +90,8 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
         return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
 
     in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
-    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera))
+    placed = mean_after_contact(placing, nominal, pose)
+    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), placed, mean_distance(in_camera))
 
 
 def mean_distance(covariances: Vector) -> float:
@@ -102,9 +105,10 @@ def mean_distance(covariances: Vector) -> float:
 class _Kinematics:
     """How the flange moves with the 18 lengths and zeros of the arm's table, at the postures that it rested in."""
 
-    def __init__(self, rests: Vector) -> None:
+    def __init__(self, rests: Vector, told: Vector) -> None:
         self._rests = rests
-        self._nominal = Kinematics(UR10E_DH)
+        self._table = told
+        self._nominal = Kinematics(told)
         self._flanges = np.array([self._nominal.forward(q) for q in rests])
 
     def shifts(self, base_from_flange: pin.SE3) -> Vector:
@@ -117,7 +121,7 @@ class _Kinematics:
         at = self._nominal.forward(joints)
         columns = []
         for column, row in [(c, r) for c in (0, 1, 3) for r in range(6)]:
-            table = UR10E_DH.copy()
+            table = self._table.copy()
             table[row, column] += _STEP
             moved = Kinematics(table).forward(joints)
             turn = pin.log3(moved[:3, :3] @ at[:3, :3].T)
