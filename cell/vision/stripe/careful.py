@@ -106,7 +106,7 @@ def read_carefully(
     fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
     sigma = carried(fitted, variance, correlation)
-    out = _believed(fitted, sigma, at, shape, k, lines, plane)
+    out = _believed(fitted, sigma, at, shape, k, lines, plane, noise)
     # A surface may be rough: lines that wander tell of errors only where something is there to make them.
     unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
     factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
@@ -294,11 +294,13 @@ def _albedo(shade: NDArray[np.float32] | None, usable: NDArray[np.bool_]) -> NDA
 
 
 def _believed(
-    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane
+    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane, noise: Noise,
 ) -> Careful:  # fmt: skip
     """The fits that are a stripe, in px of the picture and lines of all of it."""
     width = shape.width
-    keep = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    # Speckle makes a stripe's height uncertain, not that there is one.
+    clear = np.minimum(fitted.amplitude_sigma, np.sqrt(noise.floor))
+    keep = fitted.good & (fitted.amplitude > SURE * clear)
     keep &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     keep &= sigma < np.maximum(1.0, 0.7 * width)
     if keep.any():
