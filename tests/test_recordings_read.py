@@ -317,3 +317,43 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
     series, links, _ = read_series(listing)
     with pytest.raises(ConfigError, match="monday, tuesday"):
         match_series(series, listing, links)
+    for path in (tmp_path / "monday").iterdir():
+        path.rename(tmp_path / path.name)
+    listing = list_folder(tmp_path)
+    series, links, _ = read_series(listing)
+    (own,), _ = match_series(series, listing, links)
+    assert len(own.of) == len(listing.pictures) == len(POSES)
+    assert ("tuesday/", "a recording of its own: name it with --from") in listing.unread
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
+    rng = np.random.default_rng(seed)
+    for write in SPELLINGS:
+        write(recording)
+    for path in [p for p in recording.rglob("*") if p.suffix in (".txt", ".csv", ".yaml", ".yml", ".json")]:
+        data = bytearray(path.read_bytes())
+        for at in rng.integers(0, len(data), 3):
+            data[at] = rng.choice(list(b"[]{}:,;-.\n \0\xffx'\"09"))
+        path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
+    _, _, unread = read_series(list_folder(recording))
+    assert all(len(reason) > 5 for _, reason in unread)
+
+
+def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
+    (tmp_path / "laser").mkdir()
+    for path in sorted(pictures.iterdir())[:2]:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"board_{path.stem[-2:]}.png"), image)
+        dark = np.random.default_rng(1).normal(6, 1, image.shape)
+        across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+        dark += 180 * np.exp(-0.5 * (across / 2.0) ** 2)
+        cv2.imwrite(str(tmp_path / "laser" / f"{int(path.stem[-2:])}.png"), np.clip(dark, 0, 255).astype(np.uint8))
+    frames = read_frames(list_folder(tmp_path), BOARD)
+    assert [(f.name, f.stripe_from) for f in frames if f.reason is None] == [
+        ("board_03.png", "laser/3.png"),
+        ("board_04.png", "laser/4.png"),
+    ]
+    rows = frames[0].profile.rows
+    assert np.abs(frames[0].profile.centres[rows] - (300 + 0.1 * rows)).max() < 0.2
+    assert [f.reason.value for f in frames if f.reason is not None] == ["laser_picture"] * 2

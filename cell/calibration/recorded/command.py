@@ -96,13 +96,15 @@ def _from_frames(
         if s.name in (understood.about["source"] or [])
         for r in s.alone
     ]
-    if found is None or options.plan:
+    if found is None:
         return
     chosen, plain = found
     posed = [f for f in used(frames) if f.base_from_flange is not None]
     if len(posed) >= LEAST_POSES:
         settle_orders(posed, chosen.camera)
         posed = refuse_misplaced(refuse_odd_ones(posed, chosen.camera), chosen.camera)
+    if options.plan:
+        return
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = _camera(frames)
