@@ -89,13 +89,13 @@ def _from_frames(
     understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
     result["poses"] = understood.about
     notes += understood.notes
-    notes += [
-        f"{r.path.name if r.label is None or r.label[:1] != '[' else f'{r.path.name} {r.label}'} is not used: no "
-        "picture belongs to it"
-        for s in series
-        if s.name in (understood.about["source"] or [])
-        for r in s.alone
-    ]
+    for one in series:
+        if one.alone and one.name in (understood.about["source"] or []):
+            names = [
+                r.path.name if sum(r.path == o.path for o in one.records) == 1 else f"{r.path.name} {r.label}"
+                for r in one.alone
+            ]
+            notes.append(f"{', '.join(names)} not used: no picture belongs to it")
     if found is None:
         return
     chosen, plain = found
