@@ -82,7 +82,7 @@ def _from_folder(folder: Path, board: str | None, json: bool) -> None:
     from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
     from cell.vision import parse_board
-    from drivers.errors import ConfigError
+    from drivers.errors import ConfigError, RefusedError
 
     result = calibrate_folder(folder, None if board is None else parse_board(board))
     if json:
@@ -93,5 +93,7 @@ def _from_folder(folder: Path, board: str | None, json: bool) -> None:
         raise ConfigError(
             f"no picture in {folder} could be used: is {board} the board in the pictures? The reasons are listed above"
         )
+    if result["refused"]:
+        raise RefusedError("; ".join(result["refused"].values()))
     if result["intrinsics"] is None and result["hand_eye"] is None:
         raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result['notes'])}")

@@ -45,6 +45,11 @@ class RecordedFrame:
     reason: Reason | None = None
     text: str = ""
 
+    @property
+    def name(self) -> str:
+        """What it is called in tables."""
+        return self.path.name
+
     def refuse(self, reason: Reason, text: str) -> None:
         """Set the frame aside."""
         self.reason, self.text = reason, text

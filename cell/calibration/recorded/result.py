@@ -35,17 +35,20 @@ def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
         "frames_rms": {},
         **dict.fromkeys(keys),
         "notes": [],
+        "checks": [],
+        "refused": {},
+        "refused_values": {},
     }
 
 
 def frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
     """What became of one frame; `rms` in px by file name."""
     return {
-        "name": frame.path.name,
+        "name": frame.name,
         "used": frame.reason is None,
         "reason": None if frame.reason is None else str(frame.reason),
         "text": frame.text,
-        "rms_px": rms.get(frame.path.name),
+        "rms_px": rms.get(frame.name),
         "points": 0 if frame.view is None else len(frame.view.ids),
         "pose": frame.base_from_flange is not None,
         "stripe": frame.profile is not None,
@@ -58,8 +61,11 @@ def intrinsics_dict(found: Intrinsics) -> dict[str, Any]:
     return {
         **camera_dict(found.camera),
         "rms_px": found.point_rms_px,
-        "held_out_rms_px": math.sqrt(2) * found.held_out_px,
+        "held_out_rms_px": math.sqrt(2) * found.held_out_px if math.isfinite(found.held_out_px) else None,
         "sigma_px": dict(zip(PARAMETER_NAMES[:4], found.sigma[:4].tolist(), strict=True)),
+        "formal_sigma_px": dict(zip(PARAMETER_NAMES[:4], found.formal[:4].tolist(), strict=True)),
+        "lens": found.model.name,
+        "lens_tried_rms_px": {name: v for name, v in found.tried.items() if math.isfinite(v)},
         "method": "pictures alone",
     }
 

@@ -1,0 +1,136 @@
+"""Is the light plane a plane, and is it known? Straightness of each stripe, stripes of another line, scatter, size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from cell.calibration.solve.checks import Check
+from cell.calibration.solve.starts import robust_plane
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.light_plane import LightPlane
+
+CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0
+"""A stripe whose centres leave a straight line by more than all of these is not one line of light on a flat board."""
+ODD_SHARE, ODD_RATIO = 0.02, 6.0
+"""A stripe further than this share of its distance, and than so many times the others, from the others' plane."""
+LEAST_STRIPES = 3
+THIN = 40
+MOST_PAIRS = 400
+
+
+def straightness(camera: CameraModel, pixels: Array, sigma: Array) -> tuple[float, float]:
+    """RMS distance in px of stripe points (n, 2) from a straight line in the undistorted picture, and their own σ."""
+    ideal = camera.normalised(pixels) * (camera.fx, camera.fy)
+    centred = ideal - np.nanmean(ideal, axis=0)
+    across = centred @ np.linalg.svd(centred, full_matrices=False)[2][1]
+    return float(np.sqrt(np.mean(across**2))), float(np.sqrt(np.mean(sigma**2)))
+
+
+def crooked(camera: CameraModel, pixels: Array, sigma: Array) -> str | None:
+    """What is wrong with a stripe on a flat board that is not straight; None when it is."""
+    off, own = straightness(camera, pixels, sigma)
+    allowed = max(CROOKED_PX, CROOKED_SHARE * float(np.linalg.norm(np.ptp(pixels, axis=0))), CROOKED_SIGMAS * own)
+    if off < allowed:
+        return None
+    return (
+        f"its stripe is not straight on the board: {off:.1f} px RMS from a line, its own noise is {own:.2f} px, "
+        f"allowed {allowed:.1f} px; is it one line of light, and does it lie on the board?"
+    )
+
+
+def odd_stripes(clouds: Sequence[Array]) -> dict[int, str]:
+    """Which frames' stripe points (n, 3) in the camera frame, in m, are of another line of light than most; why.
+
+    The plane is that of the pair of frames to which most others are nearest, so that a third of them may be wrong.
+    """
+    lit = [k for k, cloud in enumerate(clouds) if len(cloud) >= LEAST_STRIPES]
+    if len(lit) < LEAST_STRIPES + 1:
+        return {}
+    thin = {k: clouds[k][:: max(1, len(clouds[k]) // THIN)] for k in lit}
+    pairs = list(combinations(lit, 2))
+    best: tuple[float, Array] | None = None
+    for i, j in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
+        both = np.concatenate([thin[i], thin[j]])
+        spread = np.linalg.svd(both - both.mean(axis=0), compute_uv=False)
+        if spread[1] < 0.02 * spread[0]:
+            continue
+        plane = LightPlane.fit(both)
+        off = np.array([np.median(np.abs(plane.distances(thin[k]))) for k in lit])
+        if best is None or np.median(off) < best[0]:
+            best = float(np.median(off)), off
+    if best is None:
+        return {}
+    usual, off = best
+    near = [k for k, away in zip(lit, off, strict=True) if away < 3 * usual]
+    plane = robust_plane(np.concatenate([thin[k] for k in near]))[0]
+    found = {}
+    for k in lit:
+        away = float(np.median(np.abs(plane.distances(thin[k]))))
+        reach = float(np.median(thin[k][:, 2]))
+        if away > max(ODD_SHARE * reach, ODD_RATIO * usual):
+            found[k] = (
+                f"its stripe lies {1e3 * away:.1f} mm from the plane of the other frames' stripes, which agree to "
+                f"{1e3 * usual:.1f} mm: is it another line of light, or a reflection?"
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class PlaneKnown:
+    """How well a plane is known: where it was seen (m) and its normal (rad), from planes that lack one frame each."""
+
+    place: float
+    tilt: float
+
+    @classmethod
+    def of(cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array) -> PlaneKnown:
+        """`others` (n) lack one frame each; `cloud` (m, 3) in m is where the plane was seen."""
+        count = len(others)
+        root = np.sqrt((count - 1) / count)
+        thin = cloud[:: max(1, len(cloud) // 500)]
+        away = np.array([other.distances(thin) - plane.distances(thin) for other in others])
+        turn = np.array([other.n * np.sign(other.n @ plane.n) - plane.n for other in others])
+        place = root * float(np.sqrt(np.mean(np.sum((away - away.mean(axis=0)) ** 2, axis=0))))
+        return cls(place, root * float(np.sqrt(np.sum((turn - turn.mean(axis=0)) ** 2))))
+
+
+def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
+    """The plane of all clouds but one, for each cloud that has points."""
+    lit = [k for k, cloud in enumerate(clouds) if len(cloud)]
+    if len(lit) < LEAST_STRIPES:
+        return []
+    return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
+
+
+def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown | None) -> list[Check]:
+    """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters."""
+    size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+    reach = float(np.median(cloud[:, 2]))
+    made = [
+        Check(
+            "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
+            f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
+            "points are not those of one plane; are there two lines, or something else that shines?",
+        )
+    ]  # fmt: skip
+    if known is None:
+        made.append(
+            Check(
+                "light_plane", "number of frames that check it", 1 / max(frames, 1), 1 / 3.5, 1.0, "(1 / frames)",
+                f"{frames} frames show the stripe, so no frame can check the others; take 4 or more",
+            )
+        )  # fmt: skip
+        return made
+    words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
+    made.append(
+        Check(
+            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, 0.5, 2.0,
+            "% of the distance", f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
+        )
+    )  # fmt: skip
+    made.append(Check("light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, "deg", f"{words}"))
+    return made
