@@ -25,7 +25,7 @@ from cell.calibration.recorded.result import (
     plane_dict,
     seen_depths,
 )
-from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, stripe_block
+from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, SHARED, stripe_block
 from cell.calibration.solve.checks import Check
 from cell.calibration.solve.choice import Choice, choose_solution
 from cell.calibration.solve.closed_form import points_on_boards
@@ -33,12 +33,14 @@ from cell.calibration.solve.flatness import Flatness, flatness, leave_one_out
 from cell.calibration.solve.hand_eye_checks import hand_eye_checks
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.calibration.solve.joint import Staged, solve_staged, start_state
-from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks
+from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_of_cameras
+from cell.calibration.solve.scale import Scale, metric_scale
 from cell.calibration.solve.starts import stripe_means
 from cell.geometry.camera import PARAMETER_NAMES
 from drivers.errors import RefusedError
 
 Setup = str
+STRANGE_SHARE, STRANGE_TURN = 0.15, math.radians(10.0)
 LEAST_FRAMES = 4
 """With three poses everything fits: there is no fourth to disagree."""
 
@@ -53,6 +55,8 @@ class Chain:
     choice: Choice
     stripes: dict[int, str]
     no_plane: str
+    plane_known: PlaneKnown | None
+    scale: Scale | None
     flat_staged: Flatness | None
     flat: Flatness | None
     left_out: Flatness | None
@@ -70,8 +74,19 @@ def solve_chain(
             f"{len(frames)} frames have a flange pose; a hand-eye that can be checked needs {LEAST_FRAMES} or more"
         )
     setup, observations, staged = _placed(frames, pictures, known)
+    scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)
+    _refuse_strangers(staged, scale)
     staged, stripes, no_plane = _with_plane(observations, staged, pictures)
     choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
+    known_plane = _plane_known(choice, staged, observations, pictures)
+    if scale is not None and scale.believed:
+        unsure = np.zeros(SHARED)
+        unsure[HAND.start : HAND.start + 3] = np.abs(scale.shift)
+        best, closed = (replace(s, unsure=unsure) for s in (choice.best, choice.closed))
+        choice = replace(choice, best=best, closed=closed)
+        if known_plane is not None:
+            reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
+            known_plane = replace(known_plane, place=math.hypot(known_plane.place, (scale.value - 1) * reach))
     return Chain(
         setup,
         observations,
@@ -79,10 +94,48 @@ def solve_chain(
         choice,
         stripes,
         no_plane,
+        known_plane,
+        scale,
         flatness(start_state(staged), observations, staged),
         flatness(choice.best.adjusted.state, observations, staged),
         leave_one_out(observations, staged, choice.best),
     )
+
+
+def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
+    """Refuse poses that have nothing to do with the pictures: no adjustment could make sense of them."""
+    found = staged.hand_eye
+    reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
+    if found.scatter_m < STRANGE_SHARE * reach and found.scatter_rad < STRANGE_TURN:
+        return
+    text = (
+        f"the poses and the pictures do not belong together: by the poses the board, which lies still, moves by "
+        f"{1e3 * found.scatter_m:.0f} mm and {math.degrees(found.scatter_rad):.1f}° RMS (allowed "
+        f"{100 * STRANGE_SHARE:.0f} % of its distance, {1e3 * STRANGE_SHARE * reach:.0f} mm, and "
+        f"{math.degrees(STRANGE_TURN):.0f}°)"
+    )
+    if scale is not None and scale.unit is not None and found.scatter_rad < STRANGE_TURN:
+        raise RefusedError(f"{text}; the flange's positions seem to be in {scale.unit}, not in m")
+    raise RefusedError(
+        f"{text}; are they of the same frames, in m, base_from_flange, and is the order of quaternions or angles right?"
+    )
+
+
+def _plane_known(
+    choice: Choice, staged: Staged, observations: Sequence[ScanObservation], pictures: Intrinsics
+) -> PlaneKnown | None:
+    """How well the light plane is known, None with fewer than four frames to check each other."""
+    plane = choice.best.adjusted.state.plane
+    if plane is None or staged.plane is None:
+        return None
+    lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
+    if len(lit) < LEAST_FRAMES:
+        return None
+    others = [p for k in lit if (p := choice.best.left.states[k].plane) is not None]
+    cloud = np.concatenate(points_on_boards(staged, observations))
+    views = [o.view for o in observations if o.view is not None]
+    moved = planes_of_cameras(pictures, views, [o.profile for o in observations], staged.plane.rows)
+    return PlaneKnown.of(plane, others, cloud, () if choice.best.camera_free else moved)
 
 
 def _placed(
@@ -133,14 +186,15 @@ def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
 def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     """The absolute checks of hand-eye and light plane."""
     made = hand_eye_checks(chain.choice, chain.staged.camera_from_board, pictures)
+    if chain.scale is not None:
+        made.append(chain.scale.check())
     best, staged = chain.choice.best, chain.staged
     state = best.adjusted.state
     if state.plane is None or staged.plane is None:
         return made
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
-    planes = [p for k in lit if (p := best.left.states[k].plane) is not None]
-    known = PlaneKnown.of(state.plane, planes, cloud) if len(lit) > 3 else None
+    known = chain.plane_known
     rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
     made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known)
     apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
@@ -223,10 +277,7 @@ def _report_plane(chain: Chain, result: dict[str, Any]) -> None:
     if state.plane is None or staged.plane is None:
         result["notes"].append(f"no light plane: {chain.no_plane}")
         return
-    lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
-    cloud = np.concatenate(points_on_boards(staged, chain.observations))
-    planes = [p for k in lit if (p := best.left.states[k].plane) is not None]
-    known = PlaneKnown.of(state.plane, planes, cloud) if len(lit) > 1 else None
+    known = chain.plane_known
     result["light_plane"] = {
         **plane_dict(state.plane),
         "rms_mm": 1e3 * best.adjusted.stripe_rms_m,

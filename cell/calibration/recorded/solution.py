@@ -16,7 +16,14 @@ from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.checks import Check, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
-from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_without_one
+from cell.calibration.solve.plane_checks import (
+    PlaneKnown,
+    crooked,
+    odd_stripes,
+    plane_checks,
+    planes_of_cameras,
+    planes_without_one,
+)
 from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
@@ -106,7 +113,7 @@ def solve_frames(
     else:
         notes.append("no used frame has a flange pose: no hand-eye, no flatness")
     if result["light_plane"] is None and result["hand_eye"] is None:
-        checks += _report_plane(rest, chosen.camera, result)
+        checks += _report_plane(rest, chosen, result)
     apply_checks(checks, result)
 
 
@@ -131,8 +138,9 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
         result["flatness"] = None
 
 
-def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: dict[str, Any]) -> list[Check]:
+def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[Check]:
     """The light plane from pictures alone, when the stripe is in them, and its checks."""
+    camera = pictures.camera
     views = [f.view for f in frames if f.view is not None]
     profiles = [f.profile for f in frames]
     notes: list[str] = result["notes"]
@@ -167,7 +175,8 @@ def _report_plane(frames: Sequence[RecordedFrame], camera: CameraModel, result: 
     cloud: Array = np.concatenate(clouds)
     lit = sum(len(c) > 0 for c in clouds)
     others = planes_without_one(clouds)
-    known = PlaneKnown.of(plane.plane, others, cloud) if len(others) > 3 else None
+    moved = planes_of_cameras(pictures, views, profiles, plane.rows)
+    known = PlaneKnown.of(plane.plane, others, cloud, moved) if len(others) > 3 else None
     own = float(np.sqrt(np.mean(np.square(noise)))) * float(np.median(cloud[:, 2])) / camera.fx
     result["light_plane"] = {
         **plane_dict(plane.plane),

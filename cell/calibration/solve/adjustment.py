@@ -159,6 +159,8 @@ class Adjustment:
             if normal.promised(step) < settled * normal.total + 1e-9:
                 break
             used += 1
+            if not np.isfinite(step).all():
+                break
             candidate = state.moved(step)
             new = self.normal_at(candidate)
             if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):

@@ -39,7 +39,7 @@ def camera_checks(found: Intrinsics, views: Sequence[BoardView], *, given: bool 
     advice = "tilt the board more, to several sides and up to 45°, and cover the whole picture"
     made.append(
         Check(
-            "intrinsics", "σ of the focal length", focal, 2.0, 6.0, "%",
+            "intrinsics", "σ of the focal length", focal, 2.0, 10.0, "%",
             f"{len(views)} views give fx = {camera.fx:.0f} ± {found.sigma[0]:.0f} px; {advice}",
         )
     )  # fmt: skip
@@ -50,6 +50,15 @@ def camera_checks(found: Intrinsics, views: Sequence[BoardView], *, given: bool 
         )
     )  # fmt: skip
     made.append(_terms(found))
+    if found.bend is not None and found.bend.believed:
+        made.append(
+            Check(
+                "intrinsics", "bend of the board", 100 * found.bend.share, 0.15, 3.0, "% of its diagonal",
+                f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx by "
+                f"{abs(found.bend.camera[0]):.1f} px and the principal point by "
+                f"{float(np.hypot(*found.bend.camera[2:4])):.1f} px; glue it to something flat",
+            )
+        )  # fmt: skip
     return made
 
 

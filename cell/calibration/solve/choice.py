@@ -8,13 +8,13 @@ bent does not fit left-out pictures at their own best pose as well as before, an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import CAMERA, PLANE, ViewData
+from cell.calibration.solve.blocks import CAMERA, PLANE, SHARED, ViewData
 from cell.calibration.solve.closed_form import closed_form
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.calibration.solve.joint import Staged, start_state, view_data
@@ -39,7 +39,7 @@ class Solution:
     """A solution, what it was made of, and how it predicts left-out frames.
 
     `pictures` is the camera's covariance (9, 9) from the pictures alone: where the camera is held, everything else
-    follows its error.
+    follows its error. `unsure` (27,) are deviations of what other checks found, such as a scale that disagrees.
     """
 
     name: str
@@ -50,6 +50,7 @@ class Solution:
     pictures: Array
     joint: bool = True
     camera_free: bool = False
+    unsure: Array = field(default_factory=lambda: np.zeros(SHARED))
 
     def figure(self) -> float:
         """What is compared, in mm, of left-out frames at the reported flange poses.
@@ -74,7 +75,7 @@ class Solution:
     @property
     def sigma(self) -> Array:
         """Deviations (27,) that are stated: the larger of both."""
-        return np.maximum(self.formal, self.scatter)
+        return np.hypot(np.maximum(self.formal, self.scatter), self.unsure)
 
     def _by_camera(self) -> Array:
         """Variances (27,) that a held camera's error leaves."""

@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from cell.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
 from cell.calibration.solve.blocks import BOARD, CAMERA, HAND, SHARED, State, ViewData
+from cell.calibration.solve.board_shape import Bend, bend_of
 from cell.calibration.solve.left_out import LeftOut, leave_out
 from cell.calibration.solve.starts import zhang
 from cell.geometry.camera import Array, CameraModel
@@ -73,6 +74,7 @@ class Intrinsics:
 
     `sigma` (9,) is the larger of what the residuals say and of the scatter between calibrations that lack one view.
     `formal` (9,) the former alone. `tried` has the RMS of left-out views of each lens model that was tried.
+    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations.
     """
 
     camera: CameraModel
@@ -84,6 +86,7 @@ class Intrinsics:
     covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
     model: LensModel = PLAIN
     tried: dict[str, float] = field(default_factory=dict)
+    bend: Bend | None = None
 
     @property
     def point_rms_px(self) -> float:
@@ -97,6 +100,7 @@ class _Fit:
     camera: CameraModel
     covariance: Array
     left: LeftOut | None
+    bend: Bend | None
 
     @property
     def held_out(self) -> float:
@@ -108,7 +112,12 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     start, _ = zhang(views, lens=False)
     plain = _fitted(PLAIN, start, _data(views, start))
     if len(views) < LEAST_LEFT_OUT:
-        found = _intrinsics(plain, views, {PLAIN.name: float("nan")})
+        # Too few to choose a lens: what one with distortion would say is not known better.
+        try:
+            other = _fitted(RADIAL[0], start, _data(views, start)).camera
+        except (RefusedError, np.linalg.LinAlgError):
+            other = None
+        found = _intrinsics(plain, views, {}, other)
         return found, found
     fits = [plain]
     try:
@@ -161,17 +170,30 @@ def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
     at = State(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
     result = adjustment.solve(at, ROUNDS)
     left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
-    return _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left)
+    bend = bend_of(adjustment, result.state) if left is not None else None
+    return _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
 
 
-def _intrinsics(fit: _Fit, views: Sequence[BoardView], tried: dict[str, float]) -> Intrinsics:
+def _intrinsics(
+    fit: _Fit, views: Sequence[BoardView], tried: dict[str, float], other: CameraModel | None = None
+) -> Intrinsics:
+    """`other` is a camera that explains the views as well: how far it is away is not known better."""
     rms = np.array([board_pose(view, fit.camera).rms_px for view in views])
     formal = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    scattered = fit.covariance if fit.left is None else fit.left.covariance[CAMERA, CAMERA]
-    sigma = np.maximum(formal, np.sqrt(np.maximum(np.diag(scattered), 0.0)))
-    covariance = fit.covariance if formal.sum() >= sigma.sum() else fit.covariance + scattered
+    covariance = fit.covariance
+    if fit.left is not None:
+        scattered = fit.left.covariance[CAMERA, CAMERA]
+        if np.any(np.diag(scattered)[:4] > formal[:4] ** 2):
+            covariance = fit.covariance + scattered
+    for moved in (
+        None if fit.bend is None or not fit.bend.believed else fit.bend.camera,
+        None if other is None else other.parameters - fit.camera.parameters,
+    ):
+        if moved is not None:
+            covariance = covariance + np.outer(moved, moved)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Intrinsics(
-        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried
+        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend
     )  # fmt: skip
 
 

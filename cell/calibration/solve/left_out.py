@@ -13,12 +13,15 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.calibration.solve.blocks import FLANGE, SHARED, State, ViewData, dots_block, stripe_block
+from cell.calibration.solve.blocks import CAMERA, FLANGE, OWN, SHARED, State, ViewData, dots_block, stripe_block
 from cell.geometry.camera import Array
 from cell.geometry.poses import perturbed, transform
 
 Mask = NDArray[np.bool_]
 BEST_POSE_STEPS = 3
+UNKNOWN = 1e6
+LARGEST_STEP = 1.0
+"""A step of a pose or the plane, in m or rad, beyond which the other views determine nothing."""
 TIE = 1e-9
 """Share of the information that holds directions which the other views do not determine at all."""
 
@@ -65,10 +68,17 @@ def leave_out(adjustment: Adjustment, adjusted: Adjusted) -> LeftOut:
         step = np.zeros(SHARED)
         step[free] = scale * np.linalg.lstsq(rest, scale * (gradient - g)[free], rcond=None)[0]
         steps.append(step)
-        states.append(state.moved(np.concatenate([step, np.zeros(7 * len(parts))])))
-    figures = np.array([predicted(v, f, s) for v, f, s in zip(adjustment.views, state.flanges, states, strict=True)])
+        steps[-1] = step = step if np.abs(step[CAMERA.stop :]).max() < LARGEST_STEP else np.full(SHARED, np.nan)
+        far = not np.isfinite(step).all()
+        states.append(state if far else state.moved(np.concatenate([step, np.zeros(OWN * len(parts))])))
+    figures = np.array(
+        [
+            predicted(v, f, s) if np.isfinite(d).all() else [np.inf] * 4
+            for v, f, s, d in zip(adjustment.views, state.flanges, states, steps, strict=True)
+        ]
+    )
     count = len(parts)
-    apart = np.array(steps) - np.mean(steps, axis=0)
+    apart = np.nan_to_num(np.array(steps) - np.mean(steps, axis=0), nan=np.sqrt(UNKNOWN))
     held = np.setdiff1d(np.arange(SHARED), free)
     by_held = np.zeros((SHARED, SHARED))
     inner = information[np.ix_(free, free)] * scale[:, None] * scale + TIE * np.eye(len(free))

@@ -7,11 +7,18 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cell.calibration.collect.stripe_on_board import on_plane
 from cell.calibration.solve.checks import Check
-from cell.calibration.solve.starts import robust_plane
+from cell.calibration.solve.intrinsics import Intrinsics
+from cell.calibration.solve.starts import robust_plane, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
+from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
+from cell.vision.board.board import board_pose
+from cell.vision.board.view import BoardView
+from cell.vision.stripe.extract import StripeProfile
 
 CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0
 """A stripe whose centres leave a straight line by more than all of these is not one line of light on a flat board."""
@@ -81,21 +88,68 @@ def odd_stripes(clouds: Sequence[Array]) -> dict[int, str]:
 
 @dataclass(frozen=True)
 class PlaneKnown:
-    """How well a plane is known: where it was seen (m) and its normal (rad), from planes that lack one frame each."""
+    """How well a plane is known: where it was seen (m) and its normal (rad)."""
 
     place: float
     tilt: float
 
     @classmethod
-    def of(cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array) -> PlaneKnown:
-        """`others` (n) lack one frame each; `cloud` (m, 3) in m is where the plane was seen."""
+    def of(
+        cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array, moved: Sequence[LightPlane] = ()
+    ) -> PlaneKnown:
+        """`others` (n) lack one frame each; `moved` are as `planes_of_cameras` gives them.
+
+        `cloud` (m, 3) in m is where the plane was seen.
+        """
         count = len(others)
-        root = np.sqrt((count - 1) / count)
         thin = cloud[:: max(1, len(cloud) // 500)]
-        away = np.array([other.distances(thin) - plane.distances(thin) for other in others])
-        turn = np.array([other.n * np.sign(other.n @ plane.n) - plane.n for other in others])
-        place = root * float(np.sqrt(np.mean(np.sum((away - away.mean(axis=0)) ** 2, axis=0))))
-        return cls(place, root * float(np.sqrt(np.sum((turn - turn.mean(axis=0)) ** 2))))
+
+        def away(planes: Sequence[LightPlane], whole: LightPlane) -> tuple[Array, Array]:
+            shifts = np.array([p.distances(thin) * _sign(p, whole) - whole.distances(thin) for p in planes])
+            return shifts, np.array([p.n * _sign(p, whole) - whole.n for p in planes])
+
+        shift, turn = away(others, plane)
+        share = (count - 1) / count
+        place = share * np.mean(np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
+        tilt = share * np.sum((turn - turn.mean(axis=0)) ** 2)
+        if len(moved) > 1:
+            shift, turn = away(moved[1:], moved[0])
+            place += np.mean(np.sum(shift**2, axis=0))
+            tilt += np.sum(turn**2)
+        return cls(float(np.sqrt(place)), float(np.sqrt(tilt)))
+
+
+def _sign(plane: LightPlane, like: LightPlane) -> float:
+    return float(np.sign(plane.n @ like.n))
+
+
+def planes_of_cameras(
+    pictures: Intrinsics,
+    views: Sequence[BoardView],
+    profiles: Sequence[StripeProfile | None],
+    rows: Sequence[NDArray[np.intp]],
+) -> list[LightPlane]:
+    """The plane with the camera off by one deviation along each direction of its covariance, one after the other."""
+    made = [_plane_with(pictures.camera, views, profiles, rows)]
+    for column in covariance_root(pictures.covariance).T:
+        if np.any(np.abs(column) > 0):
+            camera = pictures.camera.with_parameters(pictures.camera.parameters + column)
+            made.append(_plane_with(camera, views, profiles, rows))
+    return made
+
+
+def _plane_with(
+    camera: CameraModel,
+    views: Sequence[BoardView],
+    profiles: Sequence[StripeProfile | None],
+    rows: Sequence[NDArray[np.intp]],
+) -> LightPlane:
+    clouds = []
+    for view, profile, chosen in zip(views, profiles, rows, strict=True):
+        if profile is not None and len(chosen):
+            pose = board_pose(view, camera).camera_from_board
+            clouds.append(on_plane(camera, pose, stripe_pixels(profile, chosen[:: max(1, len(chosen) // 100)])))
+    return robust_plane(np.concatenate(clouds))[0]
 
 
 def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
