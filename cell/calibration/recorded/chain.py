@@ -124,13 +124,11 @@ def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
 def _plane_known(
     choice: Choice, staged: Staged, observations: Sequence[ScanObservation], pictures: Intrinsics
 ) -> PlaneKnown | None:
-    """How well the light plane is known, None with fewer than four frames to check each other."""
+    """How well the light plane is known, None without one."""
     plane = choice.best.adjusted.state.plane
     if plane is None or staged.plane is None:
         return None
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
-    if len(lit) < LEAST_FRAMES:
-        return None
     others = [p for k in lit if (p := choice.best.left.states[k].plane) is not None]
     cloud = np.concatenate(points_on_boards(staged, observations))
     views = [o.view for o in observations if o.view is not None]
@@ -190,15 +188,15 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
         made.append(chain.scale.check())
     best, staged = chain.choice.best, chain.staged
     state = best.adjusted.state
-    if state.plane is None or staged.plane is None:
+    known = chain.plane_known
+    if state.plane is None or staged.plane is None or known is None:
         return made
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
-    known = chain.plane_known
     rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
     made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known)
     apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
-    tilt = math.degrees(known.tilt) if known is not None else 1.0
+    tilt = math.degrees(known.tilt)
     made.append(
         Check(
             "light_plane", "plane with the arm against plane of the pictures", apart, max(1.0, 4 * tilt),
@@ -267,6 +265,11 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         ],
         "chi2_per_dof": finite(adjusted.chi2_per_dof),
     }
+    if chain.setup == "eye_to_hand":
+        result["notes"].append(
+            "by the poses the camera stands still and the board moves with the flange; if the camera rides on the "
+            "flange, the poses are those of the base in the flange (inverse)"
+        )
     _report_plane(chain, result)
 
 

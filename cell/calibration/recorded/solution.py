@@ -176,7 +176,7 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
     lit = sum(len(c) > 0 for c in clouds)
     others = planes_without_one(clouds)
     moved = planes_of_cameras(pictures, views, profiles, plane.rows)
-    known = PlaneKnown.of(plane.plane, others, cloud, moved) if len(others) > 3 else None
+    known = PlaneKnown.of(plane.plane, others, cloud, moved)
     own = float(np.sqrt(np.mean(np.square(noise)))) * float(np.median(cloud[:, 2])) / camera.fx
     result["light_plane"] = {
         **plane_dict(plane.plane),

@@ -24,7 +24,7 @@ CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0
 """A stripe whose centres leave a straight line by more than all of these is not one line of light on a flat board."""
 ODD_SHARE, ODD_RATIO = 0.02, 6.0
 """A stripe further than this share of its distance, and than so many times the others, from the others' plane."""
-LEAST_STRIPES = 3
+LEAST_STRIPES, LEAST_CHECKED = 3, 4
 THIN = 40
 MOST_PAIRS = 400
 
@@ -101,17 +101,18 @@ class PlaneKnown:
 
         `cloud` (m, 3) in m is where the plane was seen.
         """
-        count = len(others)
+        count = max(len(others), 1)
         thin = cloud[:: max(1, len(cloud) // 500)]
 
         def away(planes: Sequence[LightPlane], whole: LightPlane) -> tuple[Array, Array]:
             shifts = np.array([p.distances(thin) * _sign(p, whole) - whole.distances(thin) for p in planes])
             return shifts, np.array([p.n * _sign(p, whole) - whole.n for p in planes])
 
-        shift, turn = away(others, plane)
-        share = (count - 1) / count
-        place = share * np.mean(np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
-        tilt = share * np.sum((turn - turn.mean(axis=0)) ** 2)
+        place, tilt, share = 0.0, 0.0, (count - 1) / count
+        if others:
+            shift, turn = away(others, plane)
+            place = share * np.mean(np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
+            tilt = share * np.sum((turn - turn.mean(axis=0)) ** 2)
         if len(moved) > 1:
             shift, turn = away(moved[1:], moved[0])
             place += np.mean(np.sum(shift**2, axis=0))
@@ -160,7 +161,7 @@ def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
     return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
 
 
-def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown | None) -> list[Check]:
+def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown) -> list[Check]:
     """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters."""
     size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     reach = float(np.median(cloud[:, 2]))
@@ -171,14 +172,13 @@ def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: Plane
             "points are not those of one plane; are there two lines, or something else that shines?",
         )
     ]  # fmt: skip
-    if known is None:
+    if frames < LEAST_CHECKED:
         made.append(
             Check(
-                "light_plane", "number of frames that check it", 1 / max(frames, 1), 1 / 3.5, 1.0, "(1 / frames)",
-                f"{frames} frames show the stripe, so no frame can check the others; take 4 or more",
+                "light_plane", "frames that are missing", LEAST_CHECKED - frames, 0.5, np.inf, "",
+                f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
             )
         )  # fmt: skip
-        return made
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
     made.append(
         Check(
