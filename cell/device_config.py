@@ -98,18 +98,26 @@ class RailConfig(DeviceConfig):
         return self
 
 
+MOST_PAYLOAD = {
+    "UR3": 3.0, "UR5": 5.0, "UR10": 10.0, "UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5,
+    "UR16e": 16.0, "UR20": 20.0, "UR30": 30.0,
+}  # fmt: skip
+"""What each model carries, kg, by the maker's data sheets."""
 Centre = Annotated[float, quantity("mm", -500, 500)]
 
 
 class ArmConfig(DeviceConfig):
-    """The arm and where it stands on the vehicle; the cell plans with the kinematics of `model`."""
+    """The arm and where it stands on the vehicle.
 
-    model: Literal["UR10e"] = "UR10e"
+    The cell plans with the table that the arm's controller tells; it has to be that of an arm of `model`.
+    """
+
+    model: Literal["UR3", "UR5", "UR10", "UR3e", "UR5e", "UR7e", "UR10e", "UR12e", "UR16e", "UR20", "UR30"] = "UR10e"
     max_joint_speed: Annotated[float, quantity("deg/s", 1, 120)]
     max_joint_acceleration: Annotated[float, quantity("deg/s^2", 1, 800)]
     max_joint_jerk: Annotated[float, quantity("deg/s^3", 10, 40_000)]
     max_tool_speed: Annotated[float, quantity("mm/s", 1, 1500)]
-    payload: Annotated[float, quantity("kg", 0, 12.5)]
+    payload: Annotated[float, quantity("kg", 0, 30)]
     payload_centre: tuple[Centre, Centre, Centre]
     vehicle_from_base: Pose
     settle_time: Annotated[float, quantity("s", 0, 5)]
@@ -117,6 +125,12 @@ class ArmConfig(DeviceConfig):
     repeatability_angle: AngleScatter
     kinematic_sigma: Annotated[float, quantity("mm", 0, 10)]
     kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
+
+    @model_validator(mode="after")
+    def _carries(self) -> Self:
+        if self.payload > (most := MOST_PAYLOAD[self.model]):
+            raise ValueError(f"payload {self.payload:g} kg: a {self.model} carries up to {most:g} kg")
+        return self
 
     @model_validator(mode="after")
     def _on_the_vehicle(self) -> Self:

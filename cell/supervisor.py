@@ -14,38 +14,35 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
+from cell.calibration import sessions
 from cell.calibration.archive import Observations
-from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.sessions import arm_table, serial_numbers
 from cell.calibration.store import (
     CellCalibration,
     find_calibration,
-    gathered,
     save_with_observations,
-    solve_observations,
 )
 from cell.calibration.verify.verdict import Verification
-from cell.calibration.verify.views import collect_verification
-from cell.check.fit import require_fit
-from cell.config import DEVICES, CellConfig, Confirm, beside, config_to_open
-from cell.devices.assembly import connect, connected_for
+from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
-from cell.devices.injection import Injection, Injector
-from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
+from cell.devices.injection import Injector
+from cell.devices.simulated import Simulation
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
 from cell.devices.truth_link import ask_truth
-from cell.inversion import NominalSurface
 from cell.job import Job, load_job
-from cell.run.folder import CellLock, find_run
+from cell.opening import open_devices
+from cell.run.folder import find_run
 from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.maintenance import recorded_maintenance
+from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import Hands, RecordedWork
-from cell.run.resumption import UnfinishedRun, job_source
+from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
 from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
@@ -54,9 +51,6 @@ from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
-
-SIM_SPEED = 3.0
-"""How many times faster than the wall a simulated cell runs unless told otherwise."""
 
 HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
 """The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
@@ -119,9 +113,9 @@ class Cell:
         With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
         may be switched off, and what is asked of them is a `NotConnectedError`.
 
-        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall
-        (`SIM_SPEED`). With `clock="virtual"` its models are in this process behind the devices' interfaces, without
-        wires and without waiting: the same seed then takes the same course, to the byte.
+        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall (three
+        times unless told otherwise). With `clock="virtual"` its models are in this process behind the devices'
+        interfaces, without wires and without waiting: the same seed then takes the same course, to the byte.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -129,38 +123,21 @@ class Cell:
         Raises `ConfigError` before anything is started, `InterlockError` when another process holds the cell,
         `NotConnectedError` or `DeviceFault` that names the device that does not answer.
         """
-        if sim not in (None, "all"):
-            raise ConfigError(
-                f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices'
+        with EndSignals(), ExitStack() as undo:
+            made = open_devices(
+                undo,
+                config,
+                sim=sim,
+                seed=seed,
+                level=level,
+                speed=speed,
+                surface=surface,
+                confirm=confirm,
+                only=only,
+                clock=clock,
             )
-        if clock not in ("wall", "virtual"):
-            raise ConfigError(
-                f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait'
-            )
-        if clock == "virtual" and (sim is None or speed is not None):
-            wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
-            raise ConfigError(f'clock="virtual": {wrong}; leave that out')
-        path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
-        folder = beside(path)
-        with EndSignals(), ExitStack() as opened:
-            if clock == "virtual":
-                # The world takes long to load, and a cell over wires has it in another process, or none.
-                from cell.devices.direct import VirtualCell
-
-                virtual = VirtualCell(loaded, seed, level, surface)
-                cell = cls(loaded, folder, nullcontext(), virtual.devices, virtual)
-            else:
-                simulated = None
-                if sim == "all":
-                    simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
-                    opened.callback(simulated.close)
-                    loaded = with_endpoints(loaded, simulated.endpoints)
-                needed = connected_for(loaded, only)
-                lock = opened.enter_context(CellLock(loaded, needed))
-                devices = connect(loaded, needed)
-                opened.callback(devices.close)
-                cell = cls(loaded, folder, lock, devices, simulated)
-            opened.pop_all()
+            cell = cls(made.config, made.folder, made.lock, made.devices, made.simulated)
+            undo.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.
         cell._signals.__enter__()
         return cell
@@ -198,7 +175,7 @@ class Cell:
 
         `hold` is called before each free motion: a paused run waits in it.
         """
-        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold)
+        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks)
 
     @property
     def current(self) -> Run[Any] | None:
@@ -391,16 +368,12 @@ class Cell:
         `script` looks at results between the steps and decides about refusals.
         """
         loaded, _ = load_job(job)
-        injections = [Injection.parse(text, find_kind(loaded.job.kind).names) for text in inject]
         info: dict[str, Any] = {}
         inline: tuple[Observer, ...] = ()
-        if injections:
-            if self.simulated is None:
-                raise ConfigError(f"{injections[0]} can only happen to a simulated cell")
-            for injection in injections:
-                self.simulated.require_fault(injection.fault)
-            info["injected"] = [str(injection) for injection in injections]
-            inline = (Injector(self.simulated.fault, injections),)
+        if inject:
+            injector = Injector.scheduled(inject, find_kind(loaded.job.kind).names, self.simulated)
+            info["injected"] = [str(injection) for injection in injector.injections]
+            inline = (injector,)
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
@@ -442,21 +415,14 @@ class Cell:
                 "safe, then begin the job again"
             )
         stops = self._stops
-        loaded, mesh = load_job(job)
-        require_fit(loaded, self.config, mesh)
-        kind = find_kind(loaded.job.kind).until(until)
-        kind.require_steps(script.after)
-        nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
+        ready = ReadyJob.read(job, self.config, until, script)
         stored: CellCalibration | None = None
         try:
             stored = self.calibration()
         except CalibrationStale:
             if self.simulated is None:
                 raise
-        info |= {**self._world(), **job_source(job)}
-        # A resumed run must end where this one was to end, and be looked at as this one was.
-        info |= {"until": until} if until is not None else {}
-        info |= {} if script.idle else {"scripted": True}
+        info |= {**self._world(), **ready.info}
 
         def work(run: Run[RunOutcome]) -> RunOutcome:
             def note(text: str) -> None:
@@ -470,17 +436,17 @@ class Cell:
                 calibration = self._calibrate(run, job)
             earlier = None
             if before is not None:
-                earlier, why = before.sweep(loaded, self.config, calibration)
+                earlier, why = before.sweep(ready.job, self.config, calibration)
                 note(why if earlier is not None else f"{why}: sweeping again")
             job_run = JobRun(
                 run,
                 self.config,
                 self.devices,
-                loaded,
-                nominal,
+                ready.job,
+                ready.nominal,
                 calibration,
                 info,
-                kind,
+                ready.kind,
                 script,
                 inline,
                 earlier,
@@ -500,21 +466,11 @@ class Cell:
         """The stored calibration of this very cell as configured; raises `CalibrationStale` that says what differs."""
         return find_calibration(
             self.calibrations_folder,
-            self._identities(),
+            serial_numbers(self.devices),
             self.config.calibration_hash(),
             self.config.calibration.max_age,
+            arm_table(self.config, self.devices),
         )
-
-    def _identities(self) -> dict[str, str]:
-        return {
-            name: device.identity().serial
-            for name, device in (
-                ("arm", self.devices.arm),
-                ("rail", self.devices.rail),
-                ("scan_camera", self.devices.scan_camera),
-                ("target_camera", self.devices.target_camera),
-            )
-        }
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
         """Move through the calibration poses over the deck boards, solve, and store the result and what it came from.
@@ -533,14 +489,7 @@ class Cell:
 
         def work(hands: Hands) -> tuple[Observations, CellCalibration]:
             mover = self.mover(part_of, hands.safe_point)
-            # In command, so that one that somebody else moves or releases is noticed.
-            self.devices.vehicle.recover()
-            given = self.config, self.devices, mover, hands.check
-            scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
-            target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
-            tell(0.96, "solving")
-            observations = gathered(scan, target, self._identities(), self.config)
-            return observations, solve_observations(observations).calibration
+            return sessions.calibrate(self.config, self.devices, mover, hands, tell)
 
         observations, calibration = self._recorded(run, "calibration", work)
         save_with_observations(calibration, observations, self.calibrations_folder)
@@ -562,13 +511,8 @@ class Cell:
                 run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
 
             def work(hands: Hands) -> Verification:
-                self.devices.interlocks.work_with(calibration.configuration)
-                self.devices.vehicle.recover()
                 mover = self.mover(loaded, hands.safe_point)
-                seen = collect_verification(
-                    self.config, self.devices, mover, calibration, hands.check, tell, hands.keep
-                )
-                return Verification.of(calibration, loaded, seen)
+                return sessions.verify(self.config, self.devices, mover, calibration, loaded, hands, tell)
 
             made = self._recorded(run, "verification", work)
             tell(1.0, "done")

@@ -52,9 +52,10 @@ class RunControl:
 
     def abort(self, reason: str, signal: int | None = None) -> None:
         """End the run as aborted: what moves is stopped at once. `signal` is the number of one that asked for it."""
+        first = self.token.cancel(reason)
+        # Looked at afterwards: the run may come to its end between the two.
         if self.over:
             self.late = True
-        first = self.token.cancel(reason)
         # A signal after the run's own end still tells the program to end.
         if signal is not None and self.signal is None and (first or self.over):
             self.signal = signal

@@ -1,32 +1,95 @@
-"""What several test files need and what takes long to make: once for all of them."""
+"""What several test files need and what takes long to make, once for all of them; and which files run beside which.
+
+Three workers share the two cores: tests over the wires mostly wait. Files of a group run on one worker, one after the
+other, because they share what is made once for a worker, or because devices over wires would disturb each other's time.
+"""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 
-LONGEST = (
-    "wire/test_whole_job.py",
-    "recorded/test_recorded_calibration.py",
-    "test_virtual_door.py",
-    "wire/test_arm_endings.py",
-    "wire/test_arm_driver.py",
-    "wire/test_rail_driver.py",
-    "test_inversion.py",
-    "recorded/test_recorded_command.py",
-    "test_end_screen.py",
+GROUPS = (
+    # One cell at a time, as an engineer runs it; those first that need little of what the virtual job compiles.
+    (
+        "wire/test_commands.py",
+        "wire/test_serve.py",
+        "wire/test_one_authority.py",
+        "wire/test_whole_job.py",
+    ),
+    # The virtual job, and what is told of its ends.
+    (
+        "test_virtual_door.py",
+        "test_report.py",
+        "test_end_screen.py",
+        "test_direct_devices.py",
+    ),
+    # One device at a time.
+    (
+        "wire/test_arm_endings.py",
+        "wire/test_arm_driver.py",
+        "wire/test_rail_driver.py",
+        "wire/test_vehicle_driver.py",
+        "wire/test_camera_driver.py",
+        "wire/test_sim_arm.py",
+        "wire/test_sim_rail.py",
+        "wire/test_sim_vehicle.py",
+        "wire/test_sim_frames.py",
+        "wire/test_last_words.py",
+        "wire/test_contracts_over_wires.py",
+        "wire/test_safe_stop_over_wires.py",
+    ),
+    # Long ones begin early, so that no worker is left with one of them at the end.
+    ("recorded/test_recorded_calibration.py",),
+    ("test_inversion.py",),
+    ("test_board_campaign.py",),
+    ("test_calibration_archive.py",),
+    ("test_interlocks.py",),
+    ("test_calibration.py",),
 )
-"""Files that begin first, so that no worker is left with one of them at the end."""
+"""Groups of files in the order in which they begin. Other files over the wires end the first one; any other is a group
+of its own, after them."""
+
+HERE = Path(__file__).parent
+PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
+GIVES_WAY = 10
+"""By how much what only computes is nicer than what keeps deadlines on the wall."""
+
+
+def place(file: Path) -> tuple[int, int]:
+    """Which group a file belongs to, and where in it it comes."""
+    return PLACES.get(file, (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what lasts longest."""
-    ranks = {Path(__file__).parent / name: rank for rank, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+    items.sort(key=lambda item: place(item.path))
+
+
+class Grouped(LoadFileScheduling):
+    """Gives a worker a whole group of files at a time."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        group, _ = place(self.config.rootpath / file)
+        return file if group == len(GROUPS) else f"group {group}"
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling | None:
+    """Files by their groups where the tests are distributed by file."""
+    return Grouped(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A worker that has begun to compute gives way to those that wait for devices; the groups over wires come first."""
+    if "PYTEST_XDIST_WORKER" in os.environ and item.get_closest_marker("wire") is None and os.nice(0) < GIVES_WAY:
+        os.nice(GIVES_WAY)
 
 
 @pytest.fixture(scope="session")

@@ -58,7 +58,7 @@ def scene(
         turn = _turn(2, tilt[2]) @ _turn(0, tilt[0]) @ _turn(1, tilt[1])
         at = np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.035, 0.035), 0.4 + rng.uniform(-0.06, 0.06)])
         camera_from_board = pin.SE3(turn, at - turn @ middle)
-        frame = RecordedFrame(Path(f"frame{k:04d}.png"))
+        frame = RecordedFrame(Path(f"frame{k:04d}.png"), f"frame{k:04d}.png")
         frame.view = _view(spec, real, camera_from_board, rng)
         exact = BASE_FROM_BOARD * (FLANGE_FROM_CAMERA * camera_from_board).inverse()
         off = cv2.Rodrigues(rng.normal(0, 1e-3 * arm_mrad, 3))[0]

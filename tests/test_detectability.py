@@ -104,10 +104,15 @@ def test_a_good_verdict_says_within_what(calibrated):
     verification = Verification.of(calibration, load_job("pot")[0], look_again(cell, calibration))
     summary = verification.summary()
     assert summary["good"]
-    largest = max(row["size"] for row in summary["detectable"] if row["unit"].startswith("mm"))
-    assert f"good within {largest:.2f} mm and " in summary["reason"]
-    # In this cell 0.2 mm of the target camera's mount drown in the arm's scatter, of the light plane they do not.
-    assert "target camera's mount on the flange, shift (up to 0." in summary["reason"]
+    # In this cell the arm's scatter hides as much as is allowed, of the target camera and not of the laser.
+    assert summary["verdict"] == "good"
+    shows, allowed = summary["place"]["shows_from_mm"], summary["place"]["allowed_mm"]
+    assert allowed == pytest.approx(0.6)
+    assert 0.2 < shows < 0.9
+    assert f"moves the place by more than {shows:.2f} mm would have shown" in summary["reason"]
+    assert "allowed at the place are 0.60 mm" in summary["reason"]
+    assert "could do that unseen: " in summary["reason"]
+    assert "target camera's mount on the flange, turn (up to 0." in summary["reason"]
     assert "laser's light plane" not in summary["reason"]
     json.dumps(summary, allow_nan=False)
 

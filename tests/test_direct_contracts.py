@@ -18,6 +18,13 @@ from cell.devices.direct import VirtualCell
 CONFIG = load_config(None)
 
 
+class DirectFaults:
+    """The faults of a cell on the virtual clock."""
+
+    def __init__(self, cell: VirtualCell) -> None:
+        self.cause, self.clear = cell.fault, cell.clear_faults
+
+
 class _Direct:
     NAME = ""
 
@@ -26,7 +33,7 @@ class _Direct:
     def bench(cls) -> Bench[Any]:
         cell = VirtualCell(CONFIG, seed=4, level="ideal")
         device = getattr(cell, cls.NAME, None) or getattr(cell.devices, cls.NAME).bare
-        return Bench(lambda: device, cell.clock, linked=False)
+        return Bench(lambda: device, cell.clock, linked=False, faults=DirectFaults(cell))
 
 
 class TestRail(_Direct, RailContract):

@@ -12,7 +12,8 @@ import pytest
 from cell.cli import main
 from cell.cli.display import print_report
 from cell.cli.end_screen import HEIGHT, duration, end_screen
-from cell.run.folder import new_run, read_report, run_row, write_json
+from cell.run.folder import new_run, write_json
+from cell.run.reading import read_report, run_row
 from drivers.errors import CellError
 from statemachine.journal import Journal
 from tests import report_runs

@@ -22,12 +22,14 @@ from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
-from cell.run.folder import CellLock
+from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
+from cell.run.lock import CellLock
 from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser
+from sim_backends.models.arm_kinematics import Kinematics
 
 CONFIG = load_config(None)
 LASER = CONFIG.laser.output
@@ -398,6 +400,50 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
     assert world.world.collisions.found == ()
 
 
+def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:
+    stood = devices.arm.state().joints
+    down = shifted(devices, 0.0, 0.0, -0.05)
+    tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
+    table = block("table", BASE, tip.translation - [0.3, 0.3, 0.2], tip.translation + np.array([0.3, 0.3, -0.03]))
+    devices.interlocks.stand_before([table])
+    refused("way_clear", lambda: devices.arm.move_linear(down, 0.05, 0.5), "claw and table")
+    assert np.array_equal(devices.arm.state().joints, stood)
+    devices.interlocks.carry(tool_bodies((0.07, 0.036, 0.025), from_parts((0.0, 0.0, 0.145)))[-1:])
+    near = shifted(devices, 0.0, 0.0, -0.01)
+    refused("way_clear", lambda: devices.arm.move_linear(near, 0.05, 0.5), "part and table")
+    devices.vehicle.enable()
+    devices.vehicle.brake()
+    devices.arm.move_linear(down, 0.05, 0.5).wait(30.0)
+
+
+def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
+    arm, interlocks = devices.arm, devices.interlocks
+    post = from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.2))
+    interlocks.stand_before([block("post", BASE, post.translation - 0.02, post.translation + 0.02)])
+    interlocks.carry([block("part", FLANGE, (-0.2, -0.01, 0.145), (0.2, 0.01, 0.165))])
+    up_and_down = [arm.state().joints, arm.state().joints + np.array([0.0, 0.0, 0.06, 0.0, 0.0, 0.0])]
+    refused("way_clear", lambda: arm.follow(np.array([0.0, 9.0]), np.array(up_and_down)), "part")
+    with interlocks.lifted(["claw_at_contact"]):
+        devices.claw.release()
+    assert interlocks.situation.part == ()
+
+
+def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Devices) -> None:
+    arm = devices.arm
+    tip = (from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.145))).translation
+    devices.interlocks.stand_before([block("shelf", BASE, tip - [0.3, 0.3, 0.1], tip + np.array([0.3, 0.3, -0.001]))])
+    refused("way_clear", lambda: arm.move_linear(shifted(devices, 0, 0, -0.0006), 0.01, 0.5), "claw and shelf")
+    up = shifted(devices, 0.0, 0.0, 0.01)
+    here = arm.state().joints
+    arm.move_linear(up, 0.02, 0.5).wait(30.0)
+    higher = arm.state().joints
+    refused("way_clear", lambda: arm.move_joints(here, 0.2, 0.5), "claw and shelf")
+    arm.bare.move_joints(here, 0.2, 0.5).wait(30.0)
+    up_and_down = np.array([here, higher, here])
+    refused("way_clear", lambda: arm.follow(np.array([0.0, 3.0, 6.0]), up_and_down), "claw and shelf")
+    arm.follow(np.array([0.0, 3.0]), up_and_down[:2]).wait(30.0)
+
+
 def test_an_output_that_another_device_owns_is_switched_by_that_device(devices: Devices) -> None:
     refused("own_switch", lambda: devices.arm.set_digital_output(LASER, True), "output 0 is the laser's")
     refused("own_switch", lambda: devices.arm.set_digital_output(CONFIG.claw.output, False), "the claw's")
@@ -512,3 +558,21 @@ def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell:
     jogged("vehicle", "-0.1m")
     moved = jogged("arm", "z", "+10mm")["flange"].split("moved ")[1]
     assert float(moved.removesuffix(" mm")) == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])
+def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
+    world: VirtualCell, devices: Devices, row: int, column: int, by: float
+) -> None:
+    devices.arm.move_joints(HOME + 0.01, 0.5, 1.0).wait(60.0)
+    before = devices.arm.state()
+    table = world.world.arm.params.dh.copy()
+    table[row, column] += by
+    world.world.arm.kinematics = world.world.arm.drive.kinematics = Kinematics(table)
+    for begin in (
+        lambda: devices.arm.move_joints(HOME, 0.5, 1.0),
+        lambda: devices.arm.move_linear(before.flange, 0.05, 0.5),
+        lambda: devices.arm.follow(np.array([0.0, 1.0]), np.stack([before.joints, HOME])),
+    ):
+        refused("same_kinematics", begin, "mm and", "mrad away", "port 30001")
+    assert np.array_equal(devices.arm.state().joints, before.joints)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -104,7 +105,8 @@ def test_what_a_step_makes_serves_whoever_needs_a_base_of_it() -> None:
 
 def test_a_step_that_made_something_else_has_failed() -> None:
     site = cast(Any, SimpleNamespace())
-    site.devices = SimpleNamespace(gate=SimpleNamespace(enter=print), interlocks=SimpleNamespace(work_with=print))
+    gate = SimpleNamespace(entered=nullcontext)
+    site.devices = SimpleNamespace(gate=gate, interlocks=SimpleNamespace(work_with=print))
     site.calibration, site.mover = SimpleNamespace(configuration=""), SimpleNamespace()
     site.frames = SimpleNamespace(begin=print)
     work = Kind("promising", (JobStep(Step("see", 5.0), lambda here, context: 7, Tilt),)).work(site)["see"]

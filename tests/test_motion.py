@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 from cell.motion import bodies
+from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionError, CollisionModel
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints, Unreachable
 from cell.motion.planning import Planner
@@ -327,3 +328,84 @@ def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics)
     shifted = pin.SE3(start.rotation, start.translation + np.array([0.0, 0.25, 0.0]))
     line = planner.line(WORKING, shifted, LineLimits(speed=0.25))
     assert fastest_point(line, 800) == pytest.approx(0.25, rel=2e-3), "a line that does not turn has its full speed"
+
+
+# --- between the samples ---
+
+
+def spheres(body: bodies.Body, flange_frames: list[np.ndarray], step: float = 0.01) -> tuple[np.ndarray, float]:
+    """Points (n, 3) in the base, no farther apart than `step`, that with the radius lie on the body's skin or core."""
+    x, y, z = body.size
+    if body.radius is not None:
+        local = np.array([[0.0, 0.0, h] for h in np.linspace(-z / 2, z / 2, int(z / step) + 2)])
+    else:
+        axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in (x, y, z)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        local = grid[(np.abs(grid) >= np.array([x, y, z]) / 2 - 1e-9).any(axis=1)]
+    pose = flange_frames[body.parent] @ body.placement.homogeneous
+    return local @ pose[:3, :3].T + pose[:3, 3], body.radius or 0.0
+
+
+def link_frames(joints: Joints) -> list[np.ndarray]:
+    """Base, the six frames that turn with a joint, and the flange, (4, 4), by plain matrices."""
+    table, frames, pose = DenavitHartenberg(), [np.eye(4)], np.eye(4)
+    for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
+        c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+        frames.append(pose @ [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+    return [*frames, pose]
+
+
+def nearest_station_body(solids: list[bodies.Body], joints: Joints) -> float:
+    """Distance in m from what the arm moves to what stands, by points and boxes: never less than the true one."""
+    frames, least = link_frames(joints), np.inf
+    for obstacle in (b for b in solids if b.parent == bodies.BASE and b.radius is None):
+        inverse = np.linalg.inv(obstacle.placement.homogeneous)
+        for body in (b for b in solids if b.parent > 2):
+            points, radius = spheres(body, frames)
+            outside = np.abs(points @ inverse[:3, :3].T + inverse[:3, 3]) - np.array(obstacle.size) / 2
+            apart = np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0)
+            least = min(least, float(apart.min()) - radius)
+    return least
+
+
+def test_searched_ways_keep_five_millimetres_between_their_samples(planner: Planner, arm: ArmKinematics) -> None:
+    over_the_deck = arm.ik(pin.SE3(DOWN, np.array([-0.6, 0.0, 0.35])), np.array([0.0, -1.25, 2.0, -2.3, -1.57, 2.8]))
+    beside = planner.reach(down(0.75, -0.3, 0.25), WORKING, "beside")
+    behind = planner.reach(down(0.68, 0.42, 0.30), WORKING, "behind the board")
+    for start, end in ((beside, behind), (behind, over_the_deck)):
+        motion = planner.free(start, end)
+        way = motion.joints
+        assert np.array_equal(way, planner.free(start, end).joints)
+        dense = [a + f * (b - a) for a, b in zip(way[:-1:8], way[8::8], strict=False) for f in (0.0, 0.5)]
+        solids = list(planner.collisions.bodies)
+        assert min(nearest_station_body(solids, joints) for joints in dense[::4]) >= 0.005
+
+
+def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) -> None:
+    fin = bodies.block("fin", bodies.BASE, (0.3, -0.0005, 0.0), (1.2, 0.0005, 0.9))
+    pole = bodies.capsule("pole", bodies.FLANGE, (0, 0, 0.01), (0, 0, 0.2), 0.01)
+    model = CollisionModel(arm, [fin, pole])
+    end = arm.ik(down(0.7, 0.15, 0.4), WORKING)
+    start = end.copy()
+    start[0] -= 0.5
+    touch = first_touch(model, np.stack([start, end]))
+    assert touch is not None
+    assert touch.pairs == [("fin", "pole")]
+    y = float(arm.fk(touch.joints).translation[1])
+    assert abs(y) - 0.0105 == pytest.approx(0.005, abs=4e-4)
+    assert first_touch(model, np.stack([start, end]), (("pole", "fin"),)) is None
+
+
+def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics) -> None:
+    floor = bodies.block("floor", bodies.BASE, (0.3, -0.5, -0.1), (1.2, 0.5, 0.0))
+    pole = bodies.capsule("pole", bodies.FLANGE, (0, 0, 0.0), (0, 0, 0.2), 0.01)
+    model = CollisionModel(arm, [floor, pole])
+    low, lower, high, away = (
+        arm.ik(down(0.7, y, 0.21 + h), WORKING) for y, h in ((0, 1e-3), (0, 0), (0, 0.03), (0.1, 1e-3))
+    )
+    assert first_touch(model, np.stack([low, high])) is not None
+    for way, free in (([low, high], True), ([low, lower], False), ([low, high, low], False), ([high, low], False)):
+        touch = first_touch(model, np.array(way), opening=True)
+        assert (touch is None) is free, way
+    assert first_touch(model, plan_line(arm, low, arm.fk(away)).joints, opening=True) is None

@@ -13,6 +13,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
+from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
@@ -40,6 +41,7 @@ class Bench:
         self.log = []
         self.stopped = threading.Event()
         self.events = []
+        self.on_stop = lambda: None
         work = {name: self._step(name, steps.get(name)) for name in NAMES}
         self.runner = Runner(
             sequence=Sequence(tuple(NAMES)),
@@ -71,6 +73,7 @@ class Bench:
         )
 
     def safe_stop(self, reason):
+        self.on_stop()
         self.log.append(f"stop: {reason}")
         self.stopped.set()
 
@@ -359,7 +362,7 @@ def test_ill_health_ends_the_step_whatever_it_does(tmp_path):
     bench.runner.health = health
     result = bench.run()
     assert (result.outcome, result.reason) == (Outcome.REFUSED, "the vehicle reports a fault")
-    assert "reconstruct" not in bench.log
+    assert [record.name for record in result.steps if record.state == "failed"] == ["laser_sweep"]
 
 
 def test_what_ails_the_cell_is_written_down_once_it_stands(tmp_path):
@@ -446,6 +449,21 @@ def test_who_asks_for_the_end_as_a_run_comes_to_a_good_one_is_not_lost(tmp_path)
     assert bench.runner.control.late
 
 
+def test_who_asks_for_the_end_just_as_the_run_has_it_is_late():
+    """The run comes to its end while it is being asked to: between the two nothing is lost."""
+
+    class EndsMeanwhile(CancelToken):
+        def cancel(self, reason):
+            control.over = True
+            assert super().cancel("the run has ended")
+            return super().cancel(reason)
+
+    control = RunControl()
+    control.token = EndsMeanwhile()
+    control.abort("Cell.stop()")
+    assert control.late
+
+
 def test_who_ended_a_run_did_not_come_late(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.abort("enough"))
     assert bench.run().outcome is Outcome.ABORTED
@@ -517,15 +535,13 @@ class StallingDisk:
 
     def stall_until_stopped(self, bench):
         """Stall now; the first stop ends it and gives how long it came after the stall's beginning in `waited`."""
-        stop = bench.runner.safe_stop
 
-        def safe_stop(reason):
+        def on_stop():
             bench.waited.append(time.monotonic() - self.since)
-            stop(reason)
             self.go_on()
 
         bench.waited = []
-        bench.runner.safe_stop = safe_stop
+        bench.on_stop = on_stop
         self.stall()
 
 
@@ -669,6 +685,29 @@ def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(t
     (fault,) = result.faults
     assert (fault.step, fault.attempt, fault.code) == ("laser_sweep", 1, "fault")
     assert fault.remedy == "confirmed by Ann, recovered"
+
+
+def test_an_emergency_stop_ends_the_wait_for_a_persons_word(tmp_path):
+    def health():
+        if pressed.is_set():
+            raise OSError("the emergency stop is pressed")
+        if bench.log[-1:] == ["stop: laser_sweep failed"]:
+            raise ConnectionRefusedError("protective stop")
+
+    def observe(event):
+        if event.kind == "confirm_needed":
+            pressed.set()
+
+    pressed = threading.Event()
+    bench = Bench(tmp_path, laser_sweep=failing(ConnectionRefusedError("protective stop")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.policy = replace(bench.runner.policy, confirm_deadline_s=5.0)
+    bench.runner.observer, bench.runner.health = observe, health
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.FAULTED, "the emergency stop is pressed")
+    assert "recover" not in bench.log
+    assert not bench.runner.control.confirm("too late")
 
 
 def test_nobody_confirms_and_the_run_ends_without_a_recovery(tmp_path):

@@ -13,18 +13,9 @@ import pytest
 from cell import Cell
 from cell.cli.run import abort
 from cell.config import CellConfig, default_toml, load_config
-from cell.run.folder import (
-    CellLock,
-    Question,
-    awaited_word,
-    find_going,
-    find_run,
-    is_going,
-    list_runs,
-    new_run,
-    read_report,
-    write_json,
-)
+from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
+from cell.run.lock import CellLock
+from cell.run.reading import Question, awaited_word, read_report
 from drivers.errors import ConfigError, InterlockError
 from statemachine.journal import Journal
 
@@ -202,6 +193,24 @@ def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
         abort()
     other = journals[going.index(max(going))]
     assert [request.kind for request in other.take_requests()] == ["abort"]
+
+
+def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "runs"
+    going = sorted([new_run(root), new_run(root)])
+    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
+    said = []
+
+    def echo(line: str) -> None:
+        said.append(line)
+        journals[1].run_ended("placed", "all steps done")
+
+    monkeypatch.setattr("typer.echo", echo)
+    abort()
+    assert said == [f"asked {going[0].name} to end", f"{going[1].name} has ended meanwhile"]
 
 
 def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:

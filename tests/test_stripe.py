@@ -115,7 +115,7 @@ def test_a_picture_without_a_stripe_has_no_centres():
 
 def test_wrong_input_is_named():
     with pytest.raises(ValueError, match="8-bit"):
-        extract(np.zeros((480, 640), np.uint16))
+        extract(np.zeros((480, 640), np.float32))
     with pytest.raises(ValueError, match="dark frame"):
         extract(np.zeros((480, 640), np.uint8), dark=np.zeros((10, 10), np.uint8))
 

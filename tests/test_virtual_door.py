@@ -53,9 +53,9 @@ def opened(**options: Any) -> Iterator[Cell]:
         yield cell
 
 
-def done(inject: tuple[str, ...] = (), **options: Any) -> RunOutcome:
+def done(inject: tuple[str, ...] = (), until: str | None = None, **options: Any) -> RunOutcome:
     with opened(**options) as cell:
-        return cell.run("pot.toml", inject=inject)
+        return cell.run("pot.toml", inject=inject, until=until)
 
 
 def require_safe(report: dict[str, Any]) -> None:
@@ -140,8 +140,8 @@ def test_it_takes_the_course_of_another_seed_otherwise() -> None:
 
 
 def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
-    outcome = done(("rail.reset@laser_sweep:40%",))
-    assert outcome.outcome == "placed"
+    outcome = done(("rail.reset@laser_sweep:40%",), until="reconstruct")
+    assert outcome.outcome == "done"
     sweep = outcome.report["steps"][2]
     assert (sweep["name"], sweep["retries"]) == ("laser_sweep", 1)
     assert [(fault["code"], fault["remedy"]) for fault in outcome.report["faults"]] == [("rail.reset", "recovered")]
@@ -194,7 +194,7 @@ def upto(run: Run[RunOutcome], kind: type[RunEvent], step: str | None = None) ->
 
 def test_a_protective_stop_waits_for_a_persons_word() -> None:
     with opened() as cell:
-        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
+        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"], until="drive_to_target")
         needed = upto(run, ConfirmNeeded)
         assert isinstance(needed, ConfirmNeeded)
         before = cell.devices.clock.now()
@@ -202,8 +202,20 @@ def test_a_protective_stop_waits_for_a_persons_word() -> None:
         outcome = run.result(60.0)
         # Nobody waited on the cell's clock meanwhile: the maker's 5 s before a stop can be unlocked came after it.
         assert cell.devices.clock.now() > before + 5.0
-    assert outcome.outcome == "placed"
+    assert outcome.outcome == "done"
     assert outcome.report["faults"][0]["remedy"] == "confirmed by the test, recovered"
+
+
+@pytest.mark.parametrize("button", ["arm", "vehicle"])
+def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str) -> None:
+    with opened() as cell:
+        assert cell.simulated is not None
+        run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
+        upto(run, ConfirmNeeded)
+        cell.simulated.fault({"arm": "arm.emergency_stop", "vehicle": "vehicle.emergency_stop"}[button])
+        outcome = run.result(60.0)
+    assert (outcome.outcome, outcome.report["code"]) == ("faulted", f"{button}.emergency_stop")
+    assert [fault["code"] for fault in outcome.report["faults"]] == [f"{button}.emergency_stop"]
 
 
 def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
@@ -269,7 +281,7 @@ def test_a_stop_after_a_good_end_is_kept_and_the_next_job_is_not_begun() -> None
 
 def test_a_paused_run_stands_until_it_goes_on() -> None:
     with opened() as cell:
-        run = cell.start("pot.toml")
+        run = cell.start("pot.toml", until="drive_to_target")
         upto(run, StepStarted)
         run.pause()
         upto(run, Held)
@@ -280,7 +292,7 @@ def test_a_paused_run_stands_until_it_goes_on() -> None:
         assert run.folder is not None
         request(run.folder, "go-on", "by the journal")
         run.events()
-        assert run.result(60.0).outcome == "placed"
+        assert run.result(60.0).outcome == "done"
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -334,7 +346,7 @@ def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
 def test_the_command_line_says_what_time_passed_here_and_there(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    virtual = ("dry-run", "-j", "pot.toml", "--clock", "virtual", "--seed", str(SEED))
+    virtual = ("dry-run", "-j", "pot.toml", "--clock", "virtual", "--seed", str(SEED), "--until", "drive_to_target")
     assert command(monkeypatch, *virtual) == 0
     assert re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", capsys.readouterr().out)
     assert command(monkeypatch, *virtual, "--speed", "2") == 2

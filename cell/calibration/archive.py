@@ -37,7 +37,8 @@ class Observations:
     """All that a cell's calibration is solved from.
 
     The cameras as drawn, the noise assumed beforehand, the rail's lead as configured in m per turn, and whose they are:
-    serial numbers by device name, the hash of the configuration, the time in seconds since the epoch.
+    serial numbers by device name, the hash of the configuration, the time in seconds since the epoch, and the name of
+    the arm's table.
     """
 
     scan: list[ScanObservation]
@@ -49,6 +50,7 @@ class Observations:
     identities: dict[str, str]
     configuration: str
     made: float
+    kinematics: str = ""
 
 
 def write_archive(path: Path, observations: Observations) -> None:
@@ -59,6 +61,7 @@ def write_archive(path: Path, observations: Observations) -> None:
         "made": o.made,
         "identities": o.identities,
         "configuration": o.configuration,
+        "kinematics": o.kinematics,
         "rail_lead": o.rail_lead,
         "priors": {name: getattr(o.priors, name) for name in PRIORS},
         "scan_camera": _camera_dict(o.scan_camera),
@@ -117,6 +120,7 @@ def read_archive(path: Path) -> Observations:
             {str(name): str(serial) for name, serial in about["identities"].items()},
             str(about["configuration"]),
             float(about["made"]),
+            str(about.get("kinematics", "")),
         )
     except KeyError as error:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error

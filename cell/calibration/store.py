@@ -35,7 +35,8 @@ FORMAT = 1
 class CellCalibration:
     """Scan head and target camera, with the serial numbers and the configuration that they belong to.
 
-    `made` is in seconds since the epoch; `identities` are serial numbers by device name.
+    `made` is in seconds since the epoch; `identities` are serial numbers by device name. `kinematics` names the arm's
+    table with which the flange's poses were reckoned, as of `kinematics_name`; "" in files that do not say so.
     """
 
     scan: ScanCalibration
@@ -43,6 +44,7 @@ class CellCalibration:
     identities: dict[str, str]
     configuration: str
     made: float
+    kinematics: str = ""
 
     @classmethod
     def solve(
@@ -51,9 +53,10 @@ class CellCalibration:
         target: list[TargetObservation],
         identities: dict[str, str],
         config: CellConfig,
+        kinematics: str = "",
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"
@@ -86,6 +89,7 @@ class CellCalibration:
             "date": self.date,
             "identities": self.identities,
             "configuration": self.configuration,
+            "kinematics": self.kinematics,
             "scan": self.scan.as_dict(),
             "target": self.target.as_dict(),
         }
@@ -140,7 +144,11 @@ class Solved:
 
 
 def gathered(
-    scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str], config: CellConfig
+    scan: list[ScanObservation],
+    target: list[TargetObservation],
+    identities: dict[str, str],
+    config: CellConfig,
+    kinematics: str = "",
 ) -> Observations:
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
@@ -150,7 +158,15 @@ def gathered(
     )
     cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
     return Observations(
-        scan, target, *cameras, priors, config.rail.lead, identities, config.calibration_hash(), time.time()
+        scan,
+        target,
+        *cameras,
+        priors,
+        config.rail.lead,
+        identities,
+        config.calibration_hash(),
+        time.time(),
+        kinematics,
     )
 
 
@@ -161,7 +177,7 @@ def solve_observations(observations: Observations) -> Solved:
     head = ScanCalibration.of(scan)
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
-    made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made)
+    made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made, o.kinematics)
     return Solved(made, scan, target)
 
 
@@ -202,6 +218,7 @@ def read_calibration(path: Path) -> CellCalibration:
             {str(name): str(serial) for name, serial in data["identities"].items()},
             str(data["configuration"]),
             float(data["made"]),
+            str(data.get("kinematics", "")),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
@@ -211,8 +228,12 @@ CLOCK_SLACK_S = 3600.0
 """How far a calibration's date may lie in the future: clocks of two machines differ."""
 
 
-def find_calibration(folder: Path, identities: dict[str, str], configuration: str, max_age: float) -> CellCalibration:
+def find_calibration(
+    folder: Path, identities: dict[str, str], configuration: str, max_age: float, kinematics: str = ""
+) -> CellCalibration:
     """The stored calibration of these devices under this configuration, not older than `max_age` s.
+
+    `kinematics` names the arm's table, as of `kinematics_name`.
 
     Raises `CalibrationStale` that says what is missing or what differs.
     """
@@ -236,7 +257,15 @@ def find_calibration(folder: Path, identities: dict[str, str], configuration: st
             f"the calibration of {own[-1].date} was made under another configuration ({own[-1].configuration}, now "
             f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
         )
-    newest = max(current, key=lambda entry: entry.made)
+    fitting = [entry for entry in current if entry.kinematics == kinematics]
+    if not fitting:
+        raise CalibrationStale(
+            f"the calibration of {current[-1].date} was made with another kinematics of the arm "
+            f"({current[-1].kinematics or 'it does not say which'}; the arm now has "
+            f"{kinematics or 'none that is known'}): the arm or its controller was exchanged, or the arm was "
+            "calibrated anew, or its port 30001 could be read then and not now; run `cell calibrate`"
+        )
+    newest = max(fitting, key=lambda entry: entry.made)
     age = time.time() - newest.made
     if age > max_age:
         raise CalibrationStale(

@@ -14,9 +14,10 @@ from cell.config import CellConfig
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_parts
 from cell.job import Job
-from cell.motion.bodies import arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.arm_models import arm_kinematics
+from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionError, CollisionModel, Pair
-from cell.motion.kinematics import ArmKinematics, Unreachable
+from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
 from cell.steps.arm_sweep import RUN_UP_S
 from cell.steps.camera_poses import (
@@ -29,7 +30,6 @@ from cell.steps.camera_poses import (
     target_calibration_views,
 )
 from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates
-from cell.steps.place import TOUCHES
 from cell.vision import parse_board
 from drivers.interfaces import Vector
 
@@ -39,9 +39,10 @@ Goal = tuple[str, pin.SE3, tuple[Pair, ...]]
 
 def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:
     """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m."""
-    kinematics = ArmKinematics()
+    kinematics = arm_kinematics(config.arm.model, None)
+    arm = arm_bodies(config.arm.model)
     deck = vehicle_bodies(deck_plates(config))
-    empty = Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(), *tool_bodies(), *deck]))
+    empty = Planner(kinematics, CollisionModel(kinematics, [*arm, *tool_bodies(), *deck]))
     yield from _unreached(empty, _views(config))
     part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3())
     board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
@@ -50,7 +51,7 @@ def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) 
         base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
-    held = Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(), *part, *deck, *station]))
+    held = Planner(kinematics, CollisionModel(kinematics, [*arm, *part, *deck, *station]))
     try:
         held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")
     except CollisionError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from cell.cli.options import (
     SimOption,
     print_json,
 )  # fmt: skip
+
+if TYPE_CHECKING:
+    from cell.calibration.recorded.attach import Options
 
 
 def register(app: typer.Typer) -> None:
@@ -42,6 +45,30 @@ def calibrate(
     board: Annotated[
         str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
     ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Only say what was understood of the recorded frames, and calibrate nothing.")
+    ] = False,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            "--poses", help='How the recorded poses are to be read, such as "xyz+rotvec-rad"; else the pictures tell.'
+        ),
+    ] = None,
+    pose_field: Annotated[
+        str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
+    ] = None,
+    setup: Annotated[
+        str | None,
+        typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
+            "the arm has no say in it.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
@@ -52,10 +79,19 @@ def calibrate(
         return
     from drivers.errors import ConfigError
 
-    if source is None and board is not None:
-        raise ConfigError("--board belongs to --from; the boards on the deck are named in the configuration")
-    if source is not None:
-        _from_folder(source, board, json)
+    given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
+    given["--camera"] = camera
+    if source is None:
+        for name, value in given.items():
+            if value:
+                raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
+    else:
+        from cell.calibration.recorded.attach import Options
+        from cell.calibration.recorded.known_camera import read_camera
+
+        known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
+        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures")
+        _from_folder(source, board, options, json)
         return
     from cell.calibration.archive import read_archive
     from cell.calibration.report import examine
@@ -78,13 +114,21 @@ def calibrate(
         print_examination(examination.summary, pictures)
 
 
-def _from_folder(folder: Path, board: str | None, json: bool) -> None:
+def _setup(text: str | None) -> str | None:
+    from drivers.errors import ConfigError
+
+    if text not in (None, "eye-in-hand", "eye-to-hand"):
+        raise ConfigError(f"--setup {text}: allowed are eye-in-hand and eye-to-hand")
+    return None if text is None else text.replace("-", "_")
+
+
+def _from_folder(folder: Path, board: str | None, options: Options, json: bool) -> None:
     from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
     from cell.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
-    result = calibrate_folder(folder, None if board is None else parse_board(board))
+    result = calibrate_folder(folder, None if board is None else parse_board(board), options)
     if json:
         print_json(result)
     else:
@@ -95,5 +139,5 @@ def _from_folder(folder: Path, board: str | None, json: bool) -> None:
         )
     if result["refused"]:
         raise RefusedError("; ".join(result["refused"].values()))
-    if result["intrinsics"] is None and result["hand_eye"] is None:
+    if not options.plan and result["intrinsics"] is None and result["hand_eye"] is None:
         raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result['notes'])}")

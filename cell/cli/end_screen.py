@@ -10,7 +10,7 @@ from typing import Any
 
 from cell.job import job_path, shipped_jobs
 from cell.report.figures import shown_limit, shown_value
-from cell.run.folder import wall_seconds
+from cell.run.reading import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -43,15 +43,11 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
         if outcome == "done":
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
         return "cell diag: the state of every device"
-    match outcome, report.get("part"):
-        case (("placed" | "done"), _):
-            pass
-        case _, "released":
-            return (
-                f"look at the part, it is down; cell home: fold the arm; then {again} -j {_job(report)}: the next part"
-            )
-        case _, "unknown":
-            return f"look what has become of the part; cell home: fold the arm; then {again} -j {_job(report)}"
+    part = None if outcome in ("placed", "done") else report.get("part")
+    if part == "released":
+        return f"look at the part, it is down; cell home: fold the arm; then {again} -j {_job(report)}: the next part"
+    if part == "unknown":
+        return f"look what has become of the part; cell home: fold the arm; then {again} -j {_job(report)}"
     match outcome:
         case "done":
             return f"cell report {name}: what was measured; nothing was placed"

@@ -11,10 +11,11 @@ from rich.table import Table
 
 
 def print_recorded(result: Mapping[str, Any]) -> None:
-    """Frames with the reason of each refusal, then what was found, with units, then what could not be had."""
+    """What was understood, frame by frame and of the poses, then what was found, then what could not be had."""
     console = Console()
     if result["board"] is not None:
         console.print(_frames(result["frames"]))
+        _print_understood(console, result)
     values = _table("calibration", ("quantity", "value", "unit"), right=1)
     camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
     if camera is not None:
@@ -52,11 +53,34 @@ def print_recorded(result: Mapping[str, Any]) -> None:
         console.print(note, markup=False, soft_wrap=True)
 
 
+def _print_understood(console: Console, result: Mapping[str, Any]) -> None:
+    poses = result["poses"]
+    if poses is not None and poses.get("reading") is not None:
+        chosen = "as given" if "poses" in poses["given"] else "chosen by the pictures"
+        lines = (
+            f"poses: {', '.join(poses['source'])}, {poses['text']} ({poses['reading']}, {chosen}), in {poses['unit']}; "
+            f"matched by {poses['matched_by']}; {poses['setup'].replace('_', ' ')} (if they are base_from_flange)",
+            f"evidence: {poses['evidence']}",
+        )
+        for line in lines:
+            console.print(line, markup=False, soft_wrap=True)
+    for file in result["unread"]:
+        console.print(f"not understood: {file['name']}: {file['reason']}", markup=False, soft_wrap=True)
+
+
 def _frames(frames: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("frames", ("frame", "used", "RMS in px", "reason"), right=2)
+    table = _table("recorded frames", ("picture", "board", "pose", "stripe", "used", "RMS in px", "reason"), right=5)
     for frame in frames:
         rms = "" if frame["rms_px"] is None else f"{frame['rms_px']:.3f}"
-        table.add_row(frame["name"], "yes" if frame["used"] else "no", rms, frame["text"])
+        table.add_row(
+            frame["name"],
+            f"{frame['points']} points" if frame["points"] else "",
+            frame["pose_from"] or "",
+            frame["stripe_from"] or ("here" if frame["stripe"] else ""),
+            "yes" if frame["used"] else "no",
+            rms,
+            frame["text"],
+        )
     return table
 
 

@@ -195,7 +195,10 @@ def abort(
         try:
             _ask(str(run), config, "abort", reason, "asked {} to end")
         except ConfigError as error:
-            unasked.append(str(error))
+            if listens(run):
+                unasked.append(str(error))
+            else:
+                typer.echo(f"{run.name} has ended meanwhile")
     if unasked:
         raise ConfigError("not asked to end: " + "; ".join(unasked))
 
@@ -227,7 +230,7 @@ def confirm(
     import sys
 
     from cell.cli import EXIT_FAILED
-    from cell.run.folder import awaited_word
+    from cell.run.reading import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
@@ -263,7 +266,8 @@ def _going(name: str | None, config: Path | None) -> Path:
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
     """List what was run, newest last, a line each: when, what, how it ended, how long it took, and why."""
     from cell.cli.display import print_runs
-    from cell.run.folder import list_runs, run_row
+    from cell.run.folder import list_runs
+    from cell.run.reading import run_row
 
     rows = [run_row(folder) for folder in list_runs(_runs_folder(config))]
     if json:
@@ -277,7 +281,8 @@ def report(
 ) -> None:
     """Show the report of a run."""
     from cell.cli.display import print_report
-    from cell.run.folder import find_run, read_report
+    from cell.run.folder import find_run
+    from cell.run.reading import read_report
 
     folder = find_run(_runs_folder(config), name)
     data = read_report(folder)

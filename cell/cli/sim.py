@@ -23,7 +23,7 @@ def serve(
     level: LevelOption = Level.nominal,
     speed: SpeedOption = 1.0,
     surface: Annotated[str, typer.Option(help="What stands on the place: pot, seat or panel.")] = "pot",
-    arm: Annotated[str, typer.Option(help="Which arm: UR10e or UR5e.")] = "UR10e",
+    arm: Annotated[str, typer.Option(help="Which arm, by the maker's name.")] = "UR10e",
     json: JsonOption = False,
     config_out: Annotated[
         Path | None, typer.Option(help="Also write a configuration that names the simulated endpoints.")

@@ -34,7 +34,8 @@ def verify(
 ) -> None:
     """Say how good the stored calibration is today, from a view of each deck board and a sweep over the fine one.
 
-    Exit code 0: good. 1: disturbed, with the suspected part and the place error to expect.
+    Exit code 0: good, or changed by less than matters at the job's place. 1: the place may be off by a third of its
+    tolerance or more, with the suspected part, or the pictures fit worse than they did.
     """
     from cell.cli.display import ProgressDisplay
     from cell.supervisor import Cell
@@ -77,10 +78,19 @@ def print_verification(summary: Mapping[str, Any]) -> None:
     console.print(seen)
     if summary["suspects"]:
         suspects = Table(title="suspected parts")
-        for name in ("part", "probability", "place error in mm", "most probable change"):
-            suspects.add_column(name, justify="right" if name in ("probability", "place error in mm") else "left")
+        allowed = f"of {summary['place']['allowed_mm']:g} mm allowed"
+        for name in ("part", "probability", "place off by, mm", "at most", allowed, "most probable change"):
+            suspects.add_column(name, justify="left" if name in ("part", "most probable change") else "right")
         for row in summary["suspects"]:
             change = ", ".join(f"{name} {value:+.3f}" for name, value in row["change"].items())
-            suspects.add_row(row["part"], f"{row['probability']:.0%}", f"{row['place_error_mm']:.3f}", change)
+            most = row["place_error_at_most_mm"]
+            suspects.add_row(
+                row["part"],
+                f"{row['probability']:.0%}",
+                f"{row['place_error_mm']:.3f}",
+                f"{most:.3f}",
+                f"{most / summary['place']['allowed_mm']:.0%}",
+                change,
+            )
         console.print(suspects)
     console.print(summary["reason"], style="green" if summary["good"] else "red", markup=False, soft_wrap=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from typing import Any
 
@@ -17,10 +17,11 @@ from cell.devices.make import Surroundings
 from cell.devices.rules import RULES
 from cell.devices.ways import Ways
 from cell.geometry.poses import to_ur
-from cell.motion.kinematics import ArmKinematics
+from cell.motion.arm_models import arm_kinematics
 from cell.steps.moves import HOME
 from drivers.clock import Clock
-from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vehicle
+from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vector, Vehicle
+from drivers.link_table import LinkTable
 
 
 def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devices:
@@ -50,9 +51,13 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
     around = Surroundings(clock, look, arm)
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.
-        kinematics = ArmKinematics()
-        around = Surroundings(clock, look, None, safe_off_outputs(config), lambda joints: to_ur(kinematics.fk(joints)))
+        around = Surroundings(clock, look, None, safe_off_outputs(config), lambda table: _forward(config, table))
     return config.make(name).connect(name, config.device(name), around)
+
+
+def _forward(config: CellConfig, table: LinkTable | None) -> Callable[[Vector], Vector]:
+    kinematics = arm_kinematics(config.arm.model, table)
+    return lambda joints: to_ur(kinematics.fk(joints))
 
 
 def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
@@ -72,7 +77,7 @@ def behind_gate(
     claw: Claw | None = None,
 ) -> Devices:
     """These devices, of whatever make, with everything that moves, shines or grips behind one gate."""
-    ways = Ways(config)
+    ways = Ways(config, None if arm is None else arm.link_table())
     switched = (config.laser, "laser"), (config.claw, "claw")
     situation = Situation(
         arm,

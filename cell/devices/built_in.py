@@ -12,6 +12,7 @@ from pydantic import model_validator
 
 from cell.addresses import Endpoint, Host, Port, checked_can
 from cell.device_config import (
+    MOST_PAYLOAD,
     ArmConfig,
     CameraConfig,
     ClawConfig,
@@ -152,6 +153,7 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
 
 
 def _arm(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
+    from cell.motion.arm_models import MODELS
     from drivers.arm.limits import ArmLimits
     from drivers.arm.ur import UrArm
 
@@ -163,10 +165,12 @@ def _arm(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
             joint_speeds=(config.max_joint_speed,) * 6,
             joint_acceleration=config.max_joint_acceleration,
             linear_speed=config.max_tool_speed,
+            reach=MODELS[config.model].reach,
+            payload=MOST_PAYLOAD[config.model],
         ),
         payload=(config.payload, config.payload_centre),
         safe_off_outputs=around.safe_off_outputs,
-        forward=around.forward,
+        forward_of=around.forward_of,
         control=not around.look,
     )
 

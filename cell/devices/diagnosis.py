@@ -15,7 +15,7 @@ import numpy as np
 from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
 from cell.devices.simulated import SimulatedCell, with_endpoints
-from cell.run.folder import CellLock
+from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle

@@ -7,10 +7,11 @@ be proven there as well. Everything above the devices' interfaces is the product
 from __future__ import annotations
 
 from cell.config import CellConfig
-from cell.device_config import of_make
+from cell.device_config import MOST_PAYLOAD, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.devices import Devices
+from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
@@ -58,6 +59,8 @@ def setup_of(config: CellConfig) -> Setup:
                 joint_speeds=(arm.max_joint_speed,) * 6,
                 joint_acceleration=arm.max_joint_acceleration,
                 linear_speed=arm.max_tool_speed,
+                reach=MODELS[arm.model].reach,
+                payload=MOST_PAYLOAD[arm.model],
             ),
             fault,
             safe_off_outputs(config),

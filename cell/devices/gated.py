@@ -27,10 +27,15 @@ from drivers.interfaces import (
     Vehicle,
     VehicleState,
 )
+from drivers.link_table import LinkTable
 
 
 class GatedArm(Gated[Arm]):
     """The arm, its motions and its recovery begun through a gate."""
+
+    def link_table(self) -> LinkTable | None:
+        """See `Arm.link_table`."""
+        return self.bare.link_table()
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""
@@ -147,7 +152,13 @@ class GatedVehicle(Gated[Vehicle]):
 
     def enable(self) -> None:
         """See `Vehicle.enable`."""
-        self.gate.begin(Command("vehicle", "enable"), self.bare.enable, self.bare.brake)
+
+        def begin() -> None:
+            # It may drive away from now on.
+            self.gate.interlocks.stand_before(())
+            self.bare.enable()
+
+        self.gate.begin(Command("vehicle", "enable"), begin, self.bare.brake)
 
     def recover(self) -> None:
         """See `Vehicle.recover`."""
@@ -178,6 +189,7 @@ class GatedClaw(Gated[Claw]):
     def release(self, timeout: float = 2.0) -> None:
         """See `Claw.release`."""
         self._begin("release", lambda: self.bare.release(timeout))
+        self.gate.interlocks.carry(())
 
     def _begin(self, name: str, start: Callable[[], None]) -> None:
         self.gate.require(Command("claw", name))

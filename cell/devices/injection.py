@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from cell.devices.simulated import Simulation
 from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 from statemachine.runner import Event
@@ -50,9 +51,20 @@ class Injector:
     """
 
     def __init__(self, cause: Callable[[str], None], injections: Sequence[Injection]) -> None:
+        self.injections = tuple(injections)
         self._cause = cause
         self._waiting = list(injections)
         self._failed: dict[Injection, str] = {}
+
+    @classmethod
+    def scheduled(cls, texts: Sequence[str], steps: Sequence[str], simulated: Simulation | None) -> Injector:
+        """For texts that `Injection.parse` takes; `ConfigError` also for a fault that this cell cannot have."""
+        injections = [Injection.parse(text, steps) for text in texts]
+        if simulated is None:
+            raise ConfigError(f"{', '.join(map(str, injections))} can only happen to a simulated cell")
+        for injection in injections:
+            simulated.require_fault(injection.fault)
+        return cls(simulated.fault, injections)
 
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""

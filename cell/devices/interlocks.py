@@ -14,6 +14,7 @@ from typing import Any
 
 import pinocchio as pin
 
+from cell.motion.bodies import Body
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
 from drivers.interfaces import Arm, ArmMotion, Claw, Laser, Vector, Vehicle
@@ -38,12 +39,13 @@ class Command:
 class Situation:
     """What the rules look at: the bare devices, None where one is not connected, and what the cell knows of itself.
 
-    `outputs` says by number which of the arm's outputs belong to another device. `clear(joints, command)` gives the
-    pairs of bodies that the arm would bring together on the way that a command asks for, from where it stands (6,) in
-    rad. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by name.
-    `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is the
-    newest motion of the arm, None when it is not known how that went; `purposes` what this thread lights the laser for.
-    `clock` is the one that the devices share.
+    `outputs` says by number which of the arm's outputs belong to another device. `clear(joints, command, others)` gives
+    the pairs of bodies that the arm would bring together on the way that a command asks for, from where it stands (6,)
+    in rad, with these others about; `part` is what the claw holds and `station` what stands before the vehicle, as far
+    as a run has told. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by
+    name. `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is
+    the newest motion of the arm, None when it is not known how that went; `purposes` what this thread lights the laser
+    for. `clock` is the one that the devices share.
     """
 
     arm: Arm | None
@@ -51,13 +53,15 @@ class Situation:
     laser: Laser | None
     claw: Claw | None
     outputs: Mapping[int, str]
-    clear: Callable[[Vector, Command], Sequence[tuple[str, str]]]
+    clear: Callable[[Vector, Command, Sequence[Body]], Sequence[tuple[str, str]]]
     forward: Callable[[Vector], pin.SE3]
     postures: Mapping[str, Vector]
     configuration: str
     looks: dict[str, pin.SE3] = field(default_factory=dict)
     calibrated: str | None = None
     last: ArmMotion | None = None
+    part: tuple[Body, ...] = ()
+    station: tuple[Body, ...] = ()
     purposes: threading.local = field(default_factory=threading.local)
     clock: Clock = field(default_factory=Clock)
 
@@ -133,6 +137,14 @@ class Interlocks:
     def may_drive_with(self, name: str, base_from_flange: pin.SE3) -> None:
         """The vehicle may also drive with the flange there: a looking pose that a job names."""
         self.situation.looks[name] = base_from_flange
+
+    def carry(self, part: Sequence[Body]) -> None:
+        """From now on this is in the claw, as long as the claw holds it: its bodies, in the flange frame."""
+        self.situation.part = tuple(part)
+
+    def stand_before(self, station: Sequence[Body]) -> None:
+        """From now on these bodies stand about, in the arm base: until the vehicle is enabled, and may drive away."""
+        self.situation.station = tuple(station)
 
     def work_with(self, configuration: str) -> None:
         """From now on work is done with a calibration that was made under the configuration of this hash."""

@@ -20,6 +20,7 @@ from cell.device_config import (
 )
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Device, Vector
+from drivers.link_table import LinkTable
 
 KINDS: dict[str, type[DeviceConfig]] = {
     "rail": RailConfig,
@@ -41,14 +42,15 @@ class Surroundings:
 
     `look`: nothing on the device is to be set, started or ended, by `close` neither. `arm` is there for makes that
     hang on the arm's connectors. An arm switches `safe_off_outputs` off when the link to it or this program is lost;
-    `forward` is the cell's model of it, joints (6,) in rad to the flange's pose (6,) in m and rad.
+    `forward_of` is the cell's model of it, made from the table that its controller tells, or None: joints (6,) in rad
+    to the flange's pose (6,) in m and rad.
     """
 
     clock: Clock
     look: bool = False
     arm: Arm | None = None
     safe_off_outputs: tuple[int, ...] = ()
-    forward: Callable[[Vector], Vector] | None = None
+    forward_of: Callable[[LinkTable | None], Callable[[Vector], Vector]] | None = None
 
     def require_arm(self) -> Arm:
         """The arm, for makes with `on_arm`."""

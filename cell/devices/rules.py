@@ -13,6 +13,7 @@ import pinocchio as pin
 from cell.devices.contact import GuardedMotion
 from cell.devices.gated_laser import UNATTENDED_S
 from cell.devices.interlocks import PURPOSES, Command, Rule, Situation
+from cell.geometry.poses import from_ur
 from drivers.errors import DeadlineError
 from drivers.interfaces import Arm, ArmState, Vehicle, VehicleState
 
@@ -28,6 +29,8 @@ TURNING = 0.05
 MOVED_RAD = 0.005
 """Angle of a joint by which the arm may be off where contact ended: some mm at its reach."""
 POSTURE_RAD = math.radians(2.0)
+SAME_M, SAME_RAD = 0.05e-3, 0.1e-3
+"""How far the flange may be reported from where the cell has it: both are computed from the same angles."""
 LOOK_M, LOOK_RAD = 0.03, math.radians(3.0)
 """How near the arm has to be to a transport pose. A looking pose is reckoned from the camera's mounting as configured
 or as calibrated, which differ."""
@@ -168,10 +171,30 @@ def _calibrated(now: Situation, command: Command) -> str | None:
 def _clear(now: Situation, command: Command) -> str | None:
     if now.arm is None:
         return None
-    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command)
+    empty = bool(now.part) and now.claw is not None and not now.claw.holding
+    others = (*(() if empty else now.part), *now.station)
+    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, others)
     if not pairs:
         return None
     return f"{', '.join(f'{a} and {b}' for a, b in pairs)} would collide on the way. Go another way, or plan it"
+
+
+def _kinematics(now: Situation, command: Command) -> str | None:
+    if now.arm is None:
+        return None
+    state = now.arm.state(PATIENCE_S)
+    if _moves(now, state) is not None:
+        return None
+    apart = now.forward(state.joints).actInv(from_ur(state.flange))
+    way, turn = np.linalg.norm(apart.translation), np.linalg.norm(pin.log3(apart.rotation))
+    if way <= SAME_M and turn <= SAME_RAD:
+        return None
+    return (
+        f"the arm reports its flange {1e3 * way:.3f} mm and {1e3 * turn:.3f} mrad away from where this cell's model of "
+        f"it has it (allowed {1e3 * SAME_M:g} mm, {1e3 * SAME_RAD:g} mrad), so it would go elsewhere than planned. See "
+        "that nobody has set another tool at the pendant, that arm.model and arm.address are right and that the "
+        "controller's port 30001 can be read; then connect anew, and calibrate the cell if the arm was exchanged"
+    )
 
 
 def _own_switch(now: Situation, command: Command) -> str | None:
@@ -211,9 +234,17 @@ RULES = (
         _calibrated,
     ),
     Rule(
+        "same_kinematics",
+        MOVES,
+        "the arm at rest reports its flange where the cell's model of it has it, to 0.05 mm and 0.1 mrad",
+        _kinematics,
+        liftable=False,
+    ),
+    Rule(
         "way_clear",
         MOVES,
-        "arm, tool, vehicle and the boards on the deck stay apart all the way; what touches already may",
+        "arm, tool, vehicle, boards on the deck, and part and station where a run has told of them, stay apart all the "
+        "way; what is near at the beginning may part, but not come nearer",
         _clear,
     ),
     Rule(

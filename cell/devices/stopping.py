@@ -21,8 +21,10 @@ def stop_not_confirmed(message: str) -> DeviceFault:
 def require_healthy(devices: Devices) -> None:
     """Raise when a safety system has stopped the arm, or the vehicle has a fault, whichever device is waited for.
 
-    A reading that is too old says nothing here: the next command to that device finds a silent link.
+    An emergency stop is told before anything else: a person may be asked about the other fault meanwhile. A reading
+    that is too old says nothing here: the next command to that device finds a silent link.
     """
+    require_no_emergency_stop(devices)
     _require_arm(devices)
     if "vehicle" not in devices:
         return

@@ -22,6 +22,11 @@ def cause_fault(address: str, name: str) -> None:
     _asked(address, {"op": "fault", "name": name}, f"did not take the fault {name}")
 
 
+def clear_faults(address: str) -> None:
+    """Take away all causes of faults; raises `CellError` when that was not taken."""
+    _asked(address, {"op": "reset"}, "did not take its faults away")
+
+
 def _asked(address: str, request: dict[str, str], failed: str) -> dict[str, Any]:
     host, port = address.rsplit(":", 1)
     try:

@@ -1,14 +1,13 @@
 """Which bodies the arm would bring together on the way that a command asks for, whoever asks, planned or not.
 
-Known here are the arm, its tool, the vehicle and the boards on its deck. The part in the claw and the station are known
-to the planner of a job alone, which checks its own ways among them.
+Known here are the arm, its tool, the vehicle and the boards on its deck. The part in the claw and the station are among
+them where a run has told of them.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from functools import cached_property
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -16,66 +15,64 @@ import pinocchio as pin
 from cell.config import CellConfig
 from cell.devices.interlocks import Command
 from cell.geometry.poses import from_ur
-from cell.motion.bodies import arm_bodies, tool_bodies, vehicle_bodies
+from cell.motion.arm_models import arm_kinematics
+from cell.motion.bodies import TOUCHES, Body, arm_bodies, tool_bodies, vehicle_bodies
+from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionModel, Pair
-from cell.motion.kinematics import ArmKinematics, Joints
+from cell.motion.kinematics import Joints
 from cell.steps.moves import deck_plates
 from drivers.interfaces import Vector
+from drivers.link_table import LinkTable
 
 MARGIN_M = 0.002
 """Less than the planner keeps, so that what it finds free is not refused for a rounding."""
-STEP_RAD = 0.03
 LINE_STEP_M, LINE_STEP_RAD = 0.01, 0.03
 
 
 class Ways:
-    """The arm's ways through its own cell."""
+    """The ways of an arm whose controller told `table`, or none, through its own cell."""
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, table: LinkTable | None = None) -> None:
         self._config = config
         self._one_at_a_time = threading.Lock()
-        self.kinematics = ArmKinematics()
+        self.kinematics = arm_kinematics(config.arm.model, table)
         # One of its own: where the arm stands is asked while a way is reckoned.
         self._looking = threading.Lock()
-        self._standing = ArmKinematics()
+        self._standing = arm_kinematics(config.arm.model, table)
+        self._known: tuple[tuple[Body, ...], CollisionModel] | None = None
 
-    @cached_property
-    def _bodies(self) -> CollisionModel:
-        bodies = [*arm_bodies(), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
-        return CollisionModel(self.kinematics, bodies, MARGIN_M)
+    def _among(self, others: tuple[Body, ...]) -> CollisionModel:
+        if self._known is None or self._known[0] != others:
+            own = [*arm_bodies(self._config.arm.model), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
+            self._known = others, CollisionModel(self.kinematics, [*own, *others], MARGIN_M)
+        return self._known[1]
 
     def forward(self, joints: Vector) -> pin.SE3:
         """base_from_flange at joint angles (6,) in rad; callable from any thread."""
         with self._looking:
             return self._standing.fk(joints)
 
-    def clear(self, start: Vector, command: Command) -> list[Pair]:
-        """The pairs that come closer than 2 mm on the way from `start`, (6,) rad; what touches there already may.
+    def clear(self, start: Vector, command: Command, others: Sequence[Body] = ()) -> list[Pair]:
+        """The pairs that come closer than 2 mm on the way from `start`, (6,) rad, with these `others` about.
 
+        What is closer at the beginning may part, but not come nearer. With a force limit the part may be set down.
         Raises `Unreachable` when the arm cannot follow a straight line.
         """
         with self._one_at_a_time:
-            allowed = [] if self._bodies.free(start) else self._bodies.touching(start)
-            for joints in self._way(start, command):
-                if not self._bodies.free(joints, allowed):
-                    return self._bodies.touching(joints, allowed)
-            return []
+            allowed = () if command.arguments.get("force_limit") is None else TOUCHES
+            way = np.array([start, *self._way(start, command)])
+            touch = first_touch(self._among(tuple(others)), way, allowed, opening=True)
+            return [] if touch is None else touch.pairs
 
     def _way(self, start: Joints, command: Command) -> Iterator[Joints]:
         arguments = command.arguments
         match command.name:
             case "move_joints":
-                yield from _between(start, np.asarray(arguments["joints"]))
+                yield np.asarray(arguments["joints"])
             case "move_linear":
                 yield from self._line(start, from_ur(arguments["flange"]))
             case _:
-                points = np.asarray(arguments["joints"])
-                last = points[0]
-                for point in points[1:]:
-                    if np.abs(point - last).max() >= STEP_RAD:
-                        yield from _between(last, point)
-                        last = point
-                yield points[-1]
+                yield from np.asarray(arguments["joints"])
 
     def _line(self, joints: Joints, goal: pin.SE3) -> Iterator[Joints]:
         begin = self.kinematics.fk(joints)
@@ -87,8 +84,3 @@ class Ways:
             pose.translation = begin.translation + (goal.translation - begin.translation) * (k / count)
             joints = self.kinematics.track(pose, joints)
             yield joints
-
-
-def _between(start: Joints, end: Joints) -> Iterator[Joints]:
-    count = max(1, int(np.ceil(np.abs(end - start).max() / STEP_RAD)))
-    return (start + (end - start) * (k / count) for k in range(1, count + 1))

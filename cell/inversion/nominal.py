@@ -7,6 +7,8 @@ foot lies on the rim say nothing about the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
@@ -67,9 +69,15 @@ class NominalSurface:
 
     @classmethod
     def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> NominalSurface:
-        """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh."""
-        vertices, faces = read_mesh(path, unit)
-        return cls(vertices, faces, rim)
+        """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh.
+
+        The last few are kept: one job after another is placed on the same surface, and preparing it takes a while.
+        """
+        try:
+            content = sha256(path.read_bytes()).digest()
+        except OSError:
+            content = b""
+        return _prepared(path, content, unit, rim)
 
     @property
     def extent(self) -> tuple[Array, Array]:
@@ -121,6 +129,13 @@ class NominalSurface:
     def _sample_weights(self) -> Array:
         counts = np.bincount(self.sample_triangles, minlength=len(self.areas))
         return np.asarray(self.areas[self.sample_triangles] / counts[self.sample_triangles])
+
+
+@lru_cache(maxsize=4)
+def _prepared(path: Path, content: bytes, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
+    """The surface in a file of this content."""
+    vertices, faces = read_mesh(path, unit)
+    return NominalSurface(vertices, faces, rim)
 
 
 def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:

@@ -12,10 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from cell.motion.arm_models import MODELS
+
 BASE = 0
 """Parent of what stands still: poses are in the arm's base frame."""
 FLANGE = 7
 """Parent of what the flange carries: poses are in the flange frame. 1 … 6 are the frames that turn with a joint."""
+
+
+TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
+"""What comes near on purpose while the part is set down."""
 
 
 @dataclass(frozen=True)
@@ -50,17 +56,20 @@ def capsule(name: str, parent: int, start: Sequence[float], end: Sequence[float]
     return Body(name, parent, pin.SE3(turn.toRotationMatrix(), (p + q) / 2), (0.0, 0.0, length), radius)
 
 
-def arm_bodies() -> list[Body]:
-    """Capsules around the links of a UR10e, in the frames that turn with its joints (z along the joint's axis)."""
+def arm_bodies(model: str = "UR10e") -> list[Body]:
+    """Capsules around the links of an arm, in the frames that turn with its joints (z along the joint's axis)."""
+    arm = MODELS[model]
+    (beside, thick), (fore, slim) = arm.upper, arm.forearm
     return [
-        capsule("base", BASE, (0, 0, 0.08), (0, 0, 0.17), 0.08),
-        capsule("shoulder", 1, (0, 0, 0.17), (0, -0.12, 0.18), 0.08),
-        capsule("upper arm", 2, (0, 0, 0.176), (-0.6127, 0, 0.176), 0.075),
-        capsule("elbow", 3, (0, 0, 0.06), (0, 0, 0.16), 0.065),
-        capsule("forearm", 3, (0, 0, 0.042), (-0.5716, 0, 0.042), 0.06),
-        capsule("wrist 1", 4, (0, 0, 0.05), (0, 0, 0.16), 0.05),
-        capsule("wrist 2", 5, (0, 0, 0), (0, 0, 0.11), 0.05),
-        capsule("wrist 3", 6, (0, 0, 0.03), (0, 0, 0.07), 0.045),
+        capsule("base", BASE, (0, 0, 0.3 * arm.base), (0, 0, 0.8 * arm.base), arm.base),
+        capsule("shoulder", 1, (0, 0, arm.d1 - 0.25 * thick), (0, -0.68 * beside, arm.d1), 1.1 * thick),
+        capsule("shoulder joint", 2, (0, 0, beside - 0.4 * thick), (0, 0, beside + 0.5 * thick), thick),
+        capsule("upper arm", 2, (0, 0, beside), (arm.a2, 0, beside), thick),
+        capsule("elbow", 3, (0, 0, fore), (0, 0, beside + 0.5 * thick), thick),
+        capsule("forearm", 3, (0, 0, fore), (arm.a3, 0, fore), slim),
+        capsule("wrist 1", 4, (0, 0, fore + 0.01), (0, 0, arm.d4 + 0.01), arm.wrist),
+        capsule("wrist 2", 5, (0, 0, 0), (0, 0, arm.d5 + 0.01), arm.wrist),
+        capsule("wrist 3", 6, (0, 0, 0.03), (0, 0, arm.d6 - 0.036), 0.9 * arm.wrist),
     ]
 
 

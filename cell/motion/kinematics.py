@@ -1,8 +1,8 @@
 """Forward and inverse kinematics of the six-axis arm.
 
-The model is built in code from the maker's Denavit–Hartenberg table; the closed form of an arm with three parallel
-axes lists the branches, and Gauss–Newton on Pinocchio's model makes each of them exact. Collisions and time are not
-known here.
+The model is built in code from a Denavit–Hartenberg table, the maker's or the one that the factory calibrated; the
+closed form of the maker's arm, with three parallel axes, lists the branches, and Gauss–Newton on Pinocchio's model
+makes each of them exact. Collisions and time are not known here.
 """
 
 from __future__ import annotations
@@ -28,16 +28,27 @@ class Unreachable(RefusedError):
 
 @dataclass(frozen=True)
 class DenavitHartenberg:
-    """Table of an arm, by joint: d and a in m, alpha in rad. Default: UR10e (docs/protocols.md, section 1)."""
+    """Table of an arm, by joint: d and a in m, alpha and theta in rad; theta is added to the joint's angle.
+
+    Default: UR10e (docs/protocols.md, section 1).
+    """
 
     d: tuple[float, ...] = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)
     a: tuple[float, ...] = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)
     alpha: tuple[float, ...] = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+    theta: tuple[float, ...] = (0.0,) * 6
 
     def link(self, joint: int) -> pin.SE3:
         """Transformation from the frame that turns with joint 0 … 5 to the next joint's frame (the flange for 5)."""
         rotation = pin.utils.rotate("x", self.alpha[joint])
         return pin.SE3(rotation, np.array([self.a[joint], 0.0, self.d[joint]]))
+
+    def frames_at_zero(self) -> list[pin.SE3]:
+        """With all joints at 0: the six frames about whose z the joints turn, and the flange, in the base."""
+        frames = [pin.SE3.Identity()]
+        for joint in range(6):
+            frames.append(frames[-1] * _turn(self.theta[joint]) * self.link(joint))
+        return frames
 
 
 @dataclass(frozen=True)
@@ -74,16 +85,27 @@ class JointLimits:
 class ArmKinematics:
     """The arm from its base to its flange. An instance holds work space: use one per thread."""
 
-    def __init__(self, table: DenavitHartenberg | None = None, limits: JointLimits | None = None) -> None:
+    def __init__(
+        self,
+        table: DenavitHartenberg | None = None,
+        limits: JointLimits | None = None,
+        nominal: DenavitHartenberg | None = None,
+    ) -> None:
+        """`table` is exact; `nominal` is the maker's, which it is a calibration of (none: `table` itself)."""
         self.table = table or DenavitHartenberg()
+        self.nominal = nominal or self.table
         self.limits = limits or JointLimits()
         self.model = pin.Model()
-        parent, placement = 0, pin.SE3.Identity()
+        *drawn, _ = self.nominal.frames_at_zero()
+        *axes, flange = self.table.frames_at_zero()
+        parent, base_from_parent = 0, pin.SE3.Identity()
         for joint in range(6):
+            base_from_joint = _anchored(axes[joint], drawn[joint])
+            placement = base_from_parent.actInv(base_from_joint)
             parent = self.model.addJoint(parent, pin.JointModelRZ(), placement, f"joint_{joint + 1}")
-            placement = self.table.link(joint)
-        self.joint6_from_flange = placement
-        self._flange = self.model.addFrame(pin.Frame("flange", parent, placement, pin.FrameType.OP_FRAME))
+            base_from_parent = base_from_joint
+        self.joint6_from_flange = base_from_parent.actInv(flange)
+        self._flange = self.model.addFrame(pin.Frame("flange", parent, self.joint6_from_flange, pin.FrameType.OP_FRAME))
         self._data = self.model.createData()
 
     def fk(self, joints: Joints) -> pin.SE3:
@@ -172,7 +194,7 @@ class ArmKinematics:
 
     def _branches(self, base_from_flange: pin.SE3, seed: Joints) -> list[Joints]:
         """Up to eight closed-form solutions for three parallel axes; out of reach they end at the nearest stretch."""
-        d, a, table = self.table.d, self.table.a, self.table
+        d, a, table = self.nominal.d, self.nominal.a, self.nominal
         rotation = base_from_flange.rotation
         wrist = base_from_flange.translation - d[5] * rotation[:, 2]
         reach = float(np.hypot(wrist[0], wrist[1]))
@@ -204,6 +226,19 @@ class ArmKinematics:
 
 def _turn(angle: float) -> pin.SE3:
     return pin.SE3(pin.utils.rotate("z", angle), np.zeros(3))
+
+
+def _anchored(axis: pin.SE3, drawn: pin.SE3) -> pin.SE3:
+    """The frame on the z axis of `axis` that is nearest to the frame `drawn`.
+
+    A factory's table has its frames where common normals happen to lie, up to hundreds of metres along the axes. A
+    link's body hangs on the frame where the drawing has it.
+    """
+    z = axis.rotation[:, 2]
+    x = drawn.rotation[:, 0] - z * (z @ drawn.rotation[:, 0])
+    x /= np.linalg.norm(x)
+    along = z @ (drawn.translation - axis.translation)
+    return pin.SE3(np.column_stack([x, np.cross(z, x), z]), axis.translation + along * z)
 
 
 def _error(pose: pin.SE3, target: pin.SE3) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from cell.job import load_job
 from cell.reconstruction.e57 import write_e57
 from cell.reconstruction.mesh import triangles, write_mesh
 from cell.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
-from cell.run.folder import read_report
+from cell.run.reading import read_report
 from drivers.errors import ConfigError
 
 SUFFIXES = {"ply": ".ply", "e57": ".e57", "stl": ".stl", "mesh": ".ply"}

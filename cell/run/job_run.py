@@ -229,12 +229,12 @@ class JobRun:
 
     def _recover(self, error: BaseException, token: CancelToken, confirmed: bool) -> None:
         """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
-        self.devices.gate.enter(token)
-        token.check()
-        if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-            self.devices.arm.recover(confirmed=confirmed)
-        elif isinstance(error, DeviceError) and error.device == "vehicle":
-            self.devices.vehicle.recover()
+        with self.devices.gate.entered(token):
+            token.check()
+            if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
+                self.devices.arm.recover(confirmed=confirmed)
+            elif isinstance(error, DeviceError) and error.device == "vehicle":
+                self.devices.vehicle.recover()
 
 
 def each_of(observers: tuple[Observer, ...]) -> Observer:

@@ -126,9 +126,9 @@ class RecordedWork:
         polls = 0
 
         def begin() -> None:
-            self.devices.gate.enter(control.token)
-            control.token.check()
-            made.append(work(hands))
+            with self.devices.gate.entered(control.token):
+                control.token.check()
+                made.append(work(hands))
 
         def stop(why: str) -> None:
             nonlocal stopped

@@ -74,12 +74,12 @@ class Kind:
 
 
 def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
-    here.devices.gate.enter(context.token)
-    context.check()
-    here.devices.interlocks.work_with(here.calibration.configuration)
-    here.mover.hold = context.safe_point
-    here.frames.begin()
-    result = step.work(here, context)
+    with here.devices.gate.entered(context.token):
+        context.check()
+        here.devices.interlocks.work_with(here.calibration.configuration)
+        here.mover.hold = context.safe_point
+        here.frames.begin()
+        result = step.work(here, context)
     # What a later step finds by this type, and whether the job ends placed, rests on it.
     if not isinstance(result, step.makes):
         raise TypeError(f"step {step.name} made a {type(result).__name__}, not the {step.makes.__name__} it promises")

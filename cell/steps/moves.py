@@ -8,11 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config import ArmConfig, CellConfig
+from cell.devices.interlocks import Interlocks
 from cell.geometry.poses import from_parts
 from cell.job import Job
+from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionModel, Pair
-from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from cell.steps.camera_poses import centre_of
@@ -35,7 +37,8 @@ Postures are chosen nearest to the present one, so a fixed beginning keeps the a
 class Mover:
     """Moves one arm among the bodies that are known so far. Used by one thread at a time.
 
-    `hold` is called before each free motion, at a moment when nothing moves: a paused run waits in it.
+    `hold` is called before each free motion, at a moment when nothing moves: a paused run waits in it. `interlocks` are
+    told of the part and of the station, so that moves that nobody planned are checked against them as well.
     """
 
     def __init__(
@@ -45,17 +48,21 @@ class Mover:
         config: CellConfig,
         job: Job | None,
         hold: Callable[[], None] = lambda: None,
+        interlocks: Interlocks | None = None,
     ) -> None:
         self.hold = hold
         self._arm = arm
         self._clock = clock
         self._settle_time = config.arm.settle_time
         self._tool_speed = config.arm.max_tool_speed
-        self.kinematics = ArmKinematics(limits=_joint_limits(config.arm))
+        self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
         grasp = None if job is None else job.grasp
         part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
-        self._moving = [*arm_bodies(), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
+        self._interlocks = interlocks
+        self._moving = [*arm_bodies(config.arm.model), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
         self._planner = self._plan_among([])
+        if interlocks is not None and grasp is not None:
+            interlocks.carry([body for body in self._moving if body.name == "part"])
 
     def meet_station(
         self, base_from_place: pin.SE3, job: Job, board: BoardSpec, surface_extent: tuple[Vector, Vector]
@@ -67,9 +74,10 @@ class Mover:
         centre = job.place_from_board * from_parts(centre_of(board))
         on_place = job.surface.place_from_surface.se3()
         low, (x, y, z) = (corner.tolist() for corner in surface_extent)
-        self._planner = self._plan_among(
-            station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
-        )
+        station = station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
+        self._planner = self._plan_among(station)
+        if self._interlocks is not None:
+            self._interlocks.stand_before(station)
 
     def leave_part(self) -> None:
         """From now on the claw is empty; the part is where it was put, among the bodies that may be near the claw."""

@@ -11,6 +11,7 @@ import pinocchio as pin
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.inversion import PlacePose
 from cell.job import Job
+from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.step import JobStep
@@ -19,10 +20,6 @@ from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw
 from statemachine.policy import OnFailure, Step
 from statemachine.runner import StepContext
-
-TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
-"""What may come closer than the collision margin on the way down and up."""
-
 
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""

@@ -53,7 +53,8 @@ class Workplace:
     @cached_property
     def mover(self) -> Mover:
         """Planned moves of the arm with the job's part in the claw."""
-        return Mover(self.devices.arm, self.devices.clock, self.config, self.job)
+        devices = self.devices
+        return Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks)
 
     @cached_property
     def board(self) -> BoardSpec:

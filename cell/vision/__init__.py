@@ -1,11 +1,21 @@
-"""Images to numbers: stripe centres and board points, each with its own uncertainty or the reason of its refusal."""
+"""Images to numbers: stripe centres and board points, each with its own uncertainty or the reason of its refusal.
 
-from cell.vision.board.board import BoardPose, board_pose, find_board
-from cell.vision.board.spec import BoardSpec, parse_board
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-from cell.vision.stripe.extract import StripeProfile, StripeSettings, extract
-from cell.vision.stripe.stream import StripeStream
+Names are imported when they are first asked for: a command that only reads a board's name out of a configuration does
+not wait for the compiler of the stripe's loops.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cell.vision.board.board import BoardPose, board_pose, find_board
+    from cell.vision.board.spec import BoardSpec, parse_board
+    from cell.vision.board.view import BoardView
+    from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
+    from cell.vision.stripe.extract import StripeProfile, StripeSettings, extract
+    from cell.vision.stripe.stream import StripeStream
 
 __all__ = [
     "BoardPose",
@@ -23,3 +33,19 @@ __all__ = [
     "parse_board",
     "read_picture",
 ]
+
+_ROOMS = {
+    "board.board": ("BoardPose", "board_pose", "find_board"),
+    "board.spec": ("BoardSpec", "parse_board"),
+    "board.view": ("BoardView",),
+    "pictures": ("PictureRefused", "Reason", "check_picture", "read_picture"),
+    "stripe.extract": ("StripeProfile", "StripeSettings", "extract"),
+    "stripe.stream": ("StripeStream",),
+}
+
+
+def __getattr__(name: str) -> object:
+    for room, names in _ROOMS.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{room}"), name)
+    raise AttributeError(f"module '{__name__}' has no attribute {name!r}")

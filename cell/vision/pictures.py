@@ -37,6 +37,8 @@ class Reason(StrEnum):
     OBLIQUE = "oblique"
     RESIDUAL = "residual"
     NO_POSE = "no_pose"
+    DUPLICATE = "duplicate"
+    LASER_PICTURE = "laser_picture"
 
 
 class PictureRefused(RefusedError):
@@ -60,10 +62,33 @@ def read_picture(path: Path) -> Image:
         raise PictureRefused(
             Reason.CUT, f"{path.name} is cut: its end is missing after {len(data)} bytes; copy it again"
         )
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    if data.startswith(b"version https://git-lfs"):
+        raise PictureRefused(
+            Reason.UNREADABLE,
+            f"{path.name} only points to a picture that was not fetched (Git LFS): run `git lfs pull`",
+        )
+    image: NDArray[np.generic] | None = None
+    if data:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error as error:
+            raise PictureRefused(Reason.UNREADABLE, f"{path.name} cannot be decoded: {error.err}") from error
     if image is None:
         raise PictureRefused(Reason.UNREADABLE, f"{path.name} is no picture that can be decoded ({len(data)} bytes)")
-    return np.asarray(image, dtype=np.uint8)
+    return _eight_bit(image, path)
+
+
+def _eight_bit(image: NDArray[np.generic], path: Path) -> Image:
+    """The picture with 8 bit: of 10, 12, 14 and 16 bit the uppermost eight."""
+    if image.dtype == np.uint8:
+        return np.asarray(image, dtype=np.uint8)
+    if image.dtype != np.uint16:
+        raise PictureRefused(
+            Reason.UNREADABLE, f"{path.name} holds numbers of the kind {image.dtype}, as a depth picture does"
+        )
+    bits = next(b for b in (8, 10, 12, 14, 16) if int(image.max()) < 1 << b)
+    return np.asarray(np.asarray(image, dtype=np.uint16) >> (bits - 8), dtype=np.uint8)
 
 
 def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:
@@ -91,10 +116,21 @@ def _is_cut(data: bytes) -> bool:
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-16:]
     if data.startswith(b"\xff\xd8"):
-        return b"\xff\xd9" not in data[-4096:]
+        return b"\xff\xd9" not in data[_jpeg_scan(data) :]
     if data.startswith(b"BM") and len(data) > 6:
         return int.from_bytes(data[2:6], "little") > len(data)
     return False
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Where the picture itself begins in a JPEG: behind its headers, whose preview has an end mark of its own.
+
+    Telephones write further data behind the picture, so the end mark need not be near the file's end.
+    """
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return at
 
 
 def only_one(found: list[Found], name: str) -> Found:

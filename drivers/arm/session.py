@@ -42,10 +42,14 @@ class ArmSession:
         clock: Clock,
         connect_timeout: float,
         forward: Forward | None,
+        unknown: str,
         on_ended: Callable[[Ended], None],
         on_broken: Callable[[Exception], None],
     ) -> None:
-        """Connect. Raises `NotConnectedError`, or `DeviceFault` when the arm is another one than `forward` says."""
+        """Connect. Raises `NotConnectedError`, or `DeviceFault` when the arm is another one than `forward` says.
+
+        `unknown` says why the controller's own table is not known, if it is not.
+        """
         self.setup = setup
         self.statistics = LinkStatistics()
         self.dashboard = Dashboard(name, setup.address)
@@ -53,7 +57,7 @@ class ArmSession:
         self._name = name
         self._clock = clock
         self._connect_timeout = connect_timeout
-        self._forward = forward
+        self._forward, self._unknown = forward, unknown
         self._on_ended, self._on_broken = on_ended, on_broken
         self._safing = Safing(name, setup.address, setup.safe_off, self.statistics)
         self._closed = False
@@ -95,7 +99,7 @@ class ArmSession:
         """Raise `DeviceFault` (arm.wrong_kinematics) unless the flange is where the caller's model has it."""
         if self._forward is not None:
             with self._comparing:
-                require_same_flange(self._name, self._forward, self.feed.fresh(0.1)[0])
+                require_same_flange(self._name, self._forward, self.feed.fresh(0.1)[0], self._unknown)
 
     # --- asking ---
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from drivers.arm.clock_latch import latch_clock
+from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
@@ -27,6 +28,7 @@ from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
 from drivers.interfaces import ArmSafety, ArmState, Identity, Vector
+from drivers.link_table import LinkTable
 from drivers.quantities import check_positive, shown
 
 _FIRST_POINT = 0.02
@@ -52,8 +54,9 @@ class UrArm:
     when the driver closes or dies, or its link is lost: the laser's output belongs here. `braking` is the deceleration
     of a stop in rad/s². `connect_timeout` is in wall seconds. Raises `NotConnectedError` when no arm answers.
 
-    `forward`, joints (6,) in rad to the flange's pose (6,), is the caller's own model of the arm: here and before every
-    motion it has to agree with what the arm reports within 5 mm and 1°, else `DeviceFault` (arm.wrong_kinematics).
+    `forward`, joints (6,) in rad to the flange's pose (6,), is the caller's own model of the arm, or `forward_of` makes
+    it from the table that the controller tells, None where it tells none. Here and before every motion it has to agree
+    with what the arm reports within 0.05 mm and 0.1 mrad, else `DeviceFault` (arm.wrong_kinematics).
 
     With `control=False` the arm is only looked at: nothing on it is started, set or ended, by `close` neither, and a
     program that runs on it runs on. Everything but reading is then an `InterlockError`.
@@ -70,6 +73,7 @@ class UrArm:
         braking: float = 4.0,
         connect_timeout: float = 10.0,
         forward: Forward | None = None,
+        forward_of: Callable[[LinkTable | None], Forward] | None = None,
         control: bool = True,
         clock: Clock,
     ) -> None:
@@ -88,7 +92,12 @@ class UrArm:
             check_positive(name, "braking", braking, 20.0, "rad/s^2"),
             control,
         )
-        self._session = ArmSession(name, setup, clock, connect_timeout, forward, self._on_ended, self._end_motion)
+        self.factory = read_factory_kinematics(address)
+        if forward_of is not None:
+            forward = forward_of(self.factory.table)
+        self._session = ArmSession(
+            name, setup, clock, connect_timeout, forward, self.factory.missing, self._on_ended, self._end_motion
+        )
         self._feed = self._session.feed
         self.statistics = self._session.statistics
 
@@ -104,6 +113,10 @@ class UrArm:
             firmware=version.removeprefix("URSoftware").split("(")[0].strip(),
             address=self._session.setup.address,
         )
+
+    def link_table(self) -> LinkTable | None:
+        """The factory's table that the controller computes with, as of the connection; None where it told none."""
+        return self.factory.table
 
     def ping(self) -> float:
         """Ask the dashboard server for the robot mode; the round trip in wall seconds."""

@@ -23,12 +23,14 @@ from typing import Any
 
 from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
-from rtde_receive import RTDEReceiveInterface
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.messages import AT_REST, MODE_RUNNING, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
 from drivers.arm.outbox import Message, Outbox
-from drivers.arm.ur_control import PERIOD, ControlThread
+from drivers.arm.ur_control import ControlThread
+from drivers.arm.ur_outputs import OFF_S, keep_low, make_safe, switch_output
+from drivers.arm.ur_packets import Packets
+from drivers.arm.ur_program import PERIOD
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 
@@ -37,20 +39,7 @@ SILENCE_S = 1.5
 _CONSTRUCTION_S = 15.0
 _SHUT_DOWN_S = 5.0
 _PUSHES_PER_S = 125.0
-_VARIABLES = [
-    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
-    "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
-]  # fmt: skip
-_SECONDARY_PORT = 30002
-_GREETING = 79
-"""Bytes that the maker wants read from that port before it is closed; else what was sent may be discarded."""
-_LOW_WHEN_NOT_RUNNING = 1
-_OFF_S = 1.0
-_STOPPED = 1
-"""`runtime_state` of an arm on which no program runs; larger ones play, pause or resume."""
 _LAST_WORDS_S = 0.5
-_NOT_SAFE = 4
-"""Exit code of `--safe` when an output stays on or the arm does not come to rest."""
 
 
 class Child:
@@ -62,8 +51,8 @@ class Child:
         self._parent = os.getppid()
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
-            self._receive = RTDEReceiveInterface(setup.address, 500.0, _VARIABLES)
-            self._snapshot = self._read()
+            self._packets = Packets(setup.address)
+            self._snapshot = self._packets.read()
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
         self._outbox = Outbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
@@ -81,7 +70,7 @@ class Child:
         control = RTDEControlInterface(address) if ready else None
         try:
             self._outputs_off()
-            _let_go_low(address, self._setup.safe_off)
+            keep_low(address, self._setup.safe_off)
             if control is not None:
                 self._see_running()
                 _prepare(control, self._setup)
@@ -89,13 +78,13 @@ class Child:
             if control is not None:
                 control.stopScript()
             raise
-        self._snapshot = self._read()
+        self._snapshot = self._packets.read()
         return control
 
     def _see_running(self) -> None:
         """The state comes over a connection of its own, and may be older than the program's start."""
-        deadline = time.monotonic() + _OFF_S
-        while not self._read().program_running and time.monotonic() < deadline:
+        deadline = time.monotonic() + OFF_S
+        while not self._packets.read().program_running and time.monotonic() < deadline:
             self._clock.sleep(PERIOD)
 
     def _outputs_off(self) -> None:
@@ -103,8 +92,8 @@ class Child:
         mask = sum(1 << index for index in self._setup.safe_off)
         for index in self._setup.safe_off:
             switch_output(self._io, index, False)
-        deadline = time.monotonic() + _OFF_S
-        while self._read().outputs & mask:
+        deadline = time.monotonic() + OFF_S
+        while self._packets.read().outputs & mask:
             if time.monotonic() > deadline:
                 raise RuntimeError(f"outputs {self._setup.safe_off} cannot be switched off")
             self._clock.sleep(PERIOD)
@@ -163,41 +152,19 @@ class Child:
         while True:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
-            if not self._receive.isConnected():
+            if not self._packets.connected:
                 self._lose("the arm closed the connection")
             if os.getppid() != self._parent:
                 os.kill(os.getpid(), signal.SIGTERM)
                 self._parent = os.getppid()
-            stamp = self._receive.getTimestamp()
-            if stamp == self._controller_time:
+            if not self._packets.news:
                 if time.monotonic() - before.stamp > SILENCE_S:
                     self._lose(f"no packet from the arm for {SILENCE_S:g} s")
                 continue
-            snapshot = self._snapshot = self._read()
+            snapshot = self._snapshot = self._packets.read()
             count += 1
             if count % every == 0 or _urgent(snapshot) != _urgent(before):
                 self._send(snapshot)
-
-    def _read(self) -> Snapshot:
-        """The newest packet, read whole: again if another one has come in between."""
-        receive = self._receive
-        while True:
-            self._controller_time: float = receive.getTimestamp()
-            snapshot = Snapshot(
-                stamp=time.monotonic(),
-                joints=tuple(receive.getActualQ()),
-                speeds=tuple(receive.getActualQd()),
-                flange=tuple(receive.getActualTCPPose()),
-                wrench=tuple(receive.getActualTCPForce()),
-                safety_bits=receive.getSafetyStatusBits(),
-                mode=receive.getRobotMode(),
-                runtime=receive.getRuntimeState(),
-                inputs=receive.getActualDigitalInputBits(),
-                outputs=receive.getActualDigitalOutputBits(),
-                device_time=self._controller_time,
-            )
-            if receive.getTimestamp() == self._controller_time:
-                return snapshot
 
     def _lose(self, text: str) -> None:
         self._send(Lost(text))
@@ -211,18 +178,6 @@ class Child:
         self._outbox.put(message)
 
 
-def terminal(index: int) -> tuple[str, int]:
-    """Kind and number of digital output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
-    kind = ("standard", "configurable", "tool")[index // 8]
-    return kind, index % 8
-
-
-def switch_output(io: Any, index: int, value: bool) -> bool:
-    """Set digital output `index`."""
-    kind, number = terminal(index)
-    return bool(getattr(io, f"set{kind.capitalize()}DigitalOut")(number, value))
-
-
 def _prepare(control: Any, setup: Setup) -> None:
     mass, centre = setup.payload
     steps: list[tuple[str, Callable[[], bool]]] = [
@@ -233,27 +188,6 @@ def _prepare(control: Any, setup: Setup) -> None:
     for what, act in steps:
         if not act():
             raise RuntimeError(f"the controller did not accept {what}")
-
-
-def _let_go_low(address: str, outputs: tuple[int, ...]) -> None:
-    """Have the controller keep outputs low whenever no program runs, whatever becomes of the link.
-
-    A secondary program runs beside the main one and leaves it alone. Source: the maker's script manual.
-    """
-    if not outputs:
-        return
-    lines = [
-        f"  set_runstate_{kind}_digital_output_to_value({number}, {_LOW_WHEN_NOT_RUNNING})\n"
-        for kind, number in map(terminal, outputs)
-    ]
-    with socket.create_connection((address, _SECONDARY_PORT), timeout=_OFF_S) as connection:
-        connection.sendall(f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
-        read = 0
-        while read < _GREETING:
-            data = connection.recv(4096)
-            if not data:
-                raise RuntimeError(f"port {_SECONDARY_PORT} of the arm was closed before it took the outputs' setting")
-            read += len(data)
 
 
 def _urgent(snapshot: Snapshot) -> tuple[int, int, int, int, int]:
@@ -296,30 +230,7 @@ def _serve(descriptor: int) -> None:
     child.serve()
 
 
-def _make_safe(address: str, outputs: list[int]) -> None:
-    """Switch outputs off, then see on the arm's own word that they are and that it stands."""
-    signal.setitimer(signal.ITIMER_REAL, _SHUT_DOWN_S)
-    if outputs:
-        io = RTDEIOInterface(address)
-        for index in outputs:
-            switch_output(io, index, False)
-    receive = RTDEReceiveInterface(address, 500.0, _VARIABLES)
-    mask = sum(1 << index for index in outputs)
-    clock, deadline = Clock(), time.monotonic() + _OFF_S
-
-    def unsafe() -> bool:
-        moving = max(map(abs, receive.getActualQd())) >= AT_REST
-        # A program that is only paused would go on when it is released.
-        return bool(receive.getActualDigitalOutputBits() & mask) or moving or receive.getRuntimeState() > _STOPPED
-
-    while unsafe():
-        if time.monotonic() > deadline:
-            os._exit(_NOT_SAFE)
-        clock.sleep(PERIOD)
-    os._exit(0)
-
-
 if __name__ == "__main__":
     if sys.argv[1] == "--safe":
-        _make_safe(sys.argv[2], [int(index) for index in sys.argv[3].split(",") if index])
+        make_safe(sys.argv[2], [int(index) for index in sys.argv[3].split(",") if index])
     _serve(int(sys.argv[1]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,21 +14,29 @@ from drivers.interfaces import Vector
 Forward = Callable[[Vector], Vector]
 """Joint angles (6,) in rad to the flange's pose (6,) in the base: x, y, z in m and a rotation vector in rad."""
 
-MOST_WAY, MOST_TURN = 5e-3, math.radians(1.0)
-"""How far the two may be apart, m and rad. A factory calibration makes 1.2 mm and 7.7 mrad of it (median)."""
+MOST_WAY, MOST_TURN = 0.05e-3, 0.1e-3
+"""How far the two may be apart, m and rad. With the same table they agree to the last digits; with the maker's table
+instead of the factory's it is 2 to 4 mm and 7 to 15 mrad (docs/protocols.md, section 1)."""
 
 
-def require_same_flange(device: str, forward: Forward, snapshot: Snapshot) -> None:
-    """Raise `DeviceFault` (arm.wrong_kinematics) when the two differ by more than `MOST_WAY` or `MOST_TURN`."""
+def require_same_flange(device: str, forward: Forward, snapshot: Snapshot, unknown: str = "") -> None:
+    """Raise `DeviceFault` (arm.wrong_kinematics) when the two differ by more than `MOST_WAY` or `MOST_TURN`.
+
+    `unknown` says why the controller's own table is not known, if it is not.
+    """
     way, turn = _difference(forward, snapshot)
-    if not _near(way, turn):
-        raise fault(
-            device,
-            "arm.wrong_kinematics",
-            f"the flange that it reports is {1e3 * way:.1f} mm and {math.degrees(turn):.2f} deg away from where the "
-            f"configured model has it, allowed {1e3 * MOST_WAY:g} mm and {math.degrees(MOST_TURN):g} deg; "
-            "nothing was moved",
+    if _near(way, turn):
+        return
+    text = (
+        f"the flange that it reports is {1e3 * way:.3f} mm and {1e3 * turn:.3f} mrad away from where the cell's model "
+        f"has it, allowed {1e3 * MOST_WAY:g} mm and {1e3 * MOST_TURN:g} mrad; nothing was moved"
+    )
+    if unknown:
+        text += (
+            f". The arm's own kinematics is not known ({unknown}), so the maker's table was taken. Open that port "
+            "between this computer and the controller"
         )
+    raise fault(device, "arm.wrong_kinematics", text)
 
 
 def flange_agrees(forward: Forward, snapshot: Snapshot) -> bool:

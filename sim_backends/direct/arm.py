@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from drivers.errors import Aborted, DeviceFault, InterlockError
-from drivers.interfaces import ArmSafety, ArmState, Identity, Latch, LinkStatistics, Vector
+from drivers.interfaces import ArmSafety, ArmState, Identity, Latch, LinkStatistics, LinkTable, Vector
 from sim_backends.direct.arm_motion import AT_REST, STILL_TICK_S, TICK_S, ArmMove, Streamed
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import ArmSetup, within
@@ -55,6 +55,11 @@ class DirectArm:
     def identity(self) -> Identity:
         """The model's own plate."""
         return Identity(self.model.params.model, self.model.params.serial, "virtual", "in this process")
+
+    def link_table(self) -> LinkTable:
+        """What the model's controller computes with."""
+        a, d, alpha, theta = self.model.params.dh.T.tolist()
+        return LinkTable(tuple(theta), tuple(a), tuple(d), tuple(alpha))
 
     def ping(self) -> float:
         """No wire: 0 s."""

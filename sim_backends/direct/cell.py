@@ -62,6 +62,10 @@ class DirectCell:
         """Cause the fault `name`, one of `faults.NAMES`; ValueError for one that is not, or needs a wire."""
         faults.cause(self, name)
 
+    def clear_faults(self) -> None:
+        """Take away all causes of faults."""
+        faults.clear(self)
+
     def _tick(self, until: float) -> None:
         """Let the world's time pass by one tick, as fine as what moves needs, at most up to `until` s."""
         t = min(until, self._time.now() + min(LONGEST_TICK_S, *(device.tick_s for device in self._ticking)))

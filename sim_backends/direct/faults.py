@@ -27,6 +27,12 @@ def require(name: str) -> None:
         raise ValueError(f"unknown fault {name!r}; known: {', '.join(NAMES)}")
 
 
+def clear(cell: DirectCell) -> None:
+    """Take away all causes of faults, as a person would: buttons are released, motors are well again."""
+    cell.world.arm.clear()
+    cell.world.vehicle.clear(cell.clock.now())
+
+
 def cause(cell: DirectCell, name: str) -> None:
     """Cause the fault `name`, of the scan camera where it says only `camera.`."""
     require(name)

@@ -1,7 +1,8 @@
 """The simulated arm: joints, safety system, inputs and outputs, true and reported poses; physics only, no bytes.
 
-What the arm reports comes from its joint encoders and the nominal kinematics. Where the flange truly is differs by
-the errors of its Denavit-Hartenberg table and by a repeatability error that is drawn anew for every rest.
+What the arm reports comes from its joint encoders and the table that its controller was given in the factory. Where the
+flange truly is differs by what that calibration has left, and by a repeatability error that is drawn anew for every
+rest.
 """
 
 from __future__ import annotations
@@ -50,9 +51,10 @@ class Power(IntEnum):
 class ArmParams:
     """What one particular arm is like.
 
-    `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad; the error is the true table less
-    the nominal one. `repeatability` holds standard deviations per axis in m and rad; `force_noise` in N and N·m;
-    `force_limit` in N is where a protective stop comes; `unlock_delay` in s is how long it cannot be unlocked.
+    `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad. `dh` is what the controller
+    computes with and tells; the error is the true table less that one. `repeatability` holds standard deviations
+    per axis in m and rad; `force_noise` in N and N·m; `force_limit` in N is where a protective stop comes;
+    `unlock_delay` in s is how long it cannot be unlocked.
     """
 
     dh: Matrix = field(default_factory=lambda: UR10E_DH.copy())
@@ -72,7 +74,7 @@ class ArmParams:
     @classmethod
     def of(cls, model: str, **others: Any) -> ArmParams:
         """Those of the maker's `model`, a key of `TABLES`, with `others` as given."""
-        return cls(dh=TABLES[model].copy(), model=model, **others)
+        return cls(dh=others.pop("dh", TABLES[model]).copy(), model=model, **others)
 
 
 class ArmModel:
@@ -82,6 +84,7 @@ class ArmModel:
         """Stands at `params.initial_q`, powered, brakes released, safety normal."""
         self.params = params
         self.kinematics = Kinematics(params.dh)
+        self._drawn = Kinematics(TABLES[params.model])
         self.drive = Drive(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
         self.power = Power.RUNNING
         self.safety = Safety.NORMAL
@@ -134,6 +137,15 @@ class ArmModel:
     def base_from_flange(self, t: float) -> Matrix:
         """True flange pose (4, 4) in the base at world time `t` (the last 10 s are kept)."""
         return self._truth.at(t)
+
+    def body_frames(self) -> Matrix:
+        """The frames (7, 4, 4) of base, links and flange as the maker draws them, now; those of the links to some mm.
+
+        A factory's table has them where its common normals happen to lie, which may be far from the links.
+        """
+        frames = self._drawn.frames(self.drive.q)
+        frames[6] = self.reported_flange()
+        return frames
 
     def reported_flange(self) -> Matrix:
         """Flange pose (4, 4) in the base as the controller computes it from the encoders, now."""

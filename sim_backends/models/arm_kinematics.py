@@ -16,29 +16,30 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-UR10E_DH: Matrix = np.array(
-    [
-        [0.0, 0.1807, math.pi / 2, 0.0],
-        [-0.6127, 0.0, 0.0, 0.0],
-        [-0.57155, 0.0, 0.0, 0.0],
-        [0.0, 0.17415, math.pi / 2, 0.0],
-        [0.0, 0.11985, -math.pi / 2, 0.0],
-        [0.0, 0.11655, 0.0, 0.0],
-    ]
-)
+
+def _table(d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Matrix:
+    half = 0.5 * math.pi
+    rows = ((0.0, d1, half), (a2, 0.0, 0.0), (a3, 0.0, 0.0), (0.0, d4, half), (0.0, d5, -half), (0.0, d6, 0.0))
+    return np.array([(*row, 0.0) for row in rows])
+
+
+UR10E_DH = _table(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655)
 """One row per joint: a in m, d in m, alpha in rad, joint offset in rad."""
-UR5E_DH: Matrix = np.array(
-    [
-        [0.0, 0.1625, math.pi / 2, 0.0],
-        [-0.425, 0.0, 0.0, 0.0],
-        [-0.3922, 0.0, 0.0, 0.0],
-        [0.0, 0.1333, math.pi / 2, 0.0],
-        [0.0, 0.0997, -math.pi / 2, 0.0],
-        [0.0, 0.0996, 0.0, 0.0],
-    ]
-)
-TABLES: dict[str, Matrix] = {"UR10e": UR10E_DH, "UR5e": UR5E_DH}
-"""The makers' table by the name of the model."""
+UR5E_DH = _table(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996)
+TABLES: dict[str, Matrix] = {
+    "UR3": _table(0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819),
+    "UR5": _table(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823),
+    "UR10": _table(0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
+    "UR3e": _table(0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
+    "UR5e": UR5E_DH,
+    "UR7e": UR5E_DH,
+    "UR10e": UR10E_DH,
+    "UR12e": UR10E_DH,
+    "UR16e": _table(0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655),
+    "UR20": _table(0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
+    "UR30": _table(0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543),
+}
+"""The maker's table by the name of the model."""
 
 _Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Axes x, y, z and origin of a frame, three numbers each."""

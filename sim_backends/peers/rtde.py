@@ -1,7 +1,7 @@
 """RTDE version 2 over TCP: the simulated arm's controller as a client on the network sees it.
 
-One thread advances the arm and serves the real-time, dashboard, script and secondary ports every 2 ms on the wall, on
-absolute deadlines. Source: the maker's RTDE guide; docs/protocols.md, section 1. Physics is elsewhere.
+One thread advances the arm and serves the real-time, dashboard, script, primary and secondary ports every 2 ms on the
+wall, on absolute deadlines. Source: the maker's RTDE guide; docs/protocols.md, section 1. Physics is elsewhere.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sim_backends.peers.rtde_recipes import InputRecipe
 from sim_backends.peers.rtde_registers import Registers, View
 from sim_backends.peers.rtde_session import Session
 from sim_backends.peers.script import ControlProgram, ScriptText
-from sim_backends.peers.script_port import robot_mode, version_message
+from sim_backends.peers.script_port import robot_state, version_message
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
@@ -35,11 +35,11 @@ LATE_S = 0.1
 """Seconds on the wall by which `arm.late_states` delays every state."""
 _CATCH_UP = 100
 """Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
-RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT = 30004, 29999, 30003, 30002
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, SECONDARY_PORT = 30004, 29999, 30003, 30001, 30002
 _HELD_UP_S = 0.02
 """A tick that begins later than this, in seconds on the wall, is made up for. A real controller is never held up."""
 _REPORT_EVERY = 50
-"""Ticks between two reports on the secondary port, which come ten times a second."""
+"""Ticks between two reports on the primary and the secondary port, which come ten times a second."""
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class RtdePeer:
     """The controller of one simulated arm on its own loopback address."""
 
     def __init__(self, model: ArmModel, clock: WorldClock, host: str | None = None) -> None:
-        """Bind the four ports on `host`, or on the first free address that `TcpPorts` finds.
+        """Bind the five ports on `host`, or on the first free address that `TcpPorts` finds.
 
         Raises OSError when an address or every address is taken.
         """
@@ -63,7 +63,7 @@ class RtdePeer:
         self._scripts: dict[Client, ScriptText] = {}
         self._listeners: set[Client] = set()
         self._lines: dict[Client, bytes] = {}
-        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, SECONDARY_PORT), host)
+        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, SECONDARY_PORT), host)
         self._tick_count = 0
         self._late = 0
         self._stopping = threading.Event()
@@ -138,7 +138,7 @@ class RtdePeer:
             elif port == DASHBOARD_PORT:
                 self._serve_dashboard(client, data)
             else:
-                self._serve_script(client, data, reports=port == SECONDARY_PORT)
+                self._serve_script(client, data, reports=port in (PRIMARY_PORT, SECONDARY_PORT))
         for client in waiting:
             self._sessions[client].feed(b"")
         self._program.tick(held_up)
@@ -149,7 +149,7 @@ class RtdePeer:
                 session.send_state(self._view, self._tick_count, self._late)
         if self._tick_count % _REPORT_EVERY == 0:
             for client in self._listeners:
-                client.send(robot_mode(self._model, self._program.runtime_state))
+                client.send(robot_state(self._model, self._program.runtime_state))
 
     def _serve_rtde(self, client: Client, data: bytes | None) -> None:
         if data is None:

@@ -6,6 +6,7 @@ Poses come in, pictures go out; time and motion are the world's business.
 from __future__ import annotations
 
 import threading
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,13 @@ _FAR = {"scan": 0.5, "target": 3.0}
 """Beyond this distance, m, a camera has nothing to see that matters."""
 
 
+@cache
+def _seen_mesh(surface: str) -> Mesh:
+    """The surface with its box tree, which takes longer to make than all the rest of a world."""
+    made = mesh(surface)
+    return Mesh(made.vertices, made.triangles)
+
+
 class Cameras:
     """The scan camera with its laser and the target camera of one scene; safe between threads."""
 
@@ -50,8 +58,8 @@ class Cameras:
         )
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
-        made, shape = mesh(surface), named_surface(surface)
-        self._mesh = Mesh(made.vertices, made.triangles)
+        shape = named_surface(surface)
+        self._mesh = _seen_mesh(surface)
         self._mesh_radius = float(np.hypot(shape.half_x, shape.half_y)) + 0.015
         self._large = Board(*nominal.LARGE_BOARD)
         self._fine = Board(*nominal.FINE_BOARD)

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.models.camera import CameraSpec
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.models.screw import Screw
@@ -24,6 +25,7 @@ def make_arm(scene: Scene, clock: WorldClock, model: str = "UR10e") -> ArmModel:
     sigma = scene.deviations
     params = ArmParams.of(
         model,
+        dh=TABLES[model] + scene.dh_factory,
         dh_error=scene.dh_error,
         repeatability=(sigma.arm_repeatability / math.sqrt(3.0), sigma.arm_repeatability_rotation),
         force_noise=(sigma.arm_force_noise, _TORQUE_PER_FORCE * sigma.arm_force_noise),

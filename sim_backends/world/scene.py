@@ -81,6 +81,7 @@ class Scene:
     rail_periodic_amplitude: float
     rail_periodic_phase: float
     rail_backlash: float
+    dh_factory: Pose
     dh_error: Pose
     odometry_scale: float
     odometry_yaw: float
@@ -163,6 +164,7 @@ def draw(seed: int, level: str) -> Scene:
         rail_periodic_amplitude=abs(d.scalar("rail_periodic", sigma.rail_periodic)),
         rail_periodic_phase=float(stream(seed, "rail_phase").uniform(0.0, 2.0 * np.pi)),
         rail_backlash=abs(d.scalar("rail_backlash", sigma.rail_backlash)),
+        dh_factory=_dh_factory(d, sigma),
         dh_error=_dh_error(d, sigma),
         odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
         odometry_yaw=d.scalar("odometry_yaw", sigma.odometry_yaw),
@@ -193,8 +195,24 @@ def _lens(d: _Draws, name: str, sigma: Deviations, size: tuple[int, int]) -> Len
     return Lens(focal, focal * aspect, cx, cy, (float(k1), 0.5 * float(k2), float(p1), float(p2), 0.0))
 
 
+def _dh_factory(d: _Draws, sigma: Deviations) -> Pose:
+    """What the factory measured (6, 4), the controller's table less the maker's: a and d in m, alpha and offset in rad.
+
+    The last joint's a and alpha are those of the maker, as in the tables that were published. Axes 2 to 4 are almost
+    parallel: their d also hold a slide along them that cancels.
+    """
+    made = np.zeros((6, 4))
+    made[:5, 0] = d.vector("factory.a", sigma.arm_factory_length, 5)
+    made[:, 1] = d.vector("factory.d", sigma.arm_factory_length, 6)
+    made[:5, 2] = d.vector("factory.alpha", sigma.arm_factory_angle, 5)
+    made[:, 3] = d.vector("factory.offset", sigma.arm_factory_angle, 6)
+    first, second = d.vector("factory.slide", sigma.arm_factory_slide, 2)
+    made[1:4, 1] += [first, second, -first - second]
+    return made
+
+
 def _dh_error(d: _Draws, sigma: Deviations) -> Pose:
-    """Errors (6, 4) of a and d in m, alpha (exact) and joint offset in rad, one row per joint."""
+    """What the factory has left (6, 4): errors of a, d in m, alpha (exact) and joint offset in rad, a row per joint."""
     error = np.zeros((6, 4))
     error[:, 0] = d.vector("dh.a", sigma.arm_dh_length, 6)
     error[:, 1] = d.vector("dh.d", sigma.arm_dh_length, 6)

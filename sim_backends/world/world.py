@@ -113,8 +113,7 @@ class World:
         joints = self.arm.drive.q
         if not self.collisions.due(t, joints, world_from_base):
             return
-        frames = self.arm.kinematics.frames(joints)
-        points = self._solid.at(frames, self.flange_from_camera("scan", t), self.part.held)
+        points = self._solid.at(self.arm.body_frames(), self.flange_from_camera("scan", t), self.part.held)
         points = points @ world_from_base[:3, :3].T + world_from_base[:3, 3]
         if (met := self.collisions.arm(t, points, self.vehicle.world_from_vehicle(t))) is not None:
             self.arm.protective_stop(met)

@@ -1,6 +1,6 @@
 """Planted bugs: each of `planted.toml` is one change to a copy of the product, and the tests that it names must fail.
 
-Run with `pytest -m mutants --dist load`. A change that no longer applies fails as well, and so do tests that fail
+Run with `pytest -m mutants -n 2 --dist load`. A change that no longer applies fails as well, and so do tests that fail
 without any.
 """
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.rtde import RtdePeer
 
 STIFFNESS = 2e4
@@ -25,8 +26,12 @@ STIFFNESS = 2e4
 class ArmBench:
     """Starts the process; `address` is where the arm answers. To be used as a context."""
 
-    def __init__(self, *, speed: float = 1.0, table: float | None = None, model: str = "UR10e") -> None:
+    def __init__(
+        self, *, speed: float = 1.0, table: float | None = None, model: str = "UR10e", factory: np.ndarray | None = None
+    ) -> None:
+        """`factory` (6, 4) is what the controller's table is off the maker's: a, d, alpha, joint offset."""
         arguments = [str(speed), "none" if table is None else str(table), model]
+        arguments.append(json.dumps(None if factory is None else factory.tolist()))
         self.process = subprocess.Popen(
             [sys.executable, __file__, *arguments],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -67,9 +72,10 @@ def _table(height: float):
     return contact
 
 
-def _main(speed: float, table: float | None, name: str) -> None:
+def _main(speed: float, table: float | None, name: str, factory: list[list[float]] | None) -> None:
     clock = WorldClock(speed)
-    params = ArmParams.of(name, unlock_delay=0.3, force_noise=(0.2, 0.02))
+    dh = TABLES[name] + (0.0 if factory is None else np.array(factory))
+    params = ArmParams.of(name, dh=dh, unlock_delay=0.3, force_noise=(0.2, 0.02))
     model = ArmModel(params, np.random.default_rng(0), clock)
     if table is not None:
         model.contact = _table(table)
@@ -106,4 +112,6 @@ def _main(speed: float, table: float | None, name: str) -> None:
 
 
 if __name__ == "__main__":
-    _main(float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]), sys.argv[3])
+    _main(
+        float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4])
+    )

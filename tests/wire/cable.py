@@ -7,23 +7,24 @@ import select
 import socket
 import threading
 
-PORTS = (30004, 30003, 30002, 29999)
+PORTS = (30004, 30003, 30002, 30001, 29999)
 
 
 class Cable:
-    """Passes every port of the arm at `far_end` on; `address` is the near end. To be used as a context."""
+    """Passes every port of the arm at `far_end` on, `but` some; `address` is the near end. To be used as a context."""
 
-    def __init__(self, far_end: str) -> None:
+    def __init__(self, far_end: str, but: tuple[int, ...] = ()) -> None:
+        ports = [port for port in PORTS if port not in but]
         self._far_end = far_end
         self._listeners: list[socket.socket] = []
         for number in itertools.count(2):
             self.address = f"127.0.3.{number}"
             try:
-                self._listeners = [socket.create_server((self.address, port)) for port in PORTS]
+                self._listeners = [socket.create_server((self.address, port)) for port in ports]
                 break
             except OSError:
                 continue
-        self._ports = dict(zip(self._listeners, PORTS, strict=True))
+        self._ports = dict(zip(self._listeners, ports, strict=True))
         self._peers: dict[socket.socket, socket.socket] = {}
         self._in, self._over = threading.Event(), threading.Event()
         self._in.set()

@@ -469,7 +469,7 @@ def test_an_arm_of_another_model_is_refused_when_it_connects_and_nothing_moves()
     with ArmBench(model="UR5e") as bench:
         assert dashboard(bench, "get robot model") == "UR5e"
         before = bench.ask("show")["q"]
-        with pytest.raises(DeviceFault, match=r"mm and .* deg away from where the configured model") as caught:
+        with pytest.raises(DeviceFault, match=r"mm and .* mrad away from where the cell's model") as caught:
             connect(bench.address, forward=forward)
         assert caught.value.code == "arm.wrong_kinematics"
         assert not caught.value.recoverable
@@ -477,7 +477,7 @@ def test_an_arm_of_another_model_is_refused_when_it_connects_and_nothing_moves()
         assert dashboard(bench, "running") == "Program running: false"
 
 
-@pytest.mark.parametrize("error", [[0.006, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, np.radians(1.2)]])
+@pytest.mark.parametrize("error", [[60e-6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0.12e-3]])
 def test_the_model_is_compared_before_every_motion(bench, error):
     pose_error = np.zeros(6)
 

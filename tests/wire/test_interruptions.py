@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from cell.run.folder import list_runs, read_report, run_row
+from cell.run.folder import list_runs
+from cell.run.reading import read_report, run_row
 from cell.run.resumption import UnfinishedRun
 from cell.steps.stored_sweep import FILE
 from drivers.clock import Clock

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -15,7 +14,8 @@ import pytest
 from cell import Cell, RunOutcome
 from cell.devices.truth_link import ask_truth
 from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
-from cell.run.folder import is_going, list_runs, read_report
+from cell.run.folder import is_going, list_runs
+from cell.run.reading import read_report
 from cell.run.run import Run
 from drivers.clock import Clock
 from drivers.errors import InterlockError
@@ -137,8 +137,7 @@ def test_cell_abort_ends_a_calibration(tmp_path: Path) -> None:
         assert work.returncode == 1, error
         assert "cell abort" in error
         assert_safe(endpoints)
-        runs = json.loads(cell("runs", "-c", "sim.toml", "--json", folder=tmp_path).stdout)
-    assert [run["outcome"] for run in runs] == ["aborted"]
+    assert [read_report(run)["outcome"] for run in list_runs(tmp_path / "runs")] == ["aborted"]
 
 
 def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(tmp_path: Path) -> None:

@@ -6,33 +6,32 @@ with pairs of poses only gives the hand-eye.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cell.calibration.recorded.folder import RecordedFrame, poses_without_frame, read_frames, read_pose_pairs
+from cell.calibration.recorded.attach import Options, attach_poses
+from cell.calibration.recorded.conventions import check_reading
+from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
+from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import empty_result, frame_dict
+from cell.calibration.recorded.series import Series, match_series, read_series
 from cell.calibration.recorded.solution import camera_of, solve_frames
-from cell.geometry.camera import CameraModel
+from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
 
 
-@dataclass(frozen=True)
-class CameraOptions:
-    """A camera that is known already, or (`hold`) one that only the pictures may decide."""
-
-    given: CameraModel | None = None
-    hold: bool = False
-
-
-def calibrate_folder(folder: Path, spec: BoardSpec | None, camera: CameraOptions | None = None) -> dict[str, Any]:
+def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | None = None) -> dict[str, Any]:
     """Calibrate from the pictures of a folder, or from its pairs of poses when `spec` is None or there are no pictures.
 
     Keys, all lengths in mm and angles in deg unless the key says otherwise, None for what the folder does not tell:
 
-    - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `stripe_points`;
+    - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `pose_from`, `stripe`,
+      `stripe_from`;
+    - `poses`: how the flange poses were read: `source`, `reading`, `unit`, `setup`, `matched_by`, `evidence`;
+    - `unread`: `name` and `reason` of each file that was not understood;
     - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
       it), `held_out_rms_px`, `sigma_px`; `intrinsics_without_distortion`, `intrinsics_from_pictures` likewise;
     - `hand_eye`: `method`, `setup` (eye_in_hand, eye_to_hand), `translation_mm`, `rotation` (3×3),
@@ -47,31 +46,47 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, camera: CameraOptions
 
     Raises ConfigError when there is nothing to read.
     """
+    options = options or Options()
+    check_reading(options.poses)
     pairs = read_pose_pairs(folder) if folder.is_dir() else []
     if spec is None:
         if not pairs:
             raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
         return calibrate_pairs(pairs)
-    try:
-        frames = read_frames(folder, spec)
-    except ConfigError:
-        if pairs:
-            return calibrate_pairs(pairs)
-        raise
+    listing = list_folder(folder)
+    if pairs and not listing.pictures:
+        return calibrate_pairs(pairs)
+    series, links, unread = read_series(listing)
+    frames = read_frames(listing, spec, links)
     result = empty_result(spec)
-    result["notes"] += [
-        f"{name} is not used: no picture has its number" for name in poses_without_frame(folder, frames)
-    ]
-    _from_frames(frames, result, camera or CameraOptions())
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
+    _from_frames(frames, match_series(series, listing, links), options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
 
 
-def _from_frames(frames: list[RecordedFrame], result: dict[str, Any], options: CameraOptions) -> None:
+def _from_frames(
+    frames: list[RecordedFrame], series: Sequence[Series], options: Options, result: dict[str, Any]
+) -> None:
+    notes: list[str] = result["notes"]
+    found: tuple[Intrinsics, Intrinsics] | None = None
     try:
-        found = camera_of(frames, options.given)
+        found = camera_of(frames, options.camera)
     except RefusedError as error:
-        result["notes"].append(f"no intrinsics: {error}")
+        notes.append(f"no intrinsics: {error}")
+    understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
+    result["poses"] = understood.about
+    notes += understood.notes
+    if understood.refused:
+        result["refused"]["hand_eye"] = understood.refused
+    notes += [
+        f"{r.path.name if r.label is None or r.label[:1] != '[' else f'{r.path.name} {r.label}'} is not used: no "
+        "picture belongs to it"
+        for s in series
+        if s.name in (understood.about["source"] or [])
+        for r in s.alone
+    ]
+    if found is None or options.plan:
         return
-    solve_frames(frames, found, result, given=options.given, hold_camera=options.hold)
+    solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)

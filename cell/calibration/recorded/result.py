@@ -32,6 +32,8 @@ def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
     return {
         "board": None if spec is None else spec.name,
         "frames": [],
+        "poses": None,
+        "unread": [],
         "frames_rms": {},
         **dict.fromkeys(keys),
         "notes": [],
@@ -51,7 +53,9 @@ def frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
         "rms_px": rms.get(frame.name),
         "points": 0 if frame.view is None else len(frame.view.ids),
         "pose": frame.base_from_flange is not None,
+        "pose_from": frame.pose_from or None,
         "stripe": frame.profile is not None,
+        "stripe_from": frame.stripe_from or None,
         "order_assumed": frame.view is not None and frame.view.order_assumed,
     }
 

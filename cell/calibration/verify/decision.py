@@ -29,12 +29,16 @@ LEAST_PROBABILITY = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A part that may have changed: how probable among the parts, and the most probable change (27,) of the chain."""
+    """A part that may have changed: how probable among the parts, and the most probable change (27,) of the chain.
+
+    `spread` (27, k) is a root of the change's covariance.
+    """
 
     chain: str
     part: str
     probability: float
     change: Array
+    spread: Array
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,14 @@ class Verdict:
         return [kind for kind, value in self.fit.items() if value > WORST_FIT]
 
     @property
+    def changed(self) -> bool:
+        """True when a change of some part shows."""
+        return self.statistic > self.threshold
+
+    @property
     def good(self) -> bool:
         """True when nothing speaks for a change."""
-        return self.statistic <= self.threshold and not self.badly_fitting
+        return not self.changed and not self.badly_fitting
 
 
 def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> Verdict:
@@ -108,7 +117,9 @@ def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothes
         change = np.zeros(SHARED)
         held = weighed.information[np.ix_(index, index)] + np.diag(1 / np.array(h.size) ** 2)
         change[index] = np.linalg.solve(held, weighed.score[index])
-        made.append(Suspect(chain, part, float(weight[members].sum()), change))
+        spread = np.zeros((SHARED, len(index)))
+        spread[index] = np.linalg.cholesky(np.linalg.inv(held))
+        made.append(Suspect(chain, part, float(weight[members].sum()), change, spread))
     made.sort(key=lambda suspect: -suspect.probability)
     return [s for k, s in enumerate(made) if k == 0 or s.probability >= LEAST_PROBABILITY]
 

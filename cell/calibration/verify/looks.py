@@ -11,6 +11,7 @@ import pinocchio as pin
 from cell.calibration.collect.stripe_on_board import points_on_board
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.blocks import State, ViewData
+from cell.calibration.solve.joint import STRIPE_POINTS
 from cell.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.calibration.solve.starts import stripe_means
 from cell.calibration.verify.decision import Verdict, verdict
@@ -19,8 +20,8 @@ from cell.geometry.poses import from_parts
 from cell.vision.board.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
 
-SWEEP_PROFILES, STRIPE_POINTS = 24, 40
-"""Enough of a sweep, as means of neighbouring rows: neighbouring profiles share the rail's error."""
+SWEEP_PROFILES = 24
+"""Enough of a sweep: neighbouring profiles share the rail's error."""
 LEAST_PROFILES = 10
 LEAST_SWEEP_M = 0.01
 """Of rail between the first and the last profile on the board.
@@ -111,6 +112,7 @@ def _stripe(
     rows = points_on_board(state.camera, here, near.view.spec, lit.profile, near.view.dot_radius)
     if not len(rows):
         return None
+    # As fine as in the calibration: neighbouring rows share an error, so its scale holds for means of as many rows.
     stripe, sigma = stripe_means(lit.profile, rows, STRIPE_POINTS)
     data = ViewData(
         points=np.zeros((0, 3)),

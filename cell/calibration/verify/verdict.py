@@ -5,6 +5,7 @@ The decision itself is `cell.calibration.verify.decision`'s, the pictures are ta
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,108 +14,148 @@ import numpy as np
 from cell.calibration.solve.place_effect import scan_effect, target_effect
 from cell.calibration.solve.results import PARAMETERS
 from cell.calibration.store import CellCalibration
-from cell.calibration.verify.decision import FALSE_ALARMS, WORST_FIT, Suspect, Verdict
+from cell.calibration.verify.decision import WORST_FIT, Suspect, Verdict
 from cell.calibration.verify.detectability import DETECTED, Detectable
-from cell.calibration.verify.hypotheses import SHIFT, TURN
 from cell.calibration.verify.looks import CheckObservations, verify
+from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.report.html import table
 from cell.steps.camera_poses import centre_of
 from cell.vision import parse_board
 
+SHARE = 0.3
+"""Of the place's tolerance: what moves the place by less is told and not called bad. A third, with room for an estimate
+that falls a little short."""
+SURE = 0.95
+"""How sure a change's effect is below what is stated as the most."""
+_DRAWS = 100
+
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """The verdict with its expected effect on the place: `effects` in m, in the order of `verdict.suspects`."""
+    """The verdict, and what it means at the place of a job, lengths in m.
+
+    `effects` are what the suspects' changes do there, `at_most` what they do in `SURE` of cases, both in the order of
+    `verdict.suspects`. `unseen` is what a change does that just fails to show, in the order of `verdict.detectable`.
+    """
 
     verdict: Verdict
     effects: list[float]
+    at_most: list[float]
+    unseen: list[float]
+    tolerance: float
     date: str
 
     @classmethod
     def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Verification:
         """Compare what was seen with the calibration, and reckon the effect for a job."""
-        verdict = verify(calibration.scan, calibration.target, seen)
-        board = parse_board(job.board.spec)
-        camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
-        place = (camera_from_board * job.place_from_board.inverse()).translation
+        verdict, effect = verify(calibration.scan, calibration.target, seen), at_place(calibration, job)
 
-        def effect(suspect: Suspect) -> float:
-            if suspect.chain == "target":
-                return target_effect(calibration.target, suspect.change, place)
-            # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
-            half = 0.5 * job.scan.length
-            return scan_effect(calibration.scan, suspect.change, job.scan.stand_off, (-half, half))
+        def at_most(suspect: Suspect) -> float:
+            drawn = np.random.default_rng(0).normal(size=(_DRAWS, suspect.spread.shape[1])) @ suspect.spread.T
+            return float(np.quantile([effect(suspect.chain, suspect.change + step) for step in drawn], SURE))
 
-        return cls(verdict, [effect(suspect) for suspect in verdict.suspects], calibration.date)
+        unseen = [effect(d.change.chain, d.step) if np.isfinite(d.size) else np.inf for d in verdict.detectable]
+        return cls(
+            verdict,
+            [effect(suspect.chain, suspect.change) for suspect in verdict.suspects],
+            [at_most(suspect) for suspect in verdict.suspects],
+            unseen,
+            job.place.tolerance,
+            calibration.date,
+        )
 
     def __str__(self) -> str:
         return self.reason
 
     def __repr__(self) -> str:
-        return f"<Verification of the calibration of {self.date}: {'good' if self.good else 'not good any more'}>"
+        return f"<Verification of the calibration of {self.date}: {self.word}>"
 
     def _repr_html_(self) -> str:
-        odds = f"{self.verdict.statistic:.1f}, allowed {self.verdict.threshold:.1f}"
+        allowed = f"{1e3 * self.tolerance:.2f} mm"
+        rows = [("reason", self.reason), ("allowed at the place", allowed)]
         suspects = ", ".join(f"{s.part} ({s.probability:.0%})" for s in self.verdict.suspects) or "none"
-        rows = [("reason", self.reason), ("log odds of a change", odds)]
-        title = f"verification: {'good' if self.good else 'not good any more'}"
-        return table(title, rows if self.good else [*rows, ("suspected", suspects)])
+        return table(f"verification: {self.word}", [*rows, ("suspected", suspects)] if self.verdict.changed else rows)
+
+    @property
+    def hidden(self) -> float:
+        """The most that a change of one part does at the place, m, when it just fails to show."""
+        return max(self.unseen)
+
+    @property
+    def matters(self) -> bool:
+        """Whether what changed may move the place by a `SHARE` of its tolerance or more."""
+        return self.verdict.changed and max(self.at_most) >= SHARE * self.tolerance
 
     @property
     def good(self) -> bool:
-        """True when nothing speaks for a change."""
-        return self.verdict.good
+        """True when nothing speaks for a change, or for one that does too little to the place to matter."""
+        return not self.matters and not self.verdict.badly_fitting
 
     @property
-    def good_within(self) -> tuple[float, float]:
-        """The largest change in mm and in degrees that one part may have undergone unseen; infinite where any may."""
-        sizes = {unit: [d.size for d in self.verdict.detectable if d.change.unit == unit] for unit in ("m", "rad")}
-        return 1e3 * max(sizes["m"]), float(np.degrees(max(sizes["rad"])))
+    def word(self) -> str:
+        """The verdict in a word or two."""
+        if not self.good:
+            return "not good any more"
+        return "good, slightly changed" if self.verdict.changed else "good"
 
     @property
     def reason(self) -> str:
-        """The decision in words, and the next step."""
-        v = self.verdict
-        if v.good:
-            mm, degrees = self.good_within
-            text = (
-                f"the calibration of {self.date} is good within {mm:.2f} mm and {degrees:.3f}°: nothing speaks for a "
-                f"change (log odds {v.statistic:.1f}, chance reaches {v.threshold:.1f} in {FALSE_ALARMS:.0%} of "
-                f"checks), and a larger change of one part would have shown in {DETECTED:.0%} of checks"
+        """The decision in words, in mm at the place, and the next step."""
+        v, allowed = self.verdict, f"{1e3 * self.tolerance:.2f} mm"
+        if v.changed and (self.matters or not v.badly_fitting):
+            named = " or ".join(
+                f"the {s.part}{_DECK.get(s.part, '')} ({s.probability:.0%}): place off by {1e3 * effect:.2f} mm, at "
+                f"most {1e3 * most:.2f} mm"
+                for s, effect, most in zip(v.suspects, self.effects, self.at_most, strict=True)
             )
-            hidden = [f"{d.change.part}, {d.change.kind} ({_size(d)})" for d in v.detectable if not d.enough]
-            if not hidden:
-                return text
+            if self.matters:
+                return (
+                    f"the calibration of {self.date} is not good any more. Changed has {named}; allowed at the place "
+                    f"are {allowed}. Fasten what is loose, then run `cell calibrate`"
+                )
             return (
-                f"{text}; the scatter of arm and rail that the calibration found hides more than {1e3 * SHIFT:g} mm or "
-                f"{np.degrees(TURN):g}° of: {'; '.join(hidden)}"
+                f"the calibration of {self.date} is good, though something seems to have changed a little: {named}; "
+                f"allowed at the place are {allowed}. Nothing has to be done now; run `cell calibrate` when there is "
+                "time"
             )
-        if v.statistic <= v.threshold:
+        if v.badly_fitting:
             worst = "; ".join(f"{kind} {v.fit[kind]:.1f} times" for kind in v.badly_fitting)
             return (
-                f"the observations fit worse than when the calibration of {self.date} was made, and no moved part "
-                f"explains it: {worst} the residuals of then, allowed {WORST_FIT:g}; see whether the boards are clean "
-                "and flat and the lenses in focus, then run `cell calibrate`"
+                f"the calibration of {self.date} is not good any more: the pictures fit worse than when it was made, "
+                f"and no moved part explains it: {worst} the residuals of then, allowed {WORST_FIT:g}. See whether the "
+                "boards are clean and flat and the lenses in focus, then run `cell calibrate`"
             )
-        named = " or ".join(
-            f"the {s.part}{_DECK.get(s.part, '')} ({s.probability:.0%}, {1e3 * effect:.2f} mm)"
-            for s, effect in zip(v.suspects, self.effects, strict=True)
-        )
-        return (
-            f"the calibration of {self.date} is not good any more (log odds {v.statistic:.1f}, allowed "
-            f"{v.threshold:.1f}): suspected is {named}, in brackets its probability and the place error to expect; "
-            "fasten what is loose, then run `cell calibrate`"
-        )
+        text = f"the calibration of {self.date} is good: nothing has changed that shows"
+        if np.isfinite(self.hidden):
+            text += (
+                f", and what moves the place by more than {1e3 * self.hidden:.2f} mm would have shown in "
+                f"{DETECTED:.0%} of checks like this one (allowed at the place are {allowed})"
+            )
+        hiding = [
+            f"{d.change.part}, {d.change.kind} ({_size(d)}, {1e3 * effect:.2f} mm at the place)"
+            for d, effect in zip(v.detectable, self.unseen, strict=True)
+            if effect >= SHARE * self.tolerance
+        ]
+        if not hiding:
+            return f"{text}. Go on working"
+        return f"{text}. Go on working, but know what could do that unseen: {'; '.join(hiding)}"
 
     def summary(self) -> dict[str, Any]:
         """For reports, units in the names."""
         v = self.verdict
         return {
-            "good": v.good,
+            "good": self.good,
+            "verdict": self.word,
             "reason": self.reason,
             "calibration_date": self.date,
+            "place": {
+                "allowed_mm": round(1e3 * self.tolerance, 4),
+                "error_mm": round(1e3 * max(self.effects), 4) if v.changed else None,
+                "error_at_most_mm": round(1e3 * max(self.at_most), 4) if v.changed else None,
+                "shows_from_mm": round(1e3 * self.hidden, 4) if np.isfinite(self.hidden) else None,
+            },
             "log_odds": round(v.statistic, 3),
             "log_odds_allowed": round(v.threshold, 3),
             "residuals_over_calibration": {kind: round(value, 3) for kind, value in v.fit.items()},
@@ -125,10 +166,11 @@ class Verification:
                     "probability": round(s.probability, 3),
                     "change": _named(s.change),
                     "place_error_mm": round(1e3 * effect, 4),
+                    "place_error_at_most_mm": round(1e3 * most, 4),
                 }
-                for s, effect in zip(v.suspects, self.effects, strict=True)
+                for s, effect, most in zip(v.suspects, self.effects, self.at_most, strict=True)
             ]
-            if not v.good
+            if v.changed
             else [],
             "detectable_share": DETECTED,
             "detectable": [
@@ -148,6 +190,22 @@ class Verification:
         }
 
 
+def at_place(calibration: CellCalibration, job: Job) -> Callable[[str, Array], float]:
+    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m."""
+    board = parse_board(job.board.spec)
+    camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
+    place = (camera_from_board * job.place_from_board.inverse()).translation
+
+    def effect(chain: str, change: Array) -> float:
+        if chain == "target":
+            return target_effect(calibration.target, change, place)
+        # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
+        half = 0.5 * job.scan.length
+        return scan_effect(calibration.scan, change, job.scan.stand_off, (-half, half))
+
+    return effect
+
+
 _DECK = {
     "scan camera's mount on the flange": ", or the fine board on the deck",
     "target camera's mount on the flange": ", or the large board on the deck",
@@ -163,6 +221,8 @@ def _shown(size: float, unit: str) -> float:
 
 
 def _size(d: Detectable) -> str:
+    if not np.isfinite(d.size):
+        return "of any size"
     shown = f"{_shown(d.size, d.change.unit):.3f}"
     return f"up to {shown} mm{d.change.where}" if d.change.unit == "m" else f"up to {shown}°"
 

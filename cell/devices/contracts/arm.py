@@ -7,7 +7,7 @@ import pytest
 
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
-from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Arm, ArmSafety, Vector
 
 TURN_RAD, SPEED, ACCELERATION = 0.2, 0.2, 0.8
@@ -126,6 +126,51 @@ class ArmContract(DeviceContract):
         times = [state.device_time for state in states]
         assert len(times) >= 5
         assert times == sorted(times)
+
+    def test_a_fault_on_the_way_is_told_by_its_code_and_a_person_ends_it(self, bench: Bench[Arm]) -> None:
+        """Nothing moves then, a stop changes nothing, and `recover` wants a person's word."""
+        arm, way, code = bench.device, TURN_RAD * bench.motion, "arm.protective_stop"
+        start = arm.state().joints
+        with bench.faulty() as faults:
+            motion = arm.move_joints(turned(start, way), 0.25 * SPEED * bench.motion, ACCELERATION)
+            bench.clock.sleep(1.0)
+            faults.cause(code)
+            with pytest.raises(DeviceFault) as met:
+                motion.wait(PATIENCE_S)
+            assert (met.value.code, met.value.recoverable) == (code, True)
+            arm.stop()
+            arm.stop()
+            stood = arm.state()
+            assert stood.safety is ArmSafety.PROTECTIVE_STOP
+            assert not stood.moving
+            for begin in (lambda: arm.move_joints(start, SPEED, ACCELERATION), arm.recover):
+                with pytest.raises(DeviceFault) as again:
+                    begin()
+                assert again.value.code == code
+            assert arm.state().joints == pytest.approx(stood.joints, abs=1e-3)
+            arm.recover(confirmed=True)
+        arm.move_joints(start, SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        assert arm.state().safety is ArmSafety.NORMAL
+        assert arm.state().joints == pytest.approx(start, abs=2e-3)
+
+    def test_an_end_after_a_fault_leaves_nothing_going_on(self, bench: Bench[Arm]) -> None:
+        """Connected anew, it stands where it stood, and says what is the matter."""
+        arm = bench.device
+        start = arm.state().joints
+        with bench.faulty() as faults:
+            arm.move_joints(turned(start, TURN_RAD * bench.motion), 0.25 * SPEED * bench.motion, ACCELERATION)
+            bench.clock.sleep(1.0)
+            faults.cause("arm.protective_stop")
+            bench.over()
+            bench.clock.sleep(1.0)
+            faults.clear()
+            arm = bench.device
+            stood = arm.state().joints
+            bench.clock.sleep(1.0)
+            assert arm.state().joints == pytest.approx(stood, abs=1e-3)
+            assert not arm.state().moving
+        arm.recover(confirmed=True)
+        arm.move_joints(start, SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
 
     def test_recovering_an_arm_that_is_well_leaves_it_ready(self, bench: Bench[Arm]) -> None:
         """It moves afterwards."""

@@ -7,7 +7,7 @@ import pytest
 
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
-from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Rail
 
 FAR_M, SPEED = 0.03, 0.02
@@ -101,6 +101,26 @@ class RailContract(DeviceContract):
             motion.wait(0.5)
         self.stands(bench)
         rail.move_to(0.0).wait(PATIENCE_S)
+
+    def test_a_reset_on_the_way_is_told_by_its_code_and_homing_ends_it(self, bench: Bench[Rail]) -> None:
+        """Its zero is lost: until it was homed, it goes nowhere; a stop changes nothing."""
+        rail = self.homed(bench)
+        with bench.faulty() as faults:
+            motion = rail.move_to(FAR_M * bench.motion, 0.2 * SPEED * bench.motion)
+            bench.clock.sleep(0.5)
+            faults.cause("rail.reset")
+            with pytest.raises(DeviceFault) as met:
+                motion.wait(PATIENCE_S)
+            assert (met.value.code, met.value.recoverable) == ("rail.reset", True)
+            rail.stop()
+            rail.stop()
+            assert not rail.state().moving
+            assert not rail.state().homed
+            with pytest.raises(InterlockError):
+                rail.move_to(0.0)
+        rail.home().wait(PATIENCE_S)
+        rail.move_to(FAR_M * bench.motion).wait(PATIENCE_S)
+        assert rail.state().position == pytest.approx(FAR_M * bench.motion, abs=EXACT_M)
 
     def test_time_stamps_are_of_the_host_when_the_position_held(self, bench: Bench[Rail]) -> None:
         """Between the question and the answer, and never backwards."""

@@ -37,6 +37,18 @@ class LaserContract(DeviceContract):
                 pass
             assert shines(laser)
 
+    def test_it_goes_out_although_its_arm_has_a_fault(self, bench: Bench[Laser]) -> None:
+        """At the end of its context, by a stop, and again by the next."""
+        laser = bench.device
+        with bench.faulty() as faults:
+            with laser.lit():
+                faults.cause("arm.protective_stop")
+                bench.clock.sleep(0.5)
+            assert not shines(laser)
+            laser.stop()
+            laser.stop()
+            assert not shines(laser)
+
     def test_a_stop_puts_it_out_whoever_has_it(self, bench: Bench[Laser]) -> None:
         """And it can be lit again."""
         laser = bench.device

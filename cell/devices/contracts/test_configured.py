@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from cell.devices.contracts.camera import CameraContract
 from cell.devices.contracts.rail import RailContract
 from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
-from cell.run.folder import CellLock
+from cell.devices.truth_link import cause_fault, clear_faults
+from cell.run.lock import CellLock
 from drivers.clock import Clock
+from drivers.interfaces import Arm
 
 pytestmark = pytest.mark.skipif(
     "CELL_CONTRACTS" not in os.environ, reason="CELL_CONTRACTS names no configuration: no device is touched"
@@ -35,6 +38,24 @@ def configured() -> Iterator[CellConfig]:
         yield config
 
 
+@dataclass(frozen=True)
+class ServedFaults:
+    """The faults of a served simulated cell, through its truth endpoint; `arm` is what the device hangs on, if any."""
+
+    address: str
+    arm: Arm | None
+
+    def cause(self, name: str) -> None:
+        """Cause one."""
+        cause_fault(self.address, name)
+
+    def clear(self) -> None:
+        """Take them all away."""
+        clear_faults(self.address)
+        if self.arm is not None:
+            self.arm.recover(confirmed=True)
+
+
 def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
     """The bench of one device; what hangs on the arm brings the arm with it."""
     clock = Clock(config.cell.time_scale)
@@ -45,7 +66,8 @@ def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
             over.callback(arm.close)
         motion = float(os.environ.get("CELL_CONTRACTS_MOTION", "0.2"))
         linked = not config.make(name).on_arm
-        bench = Bench(lambda: connect_one(config, name, clock, arm=arm), clock, motion, linked)
+        faults = ServedFaults(config.cell.truth, arm) if config.cell.truth else None
+        bench = Bench(lambda: connect_one(config, name, clock, arm=arm), clock, motion, linked, faults)
         over.callback(bench.over)
         yield bench
 

@@ -8,7 +8,7 @@ import pytest
 
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
-from drivers.errors import InterlockError, LimitError
+from drivers.errors import DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Vehicle
 
 SPEED, TIME_S, PERIOD_S = 0.1, 2.0, 0.05
@@ -90,6 +90,48 @@ class VehicleContract(DeviceContract):
         assert abs(vehicle.state(1.0).speed) < 0.01
         self.drive(bench, -SPEED * bench.motion, 0.5)
         vehicle.brake()
+
+    @pytest.mark.parametrize("code", ["vehicle.emergency_stop", "vehicle.motor_fault"])
+    def test_a_fault_on_the_way_stands_it_still_and_is_told(self, bench: Bench[Vehicle], code: str) -> None:
+        """By every command and `check`, until its cause is gone and it was recovered; a stop changes nothing."""
+        vehicle = bench.device
+        vehicle.enable()
+        self.drive(bench, SPEED * bench.motion, 0.5)
+        with bench.faulty() as faults:
+            faults.cause(code)
+            with pytest.raises(DeviceFault) as met:
+                self.drive(bench, SPEED * bench.motion, 3.0)
+            told = met.value.code
+            assert told.startswith("vehicle.")
+            vehicle.stop()
+            vehicle.stop()
+            assert abs(vehicle.state(1.0).speed) < 0.01
+            with pytest.raises(DeviceFault, match=told):
+                vehicle.check()
+            assert vehicle.state(1.0).emergency_stop == (code == "vehicle.emergency_stop")
+        vehicle.recover()
+        vehicle.check()
+        assert vehicle.state(1.0).braked
+        vehicle.enable()
+        self.drive(bench, -SPEED * bench.motion, 0.5)
+        vehicle.brake()
+
+    def test_an_end_after_a_fault_leaves_it_standing(self, bench: Bench[Vehicle]) -> None:
+        """Connected anew, it stands, and is well once what caused the fault is gone."""
+        vehicle = bench.device
+        vehicle.enable()
+        self.drive(bench, SPEED * bench.motion, 0.5)
+        with bench.faulty() as faults:
+            faults.cause("vehicle.emergency_stop")
+            bench.over()
+            bench.clock.sleep(1.0)
+            here = self.here(bench)
+            bench.clock.sleep(0.5)
+            assert self.gone(bench, here) < 1e-3
+        bench.device.recover()
+        bench.device.enable()
+        self.drive(bench, -SPEED * bench.motion, 0.5)
+        bench.device.brake()
 
     def test_a_state_is_fresh_and_a_sound_vehicle_has_no_fault(self, bench: Bench[Vehicle]) -> None:
         """Stamped with the host's time; `recover` locks the brake."""

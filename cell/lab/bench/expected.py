@@ -31,6 +31,7 @@ from cell.report.bound import part_points
 from cell.steps.sweep_record import SweepRecord
 from drivers.interfaces import Vector
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+from sim_backends.world.scene import draw
 
 POINTS = 1500
 _STEP = 1e-6
@@ -63,7 +64,7 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     cloud: Cloud = record.results["reconstruct"].cloud
     sweep: SweepRecord = record.results["laser_sweep"]
     pose = record.results["invert_pose"]
-    kinematics = _Kinematics(record.rests)
+    kinematics = _Kinematics(record.rests, UR10E_DH + draw(record.seed, record.level).dh_factory)
     shared, by_kinematics = _calibration(record, config, noise, kinematics)
     rest = np.diag([noise["arm_repeatability"] ** 2 / 3] * 3 + [noise["arm_repeatability_rotation"] ** 2] * 3)
     head = _Head(record, cloud, [rest] * len(sweep.swaths), nominal, pose.base_from_surface)
@@ -102,9 +103,10 @@ def mean_distance(covariances: Vector) -> float:
 class _Kinematics:
     """How the flange moves with the 18 lengths and zeros of the arm's table, at the postures that it rested in."""
 
-    def __init__(self, rests: Vector) -> None:
+    def __init__(self, rests: Vector, told: Vector) -> None:
         self._rests = rests
-        self._nominal = Kinematics(UR10E_DH)
+        self._table = told
+        self._nominal = Kinematics(told)
         self._flanges = np.array([self._nominal.forward(q) for q in rests])
 
     def shifts(self, base_from_flange: pin.SE3) -> Vector:
@@ -117,7 +119,7 @@ class _Kinematics:
         at = self._nominal.forward(joints)
         columns = []
         for column, row in [(c, r) for c in (0, 1, 3) for r in range(6)]:
-            table = UR10E_DH.copy()
+            table = self._table.copy()
             table[row, column] += _STEP
             moved = Kinematics(table).forward(joints)
             turn = pin.log3(moved[:3, :3] @ at[:3, :3].T)

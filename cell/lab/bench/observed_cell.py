@@ -17,11 +17,13 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from cell.config import CellConfig
 from cell.geometry.poses import from_matrix
-from cell.motion.kinematics import ArmKinematics, Joints
+from cell.motion.arm_models import arm_kinematics
+from cell.motion.kinematics import Joints
 from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
 from cell.steps.moves import HOME
 from cell.vision import BoardSpec, BoardView, parse_board
 from cell.vision.stripe.extract import StripeProfile
+from drivers.link_table import LinkTable
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.world import nominal
@@ -98,8 +100,10 @@ class ObservedCell:
 
     def __post_init__(self) -> None:
         self.truth = Truth.of(self.scene)
-        self._nominal = ArmKinematics()
-        self._true = Kinematics(UR10E_DH + self.scene.dh_error)
+        told = UR10E_DH + self.scene.dh_factory
+        a, d, alpha, theta = (tuple(column) for column in told.T.tolist())
+        self._told = arm_kinematics("UR10e", LinkTable(theta, a, d, alpha))
+        self._true = Kinematics(told + self.scene.dh_error)
         self._joints: Joints = HOME
         self.fine = parse_board(self.config.calibration.fine.board)
         self.large = parse_board(self.config.calibration.large.board)
@@ -108,13 +112,13 @@ class ObservedCell:
 
     def move(self, base_from_flange: Array) -> Rest:
         """Bring the arm to rest at a pose (4, 4): what it reports, and where it truly came to rest."""
-        self._joints = self._nominal.ik(from_matrix(base_from_flange), self._joints)
+        self._joints = self._told.ik(from_matrix(base_from_flange), self._joints)
         sigma = self.scene.deviations
         drawn = self.rng.normal(size=6)
         true = self._true.forward(self._joints)
         true[:3, 3] += sigma.arm_repeatability / np.sqrt(3.0) * drawn[:3]
         true[:3, :3] = rotation(sigma.arm_repeatability_rotation * drawn[3:]) @ true[:3, :3]
-        return Rest(self._nominal.fk(self._joints).homogeneous, true)
+        return Rest(self._told.fk(self._joints).homogeneous, true)
 
     def carriage(self, reading: float) -> float:
         """Where the carriage stands for a rail reading, both in m: backlash from either side, periodic error, homing.

@@ -108,12 +108,13 @@ def own_base(record: JobRecord) -> pin.SE3:
     """
     assert record.rests is not None
     pose = record.results.get("place")
-    table = draw(record.seed, record.level).dh_error
-    flanges = np.array([Kinematics(UR10E_DH).forward(q) for q in record.rests])
+    scene = draw(record.seed, record.level)
+    told = UR10E_DH + scene.dh_factory
+    flanges = np.array([Kinematics(told).forward(q) for q in record.rests])
     wanted = (pose if pose is not None else record.results["laser_sweep"]).base_from_flange.homogeneous
     away = np.abs(flanges - wanted).reshape(len(flanges), -1).max(axis=1)
     nearest = int(np.argmin(away))
-    true = Kinematics(UR10E_DH + table).forward(record.rests[nearest])
+    true = Kinematics(told + scene.dh_error).forward(record.rests[nearest])
     return from_matrix(flanges[nearest]) * from_matrix(true).inverse()
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.sessions import arm_table
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
 from cell.devices.direct import VirtualCell
@@ -156,7 +157,7 @@ class _WholeJob:
         tell(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
-        return CellCalibration.solve(scan, target, identities, self.config)
+        return CellCalibration.solve(scan, target, identities, self.config, arm_table(self.config, self.cell.devices))
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""

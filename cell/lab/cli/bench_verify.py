@@ -55,13 +55,19 @@ def verify(
     console = Console()
     console.print(table)
     promised = Table(title="changes as large as the verification says it finds in 95 % of checks")
-    for k, name in enumerate(("part", "change", "mean", "largest", "wanted", "unit", "checks", "found %")):
+    for k, name in enumerate(
+        ("part", "change", "mean", "largest", "wanted", "unit", "checks", "found %", "bad at a third %")
+    ):
         promised.add_column(name, justify="right" if k > 1 else "left")
     for row in summary["detectable"]:
         promised.add_row(*(str(value) for value in row.values()))
     console.print(promised)
     console.print(f"found of changes of this size: {summary['found_at_detectable_percent']:g} %")
     console.print(
+        f"called bad where the place is off by a third of its tolerance: {summary['bad_at_a_third_percent']:g} %"
+    )
+    console.print(
         f"false alarms: {summary['false_alarm_percent']:g} % of {summary['checks_of_good']} checks of good "
-        f"calibrations, {CHECKS_OF_A_GOOD_ONE} per world"
+        f"calibrations, {CHECKS_OF_A_GOOD_ONE} per world, in {summary['calibrations_with_a_false_alarm']} of {seeds} "
+        f"worlds; a change was seen in {summary['change_seen_percent']:g} %"
     )

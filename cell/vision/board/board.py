@@ -20,6 +20,7 @@ from cell.vision.board.chess import find_chessboard
 from cell.vision.board.dot_board import find_dots
 from cell.vision.board.outliers import without_outliers
 from cell.vision.board.spec import DOTS, BoardSpec
+from cell.vision.board.tags import find_tags
 from cell.vision.board.view import BoardView
 from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
 
@@ -59,6 +60,8 @@ def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = Non
     check_picture(image, size)
     if spec.kind in DOTS:
         return without_outliers(find_dots(image, spec))
+    if spec.kind == "aprilgrid":
+        return without_outliers(find_tags(image, spec))
     found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
     return without_outliers(found)
 

@@ -24,6 +24,16 @@ LEAST_MARKERS = 3
 # Markers that agree with one another but not with the board found, or that it does not have: a second board.
 MOST_FOREIGN = 2
 TOLERANCE = 0.2
+# Each kind of marker with its smaller sets first: a smaller one is the likelier name for what both can read.
+DICTIONARIES = (
+    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+    "DICT_ARUCO_MIP_36h12",
+)
 
 
 def find_charuco(image: Image, spec: BoardSpec) -> BoardView:
@@ -46,9 +56,32 @@ def find_charuco(image: Image, spec: BoardSpec) -> BoardView:
             return _view(image, spec, plane, legacy)
     raise PictureRefused(
         Reason.NO_BOARD,
-        f"{most} markers of {spec.name} were read, at least {LEAST_MARKERS} that fit together are needed: is the "
-        "marker dictionary right, and the board in focus?",
+        f"{most} markers of {spec.name} were read, at least {LEAST_MARKERS} that fit together are needed: "
+        + _why(image, spec, most),
     )
+
+
+def _why(image: Image, spec: BoardSpec, most: int) -> str:
+    """What else the picture shows: markers of another dictionary, or of another layout."""
+    picture = next(_variants(image))
+    if most >= LEAST_MARKERS:
+        _, ids = _markers(picture, spec)
+        return f"those read have ids up to {ids.max()} and do not lie as on this board; are its columns and rows right?"
+    best, name = best_dictionary(picture)
+    if best >= LEAST_MARKERS:
+        return f"there are {best} markers of {name}; name the board with :{name} at its end"
+    return "no dictionary that is known has more of them; is the board in focus, and large enough in the picture?"
+
+
+def best_dictionary(image: Image) -> tuple[int, str]:
+    """The dictionary of which most markers can be read, of equals the smallest, and how many."""
+    best, name = 0, ""
+    for candidate in DICTIONARIES:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, candidate))
+        corners, _, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+        if len(corners) > best:
+            best, name = len(corners), candidate
+    return best, name
 
 
 def _variants(image: Image) -> Iterator[Image]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from cell.geometry.camera import Array
 from cell.vision.board.corner_fit import fit_corners
 from cell.vision.board.corners import Corners, corner_lattices, find_corners
-from cell.vision.board.ends import check_chess_ends
+from cell.vision.board.ends import check_chess_ends, grey
 from cell.vision.board.identify import Places, by_outline
 from cell.vision.board.plane_map import PlaneMap
 from cell.vision.board.spec import BoardSpec
@@ -24,6 +24,8 @@ LEAST_CORNERS = 6
 LEAST_SHARE = 0.5
 LEAST_SIGMA_PX = 0.0025
 LEAST_COLOURS = 0.85
+# Of the places of a next row; clutter may look like a corner here and there.
+MOST_BEYOND = 0.4
 # The picture is searched at half its size first, where noise and blur are less.
 SCALES = (0.5, 1.0, 0.25)
 # A laser line is thinner than this and longer than this share of the picture.
@@ -75,7 +77,7 @@ def _view(
     even = order[known].sum(axis=1) % 2 == 0
     first_is_dark = bool((dark_first == even).mean() > 0.5)
     dark = np.asarray((lattice.sum(axis=1) % 2 == 0) == first_is_dark, dtype=np.bool_)
-    measured, sigma, _ = fit_corners(image, starts, plane.steps(flat), dark)
+    measured, sigma, contrast = fit_corners(image, starts, plane.steps(flat), dark)
     good = np.isfinite(sigma)
     if lit.any():
         good &= ~_near(lit, starts, 5)
@@ -83,10 +85,35 @@ def _view(
         raise PictureRefused(
             Reason.NO_BOARD, f"only {good.sum()} of the {len(lattice)} corners of {spec.name} could be measured"
         )
-    check_chess_ends(image, spec, PlaneMap.fit(flat[good], measured[good], 3.0, spec.name))
+    seen = PlaneMap.fit(flat[good], measured[good], 3.0, spec.name)
+    _check_none_beyond(image, spec, seen, 0.4 * float(np.median(contrast[good])))
+    check_chess_ends(image, spec, seen)
     ids = np.flatnonzero(good)
     size = (image.shape[1], image.shape[0])
     return BoardView(spec, size, ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX), spec.symmetric)
+
+
+def _check_none_beyond(image: Image, spec: BoardSpec, plane: PlaneMap, contrast: float) -> None:
+    """Refuse a larger board: one with crossings of at least `contrast` DN where the next row or column would be."""
+    cols, rows = spec.grid
+    i, j = np.arange(cols, dtype=np.float64), np.arange(rows, dtype=np.float64)
+    quarters = 0.25 * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
+    for name, x, y in (
+        ("first row", i, np.full(cols, -1.0)),
+        ("last row", i, np.full(cols, float(rows))),
+        ("first column", np.full(rows, -1.0), j),
+        ("last column", np.full(rows, float(cols)), j),
+    ):
+        places = np.column_stack([x, y])
+        around = grey(image, plane.pixels((places[:, None, :] + quarters).reshape(-1, 2))).reshape(-1, 4)
+        one, other = around[:, :2], around[:, 2:]
+        step = np.maximum(one.min(axis=1) - other.max(axis=1), other.min(axis=1) - one.max(axis=1))
+        there = int((step > contrast).sum())
+        if there >= max(2, MOST_BEYOND * len(places)):
+            raise PictureRefused(
+                Reason.NO_BOARD,
+                f"{there} more corners follow beyond the {name} of {spec.name}; is it the board that the set-up names?",
+            )
 
 
 def _extended(corners: Corners, index: NDArray[np.intp], places: Places, name: str) -> tuple[NDArray[np.intp], Places]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
@@ -19,6 +20,12 @@ LEAST_ENDS = 0.3
 MOST_BEYOND = 2
 # What is brighter than this share of the step from black to white beside it is the sheet, not a cover.
 AS_WHITE = 0.85
+# Where a chessboard's end is looked for, in pitches beyond the outermost corners: the first place lies in a square
+# that may be only half as wide as the others. Over so many places the two columns are alike only beyond the squares.
+# A margin is darker than the white by at most this share of the contrast.
+OUTWARD = np.array([0.25, *np.arange(0.45, 1.5, 0.05)])
+FLAT = 5
+MARGIN_SHORT = 0.25
 
 
 def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], radius: float) -> None:
@@ -110,7 +117,10 @@ def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: ND
 
 
 def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
-    """Refuse unless the pattern of squares stops one square beyond the outermost corners, on every side."""
+    """Refuse unless the pattern of squares stops one square beyond the outermost corners, on every side.
+
+    The outermost squares may be narrower than the others, and the white margin beyond them as narrow as it likes.
+    """
     smooth = np.asarray(cv2.GaussianBlur(image, (5, 5), 0), dtype=np.uint8)
     cols, rows = spec.grid
     for name, start, along, out, count in (
@@ -121,14 +131,22 @@ def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
     ):
         k = np.arange(count + 1)[:, None] - 0.5
         line = np.array(start) + k * np.array(along)
-        inner, outer = (grey(smooth, plane.pixels(line + share * np.array(out))) for share in (0.5, 1.3))
-        difference, further = np.diff(inner), np.diff(outer)
+        at = np.array([grey(smooth, plane.pixels(line + share * np.array(out))) for share in OUTWARD])
+        inner, differences = at[0], np.diff(at, axis=1)
+        difference = differences[0]
         typical = float(np.nanmedian(np.abs(difference)))
         seen = np.abs(difference) > max(3.0, 0.4 * typical)
         seen[1:] &= np.sign(difference[1:]) != np.sign(difference[:-1])
-        share = -further / np.where(difference == 0, 1.0, difference)
-        goes_on = int((seen & (share > 0.5)).sum())
-        ends = int((seen & (np.abs(share) < 0.3)).sum())
+        # 1 where the last squares are, −1 where squares follow, 0 where neither column is told from the other.
+        share = differences / np.where(difference == 0, 1.0, difference)
+        # Beyond the last square both a black and a white one are followed by white. Where the squares go on never.
+        white = np.maximum(inner[1:], inner[:-1]) - MARGIN_SHORT * np.abs(difference)
+        margin = (np.minimum(at[1:, 1:], at[1:, :-1]) > white).any(axis=0)
+        same = sliding_window_view(np.abs(share) < 0.3, FLAT, axis=0).all(axis=-1).any(axis=0)
+        follows = (share[(OUTWARD > 0.72) & (OUTWARD < 0.88)] > 0.5).all(axis=0)
+        follows &= (share[(OUTWARD > 1.18)] < -0.5).all(axis=0)
+        goes_on = int((seen & ~margin & ~same & follows).sum())
+        ends = int((seen & (margin | same)).sum())
         if goes_on > max(1, ends):
             raise PictureRefused(
                 Reason.NO_BOARD,

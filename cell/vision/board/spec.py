@@ -1,4 +1,4 @@
-"""The four kinds of calibration boards and their names, such as `marked_dots:9x7:20mm` or `charuco:8x6:15mm`.
+"""The kinds of calibration boards and their names, such as `marked_dots:9x7:20mm` or `charuco:8x6:15mm`.
 
 Board frame: origin at the first dot or inner corner, x along a row, y down the rows, z into the board.
 """
@@ -15,22 +15,26 @@ import numpy as np
 from cell.geometry.camera import Array
 from drivers.errors import ConfigError
 
-Kind = Literal["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco"]
-KINDS: tuple[Kind, ...] = ("marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco")
+Kind = Literal["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco", "aprilgrid"]
+KINDS: tuple[Kind, ...] = ("marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco", "aprilgrid")
 DOTS: tuple[Kind, ...] = ("marked_dots", "asymmetric_dots", "dots")
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "in": 25.4e-3}
 FORM = "a board is named KIND:COLSxROWS:PITCH with the unit, such as chessboard:7x6:10mm"
-MARKER_SHARE = 0.7
-DEFAULT_DICTIONARY = "DICT_5X5_100"
+# Markers are named by their side and dictionary behind the pitch.
+MARKED: tuple[Kind, ...] = ("charuco", "aprilgrid")
+# Tags are 1/1.3 of their pitch where nothing is said, the usual gap of 0.3 tags between them.
+MARKER_SHARE = {"charuco": 0.7, "aprilgrid": 1 / 1.3}
+DEFAULT_DICTIONARY = {"charuco": "DICT_5X5_100", "aprilgrid": "DICT_APRILTAG_36h11"}
 
 
 @dataclass(frozen=True)
 class BoardSpec:
-    """A board: kind, columns and rows of its dots (inner corners; for ChArUco squares) and their pitch in m.
+    """A board: kind, columns and rows of its dots (inner corners; for ChArUco squares, else tags) and their pitch in m.
 
     `asymmetric_dots` follow OpenCV: dot (i, j) lies at ((2i + j mod 2)·pitch, j·pitch). `marked_dots` have a diameter
-    of half a pitch and three rings, at (c, r), (c+2, r), (c, r+1) with c = (cols−1)//2, r = (rows−1)//2.
+    of half a pitch and three rings, at (c, r), (c+2, r), (c, r+1) with c = (cols−1)//2, r = (rows−1)//2. An `aprilgrid`
+    has tags of side `marker`, a pitch apart; its points are each tag's corners, clockwise from the upper left.
     """
 
     kind: Kind
@@ -38,23 +42,32 @@ class BoardSpec:
     rows: int
     pitch: float
     marker: float = 0.0
-    dictionary: str = DEFAULT_DICTIONARY
+    dictionary: str = "DICT_5X5_100"
 
     @property
     def name(self) -> str:
         """The board's name as `parse_board` reads it."""
         name = f"{self.kind}:{self.cols}x{self.rows}:{self.pitch * 1e3:g}mm"
-        if self.kind == "charuco":
+        if self.kind in MARKED:
             name += f":{self.marker * 1e3:g}mm:{self.dictionary}"
         return name
 
     @property
     def grid(self) -> tuple[int, int]:
         """Columns and rows of the points that are measured."""
+        if self.kind == "aprilgrid":
+            return (2 * self.cols, 2 * self.rows)
         return (self.cols - 1, self.rows - 1) if self.kind == "charuco" else (self.cols, self.rows)
 
     def lattice(self) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-        """Places (n, 2) of the points in whole pitches, rows one after the other: their order is the points' id."""
+        """Places (n, 2) of the points in whole pitches, rows one after the other: their order is the points' id.
+
+        Of tags, four corners each, even places are their upper and left sides.
+        """
+        if self.kind == "aprilgrid":
+            row, column = np.divmod(np.arange(self.cols * self.rows), self.cols)
+            tag = 2 * np.column_stack([column, row])
+            return np.asarray((tag[:, None, :] + [[0, 0], [1, 0], [1, 1], [0, 1]]).reshape(-1, 2), dtype=np.intp)
         cols, rows = self.grid
         j, i = np.divmod(np.arange(cols * rows), cols)
         x = 2 * i + j % 2 if self.kind == "asymmetric_dots" else i
@@ -63,6 +76,9 @@ class BoardSpec:
     def points(self) -> Array:
         """The points (n, 3) in the board frame in m, in the order of `lattice`."""
         flat = self.lattice() * self.pitch
+        if self.kind == "aprilgrid":
+            whole, corner = np.divmod(self.lattice(), 2)
+            flat = whole * self.pitch + corner * self.marker
         return np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
 
     @property
@@ -104,24 +120,26 @@ def parse_board(text: str) -> BoardSpec:
     if size is None:
         raise ConfigError(f"board {text!r}: {parts[1]!r} is no number of columns x rows: {FORM}")
     cols, rows = int(size[1]), int(size[2])
-    least = {"marked_dots": (4, 3), "charuco": (3, 3)}.get(kind, (3, 2))
+    least = {"marked_dots": (4, 3), "charuco": (3, 3), "aprilgrid": (2, 2)}.get(kind, (3, 2))
     if not (least[0] <= cols <= 100 and least[1] <= rows <= 100):
         raise ConfigError(f"board {text!r}: {kind} needs {least[0]}x{least[1]} to 100x100, not {cols}x{rows}")
     pitch = _length(text, parts[2], "pitch")
-    if kind != "charuco":
+    if kind not in MARKED:
         if len(parts) > 3:
             raise ConfigError(f"board {text!r}: nothing may follow the pitch of a {kind} board: {FORM}")
         return BoardSpec(kind, cols, rows, pitch)
-    marker, dictionary = MARKER_SHARE * pitch, DEFAULT_DICTIONARY
+    marker, dictionary = MARKER_SHARE[kind] * pitch, DEFAULT_DICTIONARY[kind]
     for part in parts[3:]:
         if part.startswith("DICT_"):
             dictionary = part
         else:
             marker = _length(text, part, "marker size")
     if not hasattr(cv2.aruco, dictionary):
-        raise ConfigError(f"board {text!r}: unknown marker dictionary {dictionary!r}, for example {DEFAULT_DICTIONARY}")
+        raise ConfigError(
+            f"board {text!r}: unknown marker dictionary {dictionary!r}, for example {DEFAULT_DICTIONARY[kind]}"
+        )
     if not marker < pitch:
-        raise ConfigError(f"board {text!r}: the marker ({marker * 1e3:g} mm) must be smaller than its square")
+        raise ConfigError(f"board {text!r}: the marker ({marker * 1e3:g} mm) must be smaller than its pitch")
     return BoardSpec(kind, cols, rows, pitch, marker, dictionary)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -39,7 +40,8 @@ class StripeStream:
             self._like = None
         profile = extract(image, self._dark, self._axis, self._settings, like=self._like)
         # A block's first picture that shows too few lines, such as a covered one, says nothing of the others.
-        self._like = profile if profile.speckle is not None else None
+        told = profile.speckle is not None or profile.learned is not None
+        self._like = profile if told else replace(profile, noise=None)
         self._seen += 1
         return profile
 

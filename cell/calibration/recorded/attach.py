@@ -1,0 +1,145 @@
+"""Give each recorded frame its flange pose: find the poses, decide how to read them, and say what was understood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cell.calibration.recorded.conventions import why_not
+from cell.calibration.recorded.decide import Decision, decide, scale_problem, scaled
+from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.series import Series
+from cell.geometry.camera import CameraModel
+from cell.vision.board.board import board_pose
+from cell.vision.pictures import PictureRefused, Reason
+from drivers.errors import ConfigError, RefusedError
+
+LEAST_POSES = 3
+FARTHEST_M = 20.0
+
+
+@dataclass
+class Options:
+    """What a person said instead of leaving it to the data; None where nothing was said.
+
+    `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
+    eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
+    `hold_camera` the arm has no say in it.
+    """
+
+    poses: str | None = None
+    pose_field: str | None = None
+    setup: str | None = None
+    plan: bool = False
+    camera: CameraModel | None = None
+    hold_camera: bool = False
+
+
+@dataclass
+class Understood:
+    """How the poses of a folder were read: for the table that comes before the result."""
+
+    setup: str | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    refused: str = ""
+    """Why there are poses, and none can be used; empty when they can, or there are none."""
+
+
+def attach_poses(
+    frames: Sequence[RecordedFrame], series: Sequence[Series], camera: CameraModel | None, options: Options
+) -> Understood:
+    """Set each frame's pose, in m, by the reading that agrees with the boards in the pictures, and tell how.
+
+    Without a camera, or with fewer than three frames, nothing is decided and no frame gets a pose.
+    """
+    if options.pose_field is not None:
+        series = [s for s in series if s.name == options.pose_field] or _no_such_field(series, options.pose_field)
+    if not series:
+        return Understood(about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
+    for one in series:
+        _tell_apart(one, frames, len(series) == 1)
+    if camera is None:
+        return Understood(about={"source": [s.name for s in series]}, notes=[])
+    boards = {}
+    for k, frame in enumerate(frames):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
+            continue
+        try:
+            boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
+        except PictureRefused as refused:
+            frame.refuse(refused.reason, str(refused))
+    if len(boards) < LEAST_POSES:
+        return Understood(
+            about={"source": [s.name for s in series]},
+            notes=[
+                f"{len(boards)} used frames have a flange pose, at least {LEAST_POSES} are needed: no hand-eye, no "
+                "flatness"
+            ],
+        )
+    try:
+        decision = decide(series, boards, options.poses, options.setup)
+    except RefusedError as error:
+        return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
+    return _apply(decision, frames, options)
+
+
+def _apply(decision: Decision, frames: Sequence[RecordedFrame], options: Options) -> Understood:
+    best = decision.best
+    one, poses = best.series, best.series.poses(best.reading)
+    understood = Understood(
+        best.setup,
+        {
+            "source": [one.name],
+            "reading": best.reading.name,
+            "text": best.reading.text,
+            "unit": best.unit,
+            "setup": best.setup,
+            "matched_by": one.by,
+            "given": [n for n, v in vars(options).items() if v and n != "plan"],
+            "evidence": decision.evidence,
+            "turn_deg": float(np.degrees(best.turn)),
+            "shift_mm": 1e3 * best.shift,
+        },
+    )
+    view = next(f.view for f in frames if f.view is not None)
+    problem, refused = scale_problem(best, view.spec.pitch)
+    if problem and refused:
+        understood.refused = f"no hand-eye: {problem}"
+    elif problem:
+        understood.notes.append(f"doubt: {problem}")
+    for k, record in one.of.items():
+        frame = frames[k]
+        frame.pose_from = record.path.name + (f" {record.label}" if record.label and record.label[:1] == "[" else "")
+        pose = poses.get(k)
+        if pose is None:
+            if frame.reason is None:
+                why = why_not(record.numbers, record.named, best.reading.name)
+                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
+            continue
+        metres = scaled(pose, best.unit)
+        if np.linalg.norm(metres.translation) > FARTHEST_M:
+            if frame.reason is None:
+                far = float(np.linalg.norm(metres.translation))
+                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: the flange is {far:.0f} m from the base")
+            continue
+        if not refused:
+            frame.base_from_flange = metres
+    return understood
+
+
+def _tell_apart(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:
+    """Refuse frames that have two poses."""
+    for k, records in one.doubled.items():
+        if only and frames[k].reason is None:
+            names = ", ".join(dict.fromkeys(f"{r.path.name} {r.label or ''}".strip() for r in records))
+            frames[k].refuse(Reason.NO_POSE, f"{len(records)} poses are named like it: {names}; which one is it?")
+
+
+def _no_such_field(series: Sequence[Series], wanted: str) -> list[Series]:
+    raise ConfigError(
+        f"--pose-field {wanted}: no such poses belong to the pictures; there are {', '.join(s.name for s in series)}"
+    )

@@ -1,0 +1,91 @@
+"""What lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name.
+
+Nothing is left out silently: hidden files, archives, broken links and unknown kinds are listed with the reason.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from drivers.errors import ConfigError
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+TEXTS = (".txt", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".npy", ".npz")
+ARCHIVES = (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz")
+BAGS = (".bag", ".db3", ".mcap")
+LARGEST_TEXT = 50_000_000
+
+
+@dataclass
+class Listing:
+    """The files of a folder by kind, each in natural order; `unread`: (name, reason) of the others."""
+
+    folder: Path
+    pictures: list[Path] = field(default_factory=list)
+    texts: list[Path] = field(default_factory=list)
+    unread: list[tuple[str, str]] = field(default_factory=list)
+
+    def name(self, path: Path) -> str:
+        """A file's name below the folder."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def list_folder(folder: Path) -> Listing:
+    """All files of a folder and below. Raises ConfigError when it is no folder."""
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder; give the folder that holds the recorded frames")
+    listing = Listing(folder)
+    seen: set[str] = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(root)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        for name in [f for f in folders if _hidden(f)]:
+            folders.remove(name)
+            listing.unread.append((listing.name(Path(root, name)) + "/", "hidden, not read"))
+        folders.sort(key=natural)
+        for path in (Path(root, name) for name in files):
+            _sort_in(listing, path)
+    listing.pictures.sort(key=lambda p: natural(listing.name(p)))
+    listing.texts.sort(key=lambda p: natural(listing.name(p)))
+    listing.unread.sort(key=lambda u: natural(u[0]))
+    return listing
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """A sort key in which frame10 follows frame9."""
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", name.lower()) if p]
+
+
+def _hidden(name: str) -> bool:
+    return name.startswith((".", "__MACOSX"))
+
+
+def _sort_in(listing: Listing, path: Path) -> None:
+    suffix, reason = path.suffix.lower(), ""
+    if _hidden(path.name):
+        reason = "hidden, not read"
+    elif not path.exists():
+        reason = "a link to a file that is not there"
+    elif not path.is_file():
+        reason = "no ordinary file"
+    elif suffix in PICTURES:
+        listing.pictures.append(path)
+    elif suffix in TEXTS:
+        if path.stat().st_size > LARGEST_TEXT:
+            reason = f"{path.stat().st_size / 1e6:.0f} MB are too much for a table of poses"
+        else:
+            listing.texts.append(path)
+    elif suffix in ARCHIVES:
+        reason = "an archive: unpack it"
+    elif suffix in BAGS:
+        reason = "a ROS bag: export its pictures and poses to files"
+    else:
+        reason = "neither a picture nor a table that is known"
+    if reason:
+        listing.unread.append((listing.name(path), reason))

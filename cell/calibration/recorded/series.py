@@ -1,0 +1,132 @@
+"""Series of recorded poses: files of one kind, or the rows of one table, and the picture that each belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.recorded.conventions import Reading
+from cell.calibration.recorded.listing import Listing
+from cell.calibration.recorded.matching import match, series_name
+from cell.calibration.recorded.numbers import Content, Record, read_content
+from drivers.errors import ConfigError
+
+LEAST = 2
+# A table whose rows are poses holds so many different rows.
+LEAST_ALONE = 3
+
+
+@dataclass(eq=False)
+class Series:
+    """Records of one kind, and in `of` the record of each picture by the picture's index; `by` says how they match."""
+
+    name: str
+    records: list[Record]
+    of: dict[int, Record] = field(default_factory=dict)
+    by: str = ""
+    alone: list[Record] = field(default_factory=list)
+    doubled: dict[int, list[Record]] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        """Numbers of a pose."""
+        return len(self.records[0].numbers)
+
+    @property
+    def named(self) -> str:
+        """What names beside the numbers said, see `Record`."""
+        return self.records[0].named
+
+    def poses(self, reading: Reading) -> dict[int, pin.SE3]:
+        """Poses by picture in the unit of the file, without those that the reading makes no pose of."""
+        found = {}
+        for k, record in self.of.items():
+            if not np.isfinite(record.numbers).all():
+                continue
+            try:
+                found[k] = reading.pose(record.numbers)
+            except ValueError:
+                continue
+        return found
+
+
+def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], list[tuple[str, str]]]:
+    """All series of a folder, the links between its files, and the texts that could not be read, with the reason."""
+    contents: dict[str, Content] = {}
+    unread: list[tuple[str, str]] = []
+    for path in listing.texts:
+        name = listing.name(path)
+        try:
+            contents[name] = read_content(path)
+        except (ValueError, OSError, RecursionError, MemoryError) as error:
+            unread.append((name, str(error)))
+            continue
+        if not contents[name].records and not contents[name].links:
+            unread.append((name, "no pose is in it (6, 7, 12 or 16 numbers that belong together)"))
+    groups: dict[tuple[str, str, int], list[Record]] = {}
+    for content in contents.values():
+        for record in content.records:
+            alone = sum(r.field == record.field for r in content.records) == 1
+            source = (record.path.parent / series_name(record.path.name)) if alone else record.path
+            source_name = listing.name(source)
+            groups.setdefault((source_name, record.field, len(record.numbers)), []).append(record)
+    found = [
+        Series(f"{source}:{place}" if place not in ("", "row", "matrix") else source, records)
+        for (source, place, _), records in groups.items()
+    ]
+    links = [link for content in contents.values() for link in content.links]
+    return [s for s in found if len(s.records) >= LEAST], links, unread
+
+
+def match_series(series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]) -> list[Series]:
+    """The series that belong to pictures. Raises ConfigError for a folder with several recordings in it."""
+    names = [listing.name(p) for p in listing.pictures]
+    linked = _linked(names, links)
+    for one in series:
+        single = len({r.path for r in one.records}) == len(one.records)
+        own = {r.path.parent for r in one.records}
+        beside = [k for k, p in enumerate(listing.pictures) if p.parent in own] if single else []
+        which = beside or list(range(len(names)))
+        labels = [listing.name(r.path) if single else r.label for r in one.records]
+        by_link = {label: k for k, label in linked.items()}
+        if single and sum(label in by_link for label in labels) >= LEAST:
+            one.by = "table"
+            one.of = {by_link[label]: r for label, r in zip(labels, one.records, strict=True) if label in by_link}
+            one.alone = [r for label, r in zip(labels, one.records, strict=True) if label not in by_link]
+            continue
+        found = match([names[k] for k in which], labels, [r.time for r in one.records])
+        one.by = found.by
+        one.of = {which[k]: one.records[i] for k, i in enumerate(found.of) if i is not None}
+        one.alone = [one.records[i] for i in found.alone]
+        one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+    belonging = [s for s in series if s.of]
+    _refuse_several(belonging, listing)
+    return belonging
+
+
+def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, str]:
+    """Pose files that a table names beside a picture, by the picture's index."""
+    found = {}
+    for link in links:
+        pictures = [names.index(v) for v in link.values() if v in names]
+        others = [v for v in link.values() if v not in names]
+        if len(pictures) == 1 and len(others) == 1:
+            found[pictures[0]] = others[0]
+    return found
+
+
+def _refuse_several(series: Sequence[Series], listing: Listing) -> None:
+    """Refuse a folder whose sub-folders are recordings of their own: their boards and bases need not be the same."""
+    owners: dict[str, set[int]] = {}
+    for one in series:
+        folders = {listing.pictures[k].parent for k in one.of}
+        if len(one.of) >= LEAST_ALONE and len(folders) == 1:
+            owners.setdefault(listing.name(next(iter(folders))), set()).update(one.of)
+    if len(owners) > 1:
+        raise ConfigError(
+            f"{listing.folder} holds {len(owners)} recordings, each with poses of its own: "
+            f"{', '.join(sorted(owners))}; give one of these folders with --from"
+        )

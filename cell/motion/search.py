@@ -1,0 +1,97 @@
+"""A way through joint space, found by OMPL's RRT-Connect (Kuffner and LaValle, 2000) and shortened by it.
+
+It is looked at in steps: whoever uses it checks the way in between as well. The same question gives the same way: the
+generator is seeded anew for each search, and a search ends after so many looks, never by the clock.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.motion.kinematics import Joints
+
+BRANCH = 1.5
+"""Longest branch in rad that the search adds at once."""
+_one_at_a_time = threading.Lock()
+"""The library has one source of seeds for the whole process."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How one search is made: `seed` above 0, `room` in rad around start and end, `step` in rad, most `looks`."""
+
+    seed: int
+    room: float
+    step: float
+    looks: int
+
+
+def search(
+    free: Callable[[Joints], bool],
+    start: Joints,
+    end: Joints,
+    ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
+    effort: Effort,
+) -> NDArray[np.float64] | None:
+    """Corners (n, 6) rad of a way from `start` to `end`, straight between them, or None when none was found.
+
+    `ranges` are the least and the greatest joint angles (6,); `free` says whether the arm may stand there.
+    """
+    # Most moves are direct: whoever needs no search does not wait for the library.
+    from ompl import base, geometric, util
+
+    low = np.maximum(ranges[0], np.minimum(start, end) - effort.room)
+    high = np.minimum(ranges[1], np.maximum(start, end) + effort.room)
+    space = base.RealVectorStateSpace(6)
+    bounds = base.RealVectorBounds(6)
+    for joint in range(6):
+        bounds.setLow(joint, float(low[joint]))
+        bounds.setHigh(joint, float(high[joint]))
+    space.setBounds(bounds)
+    left = effort.looks
+
+    def looked(state: Any) -> bool:
+        nonlocal left
+        left -= 1
+        return free(_joints(state))
+
+    with _one_at_a_time:
+        util.setLogLevel(util.LogLevel.LOG_NONE)
+        # Each generator takes its seed, in turn, from the one of the process.
+        util.RNG.setSeed(effort.seed)
+        info = base.SpaceInformation(space)
+        info.setStateValidityChecker(looked)
+        info.setStateValidityCheckingResolution(effort.step / space.getMaximumExtent())
+        info.setup()
+        problem = base.ProblemDefinition(info)
+        problem.setStartAndGoalStates(_state(info, start), _state(info, end))
+        planner = geometric.RRTConnect(info)
+        planner.setRange(BRANCH)
+        planner.setProblemDefinition(problem)
+        planner.setup()
+        planner.solve(base.PlannerTerminationCondition(lambda: left <= 0))
+        if not problem.hasExactSolution():
+            return None
+        path = problem.getSolutionPath()
+        simplifier = geometric.PathSimplifier(info)
+        simplifier.reduceVertices(path)
+        simplifier.ropeShortcutPath(path)
+        simplifier.reduceVertices(path)
+        return np.array([start, *[_joints(state) for state in path.getStates()[1:-1]], end])
+
+
+def _joints(state: Any) -> Joints:
+    return np.array([state[joint] for joint in range(6)])
+
+
+def _state(info: Any, joints: Joints) -> Any:
+    state = info.allocState()
+    for joint, angle in enumerate(joints):
+        state[joint] = float(angle)
+    return state

@@ -1,0 +1,70 @@
+"""Opening a cell: its devices, real or simulated, over wires or on the virtual clock, and the lock that holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from cell.config import CellConfig, Confirm, beside, config_to_open
+from cell.devices.assembly import connect, connected_for
+from cell.devices.devices import Devices
+from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
+from cell.run.lock import CellLock
+from drivers.errors import ConfigError
+
+SIM_SPEED = 3.0
+"""How many times faster than the wall a simulated cell runs unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a cell consists of; `lock` is held, `simulated` is None for real devices."""
+
+    config: CellConfig
+    folder: Path
+    lock: AbstractContextManager[object]
+    devices: Devices
+    simulated: Simulation | None
+
+
+def open_devices(
+    undo: ExitStack,
+    config: str | Path | None,
+    *,
+    sim: str | None,
+    seed: int,
+    level: str,
+    speed: float | None,
+    surface: str,
+    confirm: Confirm | None,
+    only: Collection[str],
+    clock: str,
+) -> Opened:
+    """Connect as `Cell.open` says, and raise what it says. What is to be undone if the rest fails goes to `undo`."""
+    if sim not in (None, "all"):
+        raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
+    if clock not in ("wall", "virtual"):
+        raise ConfigError(f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait')
+    if clock == "virtual" and (sim is None or speed is not None):
+        wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
+        raise ConfigError(f'clock="virtual": {wrong}; leave that out')
+    path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
+    folder = beside(path)
+    if clock == "virtual":
+        # The world takes long to load, and a cell over wires has it in another process, or none.
+        from cell.devices.direct import VirtualCell
+
+        virtual = VirtualCell(loaded, seed, level, surface)
+        return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
+    simulated = None
+    if sim == "all":
+        simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
+        undo.callback(simulated.close)
+        loaded = with_endpoints(loaded, simulated.endpoints)
+    needed = connected_for(loaded, only)
+    lock = undo.enter_context(CellLock(loaded, needed))
+    devices = connect(loaded, needed)
+    undo.callback(devices.close)
+    return Opened(loaded, folder, lock, devices, simulated)

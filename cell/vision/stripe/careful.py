@@ -1,0 +1,310 @@
+"""The stripe of pictures that are not ordinary: colour, deep, wide, textured, with scenery, of an unknown profile.
+
+Slower than the search and fit of ordinary pictures: the plane is chosen in which the laser stands out, the stripe is
+followed as a line, its profile learned, and the deviation told from what surrounds it. `extract` comes here by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
+from cell.vision.stripe.learning import FREE_SCALE, learn_profile
+from cell.vision.stripe.planes import MIXES, Laser, Picture
+from cell.vision.stripe.shape import Shape, gaussian
+from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, fit_shape
+from cell.vision.stripe.surroundings import around, carried, wander
+
+if TYPE_CHECKING:
+    from cell.vision.stripe.profile import StripeSettings
+
+Array = NDArray[np.float64]
+
+COARSE_ROWS, COARSE_COLUMNS = 160, 1400
+ALONG, FAR_ALONG, WEAK_SCORE = 0.8, 3.0, 8.0
+"""Rows are blurred by the first before the line is looked for in them, in px; by the second where it scores less."""
+BINNED_WIDTH = 4.0
+"""A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
+ABOUT_AS_WELL = 0.75
+"""Mixes of colours that show the line by this share of the best are compared by what they know of its centres."""
+KNOWN_PX = 0.03
+MOST_WANDER = 2.5
+SURE = 3.5
+"""Least amplitude of a stripe in its standard deviations."""
+LEAST_SCORE = 0.35
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a picture taught that holds for others of the same set-up: the `mix` of colours, the `scale` that answers
+    (σ in px), the profile's `shape` in pixels of `binned` px, its `spread` from line to line, the `noise`, and by how
+    many px rows were blurred `along` the line to find it."""
+
+    mix: str
+    scale: float
+    binned: int
+    shape: Shape
+    spread: float
+    noise: Noise
+    along: float
+
+
+@dataclass(frozen=True)
+class Careful:
+    """What `read_carefully` found, arrays (lines,) as in `StripeProfile`; `rival` is how high the next best peak of a
+    line is over the stripe's, 0 where there is none, and `misfit` χ² over what is usual in the picture."""
+
+    centres: Array
+    sigma: Array
+    amplitude: Array
+    width: Array
+    saturated: NDArray[np.bool_]
+    rival: Array
+    misfit: Array
+    learned: Learned | None
+
+
+def read_carefully(
+    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None = None,
+    starts: Array | None = None,
+) -> Careful:  # fmt: skip
+    """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
+
+    `starts` (lines,) in px, NaN where there is none, spare the following.
+    """
+    lines = picture.value.shape[0]
+    mix = like.mix if like is not None else choose_mix(picture, off, laser)
+    value, usable, shade = _difference(picture, off, mix)
+    rival = np.zeros(lines)
+    if starts is None:
+        found, chain, scale, along = _follow(value, like)
+        if not len(chain.rows):
+            return _nothing(lines)
+        place = np.full(lines, np.nan)
+        place[chain.rows] = found.place[chain.rows, chain.which]
+        rival = _rivals(found, chain)
+        place = _bridge(place)
+    else:
+        place, scale, along = starts, like.scale if like is not None else SCALES[2], ALONG
+    rows = np.flatnonzero(np.isfinite(place))
+    k = like.binned if like is not None else max(1, int(scale / BINNED_WIDTH))
+    plane = binned(Plane(value, usable, shade, _albedo(shade, usable)), k)
+    at = (place[rows] - 0.5 * (k - 1)) / k
+    noise = Noise(settings.read_noise_dn**2 / k, settings.gain_dn / k * float(np.abs(MIXES[mix]).sum()))
+    if like is None:
+        noise = surrounded(plane, rows, at, 4 * scale / k, noise)
+        shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
+        learned = Learned(mix, shape.width * k, k, shape, spread, noise, along)
+    else:
+        learned = like
+    shape, noise = learned.shape, learned.noise
+    fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
+    variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
+    sigma = carried(fitted, variance, correlation)
+    out = _believed(fitted, sigma, at, shape, k, lines, plane)
+    # A surface may be rough: lines that wander tell of errors only where something is there to make them.
+    unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
+    factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
+    return Careful(
+        out.centres, out.sigma * factor, out.amplitude, out.width, out.saturated, rival, out.misfit, learned
+    )  # fmt: skip
+
+
+def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
+    """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names.
+
+    Of the mixes that show it about as well, the one in which its centres are known best: a channel in which the core is
+    saturated, or the noise or the texture strong, gives way to another.
+    """
+    if not picture.coloured or laser is not Laser.AUTO:
+        return laser.value if picture.coloured else "grey"
+    looks = {mix: coarse(_difference(picture, off, mix)[0]) for mix in MIXES}
+    best = max(look.chain.score for look in looks.values())
+    shown = [m for m, look in looks.items() if look.chain.score >= ABOUT_AS_WELL * best and len(look.chain.rows)]
+    if len(shown) < 2:
+        return shown[0] if shown else "grey"
+    return max(
+        shown, key=lambda mix: _knowledge(*_difference(picture, off, mix), looks[mix].found, looks[mix].chain, mix)
+    )
+
+
+def _knowledge(
+    value: NDArray[np.float32], usable: NDArray[np.bool_], shade: NDArray[np.float32] | None, found: Candidates,
+    chain: Chain, mix: str,
+) -> float:  # fmt: skip
+    """How much the lines of a chain say about their centres, in 1/px², the sum of all that are worth a fit."""
+    rows, at = found.rows[chain.rows], found.place[chain.rows, chain.which]
+    scale = float(np.median(found.scale[chain.rows, chain.which]))
+    k = max(1, int(scale / BINNED_WIDTH))
+    plane, at, width = binned(Plane(value, usable, shade), k), (at - 0.5 * (k - 1)) / k, scale / k
+    noise = surrounded(plane, rows, at, 4 * width, Noise(0.1, 1 / 40 * float(np.abs(MIXES[mix]).sum())))
+    fitted = fit_shape(plane, rows, at, gaussian(width, 4 * width + 3), noise, FREE_SCALE)
+    good = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
+    variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
+    sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
+    # A line that is known very well says no more than that it is.
+    return float(np.sum(1 / (KNOWN_PX**2 + sigma**2)))
+
+
+def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:
+    """The noise with the floor that the surroundings of the lines show, no less than it has."""
+    variance, _, level = around(plane, rows, at, reach)
+    return Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)
+
+
+class Look(NamedTuple):
+    """What a coarse look at a plane gave: candidates, the chain through them, and by how many px rows were blurred."""
+
+    found: Candidates
+    chain: Chain
+    along: float
+
+
+def coarse(value: NDArray[np.float32]) -> Look:
+    """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels.
+
+    Where there is hardly a line to see, rows are blurred more: what is noisy is often straight.
+    """
+    look = _coarse(value, ALONG)
+    if look.chain.score > WEAK_SCORE:
+        return look
+    further = _coarse(value, FAR_ALONG)
+    return further if further.chain.score > 1.2 * look.chain.score else look
+
+
+def _coarse(value: NDArray[np.float32], along: float) -> Look:
+    step = max(1, len(value) // COARSE_ROWS)
+    calm = cv2.GaussianBlur(value, (1, 2 * int(2.5 * along) + 1), sigmaX=0.0, sigmaY=along)
+    part: NDArray[np.float32] = np.ascontiguousarray(calm[::step], dtype=np.float32)
+    shrink = -(-part.shape[1] // COARSE_COLUMNS)
+    if shrink > 1:
+        size = (part.shape[1] // shrink, len(part))
+        part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    found = candidates(part, np.arange(0, len(part)), SCALES, along=0.0)
+    place = found.place * shrink + 0.5 * (shrink - 1)
+    found = Candidates(found.rows * step, place, found.response, found.clear, found.scale * shrink)
+    return Look(found, follow(found, step), along)
+
+
+def _difference(
+    picture: Picture, off: Picture | None, mix: str
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32] | None]:
+    """The plane, the pixels that can be used, and what was taken off it."""
+    value, usable = picture.plane(mix)
+    if off is None:
+        return value, usable, None
+    shade, fine = off.plane(mix)
+    return value - shade, usable & fine, shade
+
+
+def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float, float]:
+    """Candidates and chain in all rows, the scale in px that answers most, and by how many px rows were blurred."""
+    scales = np.asarray(SCALES)
+    typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
+    if not typical:
+        found, chain, along = coarse(value)
+        if not len(chain.rows) or chain.score < LEAST_SCORE:
+            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
+        typical = float(np.median(found.scale[chain.rows, chain.which]))
+    near = scales[np.abs(np.log(scales / typical)) < 0.75]
+    found = candidates(value, np.arange(len(value)), tuple(near), along)
+    chain = follow(found)
+    if not len(chain.rows):
+        return found, chain, typical, along
+    return found, chain, float(np.median(found.scale[chain.rows, chain.which])), along
+
+
+def _bridge(place: Array) -> Array:
+    """Places also in the gaps of the chain that are short and go on at the other side."""
+    there = np.flatnonzero(np.isfinite(place))
+    if len(there) < 2:
+        return place
+    before, after = there[:-1], there[1:]
+    size = after - before
+    smooth = (size > 1) & (size <= 24) & (np.abs(place[after] - place[before]) < 1.0 * size + 2)
+    filled = place.copy()
+    for first, last in zip(before[smooth], after[smooth], strict=True):
+        filled[first : last + 1] = np.interp(np.arange(first, last + 1), (first, last), (place[first], place[last]))
+    return filled
+
+
+def _rivals(found: Candidates, chain: Chain) -> Array:
+    """Response of the best candidate beside the chain over the chain's, of each row (m,), 0 where none is clear."""
+    rival = np.zeros(len(found.rows))
+    own = found.response[chain.rows, chain.which]
+    away = np.abs(found.place[chain.rows] - found.place[chain.rows, chain.which][:, None])
+    beside = (away > 3 * found.scale[chain.rows, chain.which][:, None]) & (found.clear[chain.rows] > 6)
+    beside &= np.arange(CANDIDATES) != chain.which[:, None]
+    rival[chain.rows] = np.where(beside, found.response[chain.rows], 0.0).max(axis=1) / np.maximum(own, 1e-6)
+    return rival
+
+
+def binned(plane: Plane, k: int) -> Plane:
+    """The plane of pixels that are `k` px wide, each the mean of what it holds; the last ones may fall away."""
+    if k == 1:
+        return plane
+    n = plane.value.shape[1] // k
+
+    def mean(part: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        if part is None:
+            return None
+        return np.asarray(part[:, : n * k].reshape(len(part), n, k).mean(axis=2), dtype=np.float32)
+
+    value = mean(plane.value)
+    assert value is not None
+    usable = np.asarray(plane.usable[:, : n * k].reshape(len(value), n, k).all(axis=2))
+    return Plane(value, usable, mean(plane.shade), mean(plane.albedo))
+
+
+BRIGHT, SMOOTH_PX = 25.0, 31
+"""DN of a picture without the laser from which it tells the albedo, and the px over which that is taken to be 1."""
+
+
+def _albedo(shade: NDArray[np.float32] | None, usable: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+    """How much lighter each pixel is than its surroundings in the picture without the laser; None where it is dark."""
+    if shade is None or float(np.median(shade)) < BRIGHT:
+        return None
+    here: Array = np.asarray(cv2.GaussianBlur(shade, (3, 3), 0), dtype=np.float64)
+    surroundings: Array = np.asarray(cv2.blur(here, (SMOOTH_PX, SMOOTH_PX)), dtype=np.float64)
+    relative = np.where(usable & (surroundings > BRIGHT), here / np.maximum(surroundings, 1.0), 1.0)
+    return np.asarray(np.clip(relative, 0.1, 4.0), dtype=np.float32)
+
+
+def _believed(
+    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane
+) -> Careful:  # fmt: skip
+    """The fits that are a stripe, in px of the picture and lines of all of it."""
+    width = shape.width
+    keep = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    keep &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
+    keep &= sigma < np.maximum(1.0, 0.7 * width)
+    if keep.any():
+        usual = float(np.median(fitted.log_scale[keep]))
+        keep &= np.abs(fitted.log_scale - usual) < 0.8
+    n = plane.value.shape[1]
+    keep &= (fitted.centre > 1.0) & (fitted.centre < n - 2.0)
+    out = {name: np.full(lines, np.nan) for name in ("centres", "sigma", "amplitude", "width", "misfit")}
+    rows = fitted.lines[keep]
+    out["centres"][rows] = k * fitted.centre[keep] + 0.5 * (k - 1)
+    out["sigma"][rows] = k * sigma[keep]
+    out["amplitude"][rows] = fitted.amplitude[keep]
+    out["width"][rows] = k * width * np.exp(fitted.log_scale[keep])
+    usual = float(np.median(fitted.chi2[keep])) if keep.any() else 1.0
+    out["misfit"][rows] = fitted.chi2[keep] / max(usual, 1e-6)
+    saturated = np.zeros(lines, np.bool_)
+    inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
+    saturated[rows] = inside[keep].any(axis=1)
+    return Careful(
+        out["centres"], out["sigma"], out["amplitude"], out["width"], saturated, np.zeros(lines), out["misfit"], None
+    )  # fmt: skip
+
+
+def _nothing(lines: int) -> Careful:
+    none, no = np.full(lines, np.nan), np.zeros(lines, np.bool_)
+    return Careful(none, none.copy(), none.copy(), none.copy(), no, np.zeros(lines), none.copy(), None)

@@ -1,0 +1,195 @@
+"""The stripe followed as a line: of all that looks like a stripe in each row, the chain that runs through the picture.
+
+A row's response is how far a spot stands above *both* its sides, so that an edge of the scene answers little.
+Candidates of neighbouring rows are chained by dynamic programming: a chain may bend and have gaps; a jump, such as a
+step of the surface makes, costs as much as several clear rows are worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.compiled import compiled
+
+Array = NDArray[np.float64]
+
+SCALES = (0.8, 1.4, 2.4, 4.0, 7.0, 12.0, 20.0, 30.0)
+"""Stripe widths σ in px that are looked for."""
+CANDIDATES = 6
+SIDES = 2.8
+"""Where the sides of a stripe are, in widths."""
+LEAST = 2.5
+"""Response over noise from which a candidate speaks for the chain, and how much one says at most."""
+MOST = 25.0
+# What a chain pays: for a px aside and row, for a row of a gap, for a jump.
+ASIDE, GAP, JUMP = 0.5, 0.4, 30.0
+LONGEST_GAP = 24
+STEEPEST = 2.5
+"""A chain moves no more than this many px a row, and one width more."""
+AGAINST = 0.5
+"""How much the strongest thing beside the chain in each row counts against it."""
+LEAST_SCORE, LEAST_ROWS = 60.0, 8
+"""Of a piece of the chain that is believed."""
+UNLIKE, FAINTER, OUTDONE = 1.4, 0.25, 0.5
+"""A piece belongs to the line if it is about as wide, in the logarithm, at least this share as clear as the best, and
+if in no more than this share of its rows something beside it is clearer."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What looks like a stripe in `rows` (m,) of the picture, CANDIDATES each (m, CANDIDATES): `place` in px,
+    `response` in DN, `clear`, that over its noise (0: none), and the `scale` in px that answers most."""
+
+    rows: NDArray[np.intp]
+    place: Array
+    response: Array
+    clear: Array
+    scale: Array
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The line that was followed: `rows` (k,), indices of those of the candidates, `which` of them, and the `piece`
+    each belongs to. `score` is what it says for itself, a row on average, less what in the picture says otherwise."""
+
+    rows: NDArray[np.intp]
+    which: NDArray[np.intp]
+    piece: NDArray[np.intp]
+    score: float
+
+
+def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray[np.float32]:
+    """How far, in DN, each place of `picture` (m, n) stands above both its sides, for a stripe of σ `scale` px.
+
+    Rows are blurred by `along` px.
+    """
+    across = cv2.getGaussianKernel(2 * int(np.ceil(2 * max(0.5, 0.6 * scale))) + 1, max(0.5, 0.6 * scale))
+    rows = cv2.getGaussianKernel(2 * int(2.5 * along) + 1, along or 1.0)
+    smooth = cv2.sepFilter2D(picture, cv2.CV_32F, across, rows, borderType=cv2.BORDER_REPLICATE)
+    away = max(2, round(SIDES * scale))
+    padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, cv2.BORDER_REPLICATE)
+    n = picture.shape[1]
+    return np.asarray(smooth - np.maximum(padded[:, :n], padded[:, 2 * away :]), dtype=np.float32)
+
+
+def candidates(
+    part: NDArray[np.float32], rows: NDArray[np.intp], scales: tuple[float, ...], along: float
+) -> Candidates:
+    """What looks like a stripe of one of `scales` in the rows of `part` (m, n), in DN, which are `rows` of the picture.
+
+    Neighbouring rows are blurred by `along` px.
+    """
+    n = part.shape[1]
+    best = np.full(part.shape, -np.inf, np.float32)
+    answer = np.zeros(part.shape, np.float32)
+    of = np.zeros(part.shape, np.uint8)
+    for k, scale in enumerate(scales):
+        if 6 * scale > n:
+            continue
+        response = respond(part, scale, along)
+        clear = response / _noise(response)
+        better = clear > best
+        best[better], answer[better], of[better] = clear[better], response[better], k
+    edge = 2
+    peak = np.zeros(part.shape, np.bool_)
+    peak[:, edge:-edge] = (best[:, edge:-edge] >= best[:, edge - 1 : -edge - 1]) & (
+        best[:, edge:-edge] > best[:, edge + 1 : n - edge + 1]
+    )
+    score = np.where(peak & (best > LEAST), best, 0.0)
+    place = np.argpartition(-score, CANDIDATES, axis=1)[:, :CANDIDATES]
+    line = np.arange(len(rows))[:, None]
+    return Candidates(
+        rows, place.astype(np.float64), answer[line, place].astype(np.float64), score[line, place].astype(np.float64),
+        np.asarray(scales)[of[line, place]],
+    )  # fmt: skip
+
+
+def _noise(response: NDArray[np.float32]) -> float:
+    """Scatter of what answers where nothing is, which is the middle of all answers."""
+    few = response[:: max(1, len(response) // 128), :: max(1, response.shape[1] // 512)]
+    low, middle = np.percentile(few, (30, 50))
+    return max(float(middle - low) / 0.5244, 0.05)
+
+
+def follow(found: Candidates, spacing: float = 1.0) -> Chain:
+    """The chain through `found` whose rows are `spacing` px apart on average."""
+    m = len(found.rows)
+    best, back_row, back_which, opens = _chain(
+        found.rows.astype(np.float64), found.place, np.minimum(found.clear, MOST) - LEAST * (found.clear > 0),
+        found.clear > 0, found.scale, spacing,
+    )  # fmt: skip
+    rows, which, fresh = [], [], []
+    end = int(best.argmax())
+    r, k = divmod(end, CANDIDATES)
+    while r >= 0 and best[r, k] > 0:
+        rows.append(r)
+        which.append(k)
+        fresh.append(bool(opens[r, k]))
+        r, k = int(back_row[r, k]), int(back_which[r, k])
+    order = np.array(rows[::-1], dtype=np.intp)
+    chosen = np.array(which[::-1], dtype=np.intp)
+    piece = np.cumsum(np.array(fresh[::-1], dtype=np.intp)) if m and len(order) else order
+    return _believed(found, order, chosen, piece)
+
+
+def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
+    """Without the pieces that noise may have made."""
+    if not len(rows):
+        return Chain(rows, which, piece, 0.0)
+    said = np.minimum(found.clear[rows, which], MOST) - LEAST
+    keep = np.zeros(len(rows), np.bool_)
+    scale = found.scale[rows, which]
+    others = found.clear.copy()
+    others[rows, which] = 0.0
+    outdone = others[rows].max(axis=1) > np.maximum(found.clear[rows, which], 2 * LEAST)
+    pieces = [piece == one for one in np.unique(piece)]
+    main = max(pieces, key=lambda here: float(said[here].sum()))
+    for here in pieces:
+        alike = abs(np.log(np.median(scale[here]) / np.median(scale[main]))) < UNLIKE
+        alike = alike and outdone[here].mean() < OUTDONE and said[here].mean() > FAINTER * said[main].mean()
+        if alike and said[here].sum() > LEAST_SCORE and here.sum() >= LEAST_ROWS:
+            keep |= here
+    rows, which, piece, said = rows[keep], which[keep], piece[keep], said[keep]
+    rivals = np.clip(others.max(axis=1) - 2 * LEAST, 0.0, MOST).sum()
+    score = float(said.sum() - JUMP * len(np.unique(piece)) - AGAINST * rivals)
+    return Chain(rows, which, piece, score / len(found.rows))
+
+
+@compiled
+def _chain(rows: Any, place: Any, gain: Any, there: Any, scale: Any, spacing: float) -> Any:
+    """Best sums that end at each candidate (m, CANDIDATES), where they come from, and whether by a jump."""
+    m, count = place.shape
+    best = np.zeros((m, count))
+    back_row, back_which = np.full((m, count), -1), np.zeros((m, count), np.int64)
+    opens = np.ones((m, count), np.bool_)
+    top, top_row, top_which = 0.0, -1, 0
+    for r in range(m):
+        for k in range(count):
+            if not there[r, k]:
+                continue
+            value, from_row, from_which, fresh = top - JUMP, top_row, top_which, True
+            if value < 0.0:
+                value, from_row = 0.0, -1
+            for before in range(r - 1, max(-1, r - 1 - LONGEST_GAP), -1):
+                apart = rows[r] - rows[before]
+                if apart > LONGEST_GAP * spacing:
+                    break
+                limit = STEEPEST * apart + 1.0 + scale[r, k]
+                for j in range(count):
+                    aside = abs(place[r, k] - place[before, j])
+                    if not there[before, j] or aside > limit:
+                        continue
+                    sum_ = best[before, j] - ASIDE * max(0.0, aside - 0.5) / spacing - GAP * (apart / spacing - 1.0)
+                    if sum_ > value:
+                        value, from_row, from_which, fresh = sum_, before, j, False
+            best[r, k] = value + gain[r, k]
+            back_row[r, k], back_which[r, k], opens[r, k] = from_row, from_which, fresh
+        for k in range(count):
+            if best[r, k] > top:
+                top, top_row, top_which = best[r, k], r, k
+    return best, back_row, back_which, opens

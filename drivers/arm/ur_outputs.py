@@ -1,0 +1,82 @@
+"""Child side: the arm's digital outputs: switched, kept low while no program runs, and all off in an arm at rest."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from typing import Any
+
+from rtde_io import RTDEIOInterface
+
+from drivers.arm.messages import STOPPED
+from drivers.arm.ur_packets import Packets
+from drivers.arm.ur_program import PERIOD
+from drivers.clock import Clock
+
+OFF_S = 1.0
+"""How long on the wall an output may take to be seen off."""
+_SAFE_S = 5.0
+_SECONDARY_PORT = 30002
+_GREETING = 79
+"""Bytes that the maker wants read from that port before it is closed; else what was sent may be discarded."""
+_LOW_WHEN_NOT_RUNNING = 1
+_NOT_SAFE = 4
+"""Exit code of `--safe` when an output stays on or the arm does not come to rest."""
+
+
+def _terminal(index: int) -> tuple[str, int]:
+    """Kind and number of digital output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
+    kind = ("standard", "configurable", "tool")[index // 8]
+    return kind, index % 8
+
+
+def switch_output(io: Any, index: int, value: bool) -> bool:
+    """Set digital output `index`."""
+    kind, number = _terminal(index)
+    return bool(getattr(io, f"set{kind.capitalize()}DigitalOut")(number, value))
+
+
+def keep_low(address: str, outputs: tuple[int, ...]) -> None:
+    """Have the controller keep outputs low whenever no program runs, whatever becomes of the link.
+
+    A secondary program runs beside the main one and leaves it alone. Source: the maker's script manual.
+    """
+    if not outputs:
+        return
+    lines = [
+        f"  set_runstate_{kind}_digital_output_to_value({number}, {_LOW_WHEN_NOT_RUNNING})\n"
+        for kind, number in map(_terminal, outputs)
+    ]
+    with socket.create_connection((address, _SECONDARY_PORT), timeout=OFF_S) as connection:
+        connection.sendall(f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
+        read = 0
+        while read < _GREETING:
+            data = connection.recv(4096)
+            if not data:
+                raise RuntimeError(f"port {_SECONDARY_PORT} of the arm was closed before it took the outputs' setting")
+            read += len(data)
+
+
+def make_safe(address: str, outputs: list[int]) -> None:
+    """Switch outputs off, then see on the arm's own word that they are and that it stands."""
+    signal.setitimer(signal.ITIMER_REAL, _SAFE_S)
+    if outputs:
+        io = RTDEIOInterface(address)
+        for index in outputs:
+            switch_output(io, index, False)
+    packets = Packets(address)
+    mask = sum(1 << index for index in outputs)
+    clock, deadline = Clock(), time.monotonic() + OFF_S
+
+    def unsafe() -> bool:
+        snapshot = packets.read()
+        # A program that is only paused would go on when it is released.
+        return bool(snapshot.outputs & mask) or not snapshot.at_rest or snapshot.runtime > STOPPED
+
+    while unsafe():
+        if time.monotonic() > deadline:
+            os._exit(_NOT_SAFE)
+        clock.sleep(PERIOD)
+    os._exit(0)

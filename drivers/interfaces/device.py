@@ -1,0 +1,74 @@
+"""What every device offers, whatever its kind: who it is, how well its link does, how a motion is waited for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+"""Array of shape (n,), float64."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who a device is: used by `cell diag` and to tie a calibration to its hardware."""
+
+    model: str
+    serial: str
+    firmware: str
+    address: str
+
+
+@dataclass
+class LinkStatistics:
+    """Health of a link since it was opened: round trips in seconds (newest 1000) and error counters by name."""
+
+    round_trips_s: list[float] = field(default_factory=list)
+    errors: dict[str, int] = field(default_factory=dict)
+
+    def add_round_trip(self, seconds: float) -> None:
+        """Record one round trip, forgetting the oldest beyond 1000."""
+        self.round_trips_s.append(seconds)
+        if len(self.round_trips_s) > 1000:
+            del self.round_trips_s[:500]
+
+    def count(self, name: str) -> None:
+        """Add one to the error counter `name`."""
+        self.errors[name] = self.errors.get(name, 0) + 1
+
+
+class Device(Protocol):
+    """What every device offers. `name` is its name in the configuration and in every error."""
+
+    name: str
+    statistics: LinkStatistics
+
+    def identity(self) -> Identity:
+        """Ask the device who it is."""
+
+    def ping(self) -> float:
+        """One harmless round trip on the wire, in wall seconds; also recorded in `statistics`."""
+
+    def stop(self) -> None:
+        """Bring the device to rest (or its output off) now, overtaking everything."""
+
+    def close(self) -> None:
+        """Stop, then release the connection."""
+
+
+class Motion(Protocol):
+    """A motion that was started."""
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+
+    def wait(self, timeout: float) -> None:
+        """Block until the motion has reached its end.
+
+        Raises `DeadlineError` after `timeout` seconds (the device is then stopped), `DeviceFault` when the device
+        failed, `Aborted` when `stop()` ended the motion early. Never returns for a motion that did not arrive.
+        """

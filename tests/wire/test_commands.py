@@ -1,0 +1,154 @@
+"""Single commands on one served cell: they connect what they need, move, refuse, and look without touching."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cell.config import default_toml, load_config
+from cell.devices.assembly import connect
+from cell.run.lock import CellLock
+from drivers.errors import InterlockError, NotConnectedError
+from tests.packages import RAIL, install, with_acme_rail
+from tests.wire.cells import ask, cell, served
+
+pytestmark = pytest.mark.wire
+
+STAYS = ("laser_on", "digital_outputs", "rail_moving", "vehicle", "arm", "part")
+Typed = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """A folder with the configuration of a served cell, and its endpoints."""
+    folder = tmp_path_factory.mktemp("cell")
+    with served(folder, "--seed", "3", "--level", "ideal") as endpoints:
+        yield folder, endpoints
+
+
+@pytest.fixture
+def endpoints(serving: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The served cell after a reset of the rail; its configuration is the `cell.toml` of the present folder."""
+    folder, endpoints = serving
+    (tmp_path / "cell.toml").write_text((folder / "sim.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    ask(endpoints, op="fault", name="rail.reset")
+    ask(endpoints, op="reset")
+    return endpoints
+
+
+def truth(endpoints: dict[str, Any]) -> dict[str, Any]:
+    told: dict[str, Any] = ask(endpoints, op="truth")["truth"]
+    return told
+
+
+def change(old: str, new: str) -> None:
+    """Another configuration in the present folder."""
+    toml = Path("cell.toml")
+    text, count = re.subn(old, new, toml.read_text(encoding="utf-8"))
+    assert count
+    toml.write_text(text, encoding="utf-8")
+
+
+def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_does(
+    endpoints: dict[str, Any], typed: Typed
+) -> None:
+    before = truth(endpoints)
+    code, out, error = typed("diag", "--json")
+    after = truth(endpoints)
+    assert code == 0, error
+    rows = json.loads(out)
+    assert set(rows) == {"arm", "rail", "vehicle", "scan_camera", "target_camera", "laser", "claw"}
+    assert all(row["ok"] and np.isfinite(row["p99_ms"]) for row in rows.values())
+    assert "brake unknown" in rows["vehicle"]["state"]
+    assert rows["rail"]["state"].startswith("not homed")
+    for name in STAYS:
+        assert after[name] == before[name], name
+    assert after["rail"]["carriage"] == before["rail"]["carriage"]
+    change(r'url = "socket://[^"]*"', 'url = "socket://127.0.0.1:1"')
+    code, out, _ = typed("diag", "--json")
+    assert code == 1
+    assert not json.loads(out)["rail"]["ok"]
+
+
+def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any], typed: Typed) -> None:
+    change(re.escape(f'"{load_config(Path("cell.toml")).arm.place}"'), '"127.255.0.9"')
+    done = cell("home", "rail", folder=Path.cwd())
+    assert (done.returncode, done.stdout) == (0, "rail homed\n"), done.stderr
+    code, _, error = typed("jog", "rail", "+5mm")
+    assert code == 0, error
+    assert truth(endpoints)["rail"]["carriage"] == pytest.approx(0.005, abs=1e-5)
+    code, out, error = typed("diag", "--device", "rail", "--json")
+    assert code == 0, error
+    rows = json.loads(out)
+    assert list(rows) == ["rail"]
+    assert rows["rail"]["state"] == "homed, at 5.00 mm"
+    code, _, error = typed("home")
+    assert code == 1
+    assert "127.255.0.9" in error
+
+
+def test_two_jogs_by_5_mm_end_at_10_mm_and_one_after_a_reset_says_that_it_homed(endpoints: dict[str, Any]) -> None:
+    """The rail goes on from where it stands, program after program; only a rail that is not homed is homed."""
+
+    def jogged() -> dict[str, str]:
+        done = cell("jog", "rail", "+5mm", "--json", folder=Path.cwd())
+        assert done.returncode == 0, done.stderr
+        answer: dict[str, str] = json.loads(done.stdout)
+        return answer
+
+    assert "homing" in jogged()
+    assert truth(endpoints)["rail"]["carriage"] == pytest.approx(0.005, abs=1e-5)
+    assert "homing" not in jogged()
+    assert truth(endpoints)["rail"]["carriage"] == pytest.approx(0.010, abs=1e-5)
+    ask(endpoints, op="fault", name="rail.reset")
+    assert "homing" in jogged()
+    assert truth(endpoints)["rail"]["carriage"] == pytest.approx(0.005, abs=1e-5)
+
+
+def test_jogs_move_and_are_refused_outside_the_limits(endpoints: dict[str, Any], typed: Typed) -> None:
+    before = np.array(truth(endpoints)["poses"]["base_from_flange"])
+    assert typed("jog", "arm", "z", "-10mm")[0] == 0
+    after = np.array(truth(endpoints)["poses"]["base_from_flange"])
+    assert after[2, 3] - before[2, 3] == pytest.approx(-0.010, abs=0.0005)
+    start = np.array(truth(endpoints)["poses"]["world_from_vehicle"])
+    code, _, error = typed("jog", "vehicle", "+0.1m")
+    assert (code, "arm_stowed" in error) == (1, True)
+    code, _, error = typed("jog", "vehicle", "+0.1m", "--lift", "arm_stowed", "--reason", "the arm stands upright")
+    assert code == 0, error
+    end = np.array(truth(endpoints)["poses"]["world_from_vehicle"])
+    assert np.linalg.norm(end[:2, 3] - start[:2, 3]) == pytest.approx(0.1, abs=0.01)
+    code, _, error = typed("jog", "rail", "-20mm")
+    assert code == 1
+    assert "0 mm" in error or "0 to 100" in error
+
+
+def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoints: dict[str, Any]) -> None:
+    config = load_config(Path("cell.toml"))
+    with CellLock(config, ["rail"]):
+        with CellLock(config, ["vehicle"]):
+            pass
+        with pytest.raises(InterlockError, match="the rail at"), CellLock(config):
+            pass
+    devices = connect(config, ["rail"])
+    assert [device.name for device in devices] == ["rail"]
+    with pytest.raises(NotConnectedError, match="arm: this command works without it"):
+        _ = devices.arm
+    assert devices.stop() == devices.close() == []
+
+
+def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = install(tmp_path / "site", "acme-rail", "1.2", "rail.acme = acme_rail:MAKE", acme_rail=RAIL)
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=":")
+    (tmp_path / "cell.toml").write_text(with_acme_rail(default_toml()).replace("192.0.2.", "10.255.255."))
+    done = cell("jog", "rail", "+5mm", "--json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rail"] == "0.000 mm → 5.000 mm"

@@ -1,0 +1,114 @@
+"""The controller's own kinematics over its wires: read, planned with, compared; what is done where it is not told."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from arm_bench import ArmBench
+from cable import Cable
+
+from cell.geometry.poses import to_ur
+from cell.motion.arm_models import arm_kinematics
+from drivers.arm.factory import read_factory_kinematics
+from drivers.arm.ur import UrArm
+from drivers.clock import Clock
+from drivers.errors import ConfigError, DeviceFault
+
+pytestmark = pytest.mark.wire
+
+FACTORY = np.array(
+    [
+        [2e-4, -3e-4, -6e-4, 1e-7], [4e-4, 0.3, -1.2e-3, -1e-3], [-4e-4, -0.2, 2.1e-3, 2e-3],
+        [-1e-4, -0.0996, -1e-3, -8e-4], [1e-5, -2e-4, 9e-4, -4e-5], [0.0, -1e-4, 0.0, 1e-6],
+    ]
+)  # fmt: skip
+"""a, d, alpha, joint offset, as a factory may have found them: the offsets of joints 2 to 4 nearly cancel."""
+
+
+def forward_of(table):
+    """The cell's model of a UR10e whose controller told `table`."""
+    arm = arm_kinematics("UR10e", table)
+    return lambda joints: to_ur(arm.fk(joints))
+
+
+def connect(address):
+    return UrArm("arm", address, forward_of=forward_of, clock=Clock())
+
+
+def test_an_arm_is_moved_by_the_table_that_its_controller_tells():
+    with ArmBench(factory=FACTORY) as bench:
+        arm = connect(bench.address)
+        try:
+            assert arm.factory.status == "linearised"
+            np.testing.assert_array_equal(
+                arm.link_table().alpha, FACTORY[:, 2] + [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
+            )
+            model, drawn = arm_kinematics("UR10e", arm.link_table()), arm_kinematics("UR10e", None)
+            state = arm.state()
+            goal = pin.SE3(np.eye(3), np.array([0.0, 0.02, -0.03])) * model.fk(state.joints)
+            arm.move_joints(model.ik(goal, state.joints), 0.5, 1.0).wait(10.0)
+            reached = arm.state()
+            np.testing.assert_allclose(reached.flange, to_ur(goal), atol=1e-6)
+            off = drawn.fk(reached.joints).actInv(goal)
+            assert np.linalg.norm(off.translation) > 0.5e-3, "the maker's table would have missed"
+        finally:
+            arm.close()
+
+
+def test_where_the_controller_tells_no_table_nothing_moves_unless_it_is_the_makers():
+    with ArmBench(factory=FACTORY) as bench, Cable(bench.address, but=(30001,)) as cable:
+        assert "30001" in read_factory_kinematics(cable.address, timeout=0.5).missing
+        before = bench.ask("show")["q"]
+        with pytest.raises(DeviceFault, match=r"own kinematics is not known \(port 30001 .*Open that port") as caught:
+            connect(cable.address)
+        assert caught.value.code == "arm.wrong_kinematics"
+        assert bench.ask("show")["q"] == before
+    with ArmBench() as bench, Cable(bench.address, but=(30001,)) as cable:
+        arm = connect(cable.address)
+        assert arm.link_table() is None
+        arm.move_joints(arm.state().joints + 0.02, 0.5, 1.0).wait(10.0)
+        arm.close()
+
+
+def test_an_arm_of_another_size_is_named_before_anything_is_sent_to_it():
+    with ArmBench(model="UR5e") as bench, pytest.raises(ConfigError, match=r"The nearest model is UR5e"):
+        connect(bench.address)
+
+
+@pytest.mark.parametrize(
+    ("sent", "why"),
+    [
+        (struct.pack(">iB", 5, 20), "sent none within 0.5 s"),
+        (struct.pack(">iB", 3, 16), "package of 3 bytes"),
+        (struct.pack(">iB", 15, 16) + struct.pack(">IB", 99, 5) + bytes(5), "part of 99 bytes where 10 are left"),
+        (struct.pack(">iB", 70_000, 16), "package of 70000 bytes"),
+        (struct.pack(">iBIB6I24dI", 230, 16, 225, 5, *[0] * 6, *[np.nan] * 24, 2), "theta of a link table"),
+    ],
+    ids=["none", "short", "part", "long", "nan"],
+)
+def test_a_port_that_sends_something_else_is_unknown_with_its_reason(sent, why):
+    for number in range(2, 255):
+        try:
+            server = socket.create_server((f"127.0.4.{number}", 30001))
+            break
+        except OSError:
+            continue
+    with server:
+        thread = threading.Thread(target=_send, args=(server, sent), daemon=True)
+        thread.start()
+        told = read_factory_kinematics(server.getsockname()[0], timeout=0.5)
+        thread.join(3.0)
+    assert told.table is None
+    assert why in told.missing
+
+
+def _send(server, sent):
+    """Tell the first client this, and wait for it to leave."""
+    with server.accept()[0] as connection:
+        connection.sendall(sent)
+        connection.recv(1)
