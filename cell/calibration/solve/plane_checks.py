@@ -161,17 +161,20 @@ def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
     return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
 
 
+def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
+    """The RMS (m) of a plane's points (n, 3) against their span, beside the stripe's own σ (m)."""
+    size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+    return Check(
+        "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
+        f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
+        "points are not those of one plane; are there two lines, or something else that shines?",
+    )  # fmt: skip
+
+
 def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown) -> list[Check]:
     """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters."""
-    size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     reach = float(np.median(cloud[:, 2]))
-    made = [
-        Check(
-            "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
-            f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
-            "points are not those of one plane; are there two lines, or something else that shines?",
-        )
-    ]  # fmt: skip
+    made = [plane_fit_check(rms, own, cloud)]
     if frames < LEAST_CHECKED:
         made.append(
             Check(
