@@ -12,6 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from pydantic import AfterValidator, model_validator
 
 from cell.toml_file import Table
@@ -156,7 +157,10 @@ class VehicleConfig(DeviceConfig):
 
 
 class CameraConfig(DeviceConfig):
-    """A camera with its nominal optics and mounting."""
+    """A camera with its nominal optics and mounting.
+
+    `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    """
 
     width: Pixels
     height: Pixels
@@ -164,6 +168,7 @@ class CameraConfig(DeviceConfig):
     focal_length: Annotated[float, quantity("mm", 1, 200)]
     flange_from_camera: Mounting
     photo_exposure: PhotoExposure
+    late: Annotated[float, quantity("ms", 0, 100)] = 0.002
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
@@ -182,10 +187,19 @@ class CameraConfig(DeviceConfig):
 
 
 class LaserConfig(DeviceConfig):
-    """The line laser with its nominal place in the scan camera's frame."""
+    """The line laser with its nominal place in the scan camera's frame.
+
+    `witness`: where the rail shows the scan camera the line on a plate that is fixed to the claw; None without one.
+    """
 
     baseline: Annotated[float, quantity("mm", 5, 500)]
     tan_theta: Annotated[float, number(0.2, 20)]
+    witness: Annotated[float, quantity("mm", -2000, 2000)] | None = None
+
+    @property
+    def exit_point(self) -> NDArray[np.float64]:
+        """The laser's exit point (3,) in the scan camera's frame as drawn, m."""
+        return np.array([-self.baseline, 0.0, 0.0])
 
 
 class ClawConfig(DeviceConfig):

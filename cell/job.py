@@ -10,7 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from cell.addresses import Name
@@ -124,10 +126,17 @@ Edge = Annotated[float, quantity("mm", 1, 1_000)]
 
 
 class GraspSection(Table):
-    """How the claw holds the part."""
+    """How the claw holds the part, and how exactly: nothing of the cell sees the part before it is placed."""
 
     flange_from_part: Mounting
     size: tuple[Edge, Edge, Edge]
+    sigma: Annotated[float, quantity("mm", 0, 5)] = 1e-4
+    sigma_angle: Annotated[float, quantity("mrad", 0, 50)] = 1e-3
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) of the part's place in the claw about its origin, m² and rad², the same in every direction."""
+        return np.diag([self.sigma**2] * 3 + [self.sigma_angle**2] * 3)
 
 
 class PlaceSection(Table):

@@ -65,6 +65,23 @@ def test_that_of_another_device_is_not_taken(tmp_path: Path, device: str) -> Non
         found(tmp_path)
 
 
+@pytest.mark.parametrize(("kept", "now"), [("UR10e 0a1b", "UR10e 2c3d"), ("", "UR10e 2c3d"), ("UR10e 0a1b", "")])
+def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept: str, now: str) -> None:
+    save_calibration(replace(made(), kinematics=kept), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match="another kinematics of the arm") as caught:
+        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, now)
+    for word in (kept or "it does not say which", now or "none that is known", "30001", "run `cell calibrate`"):
+        assert word in str(caught.value)
+    assert find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, kept).kinematics == kept
+
+
+def test_the_arm_that_was_exchanged_is_named(tmp_path: Path) -> None:
+    save_calibration(made(devices={**DEVICES, "arm": "B7"}), tmp_path / "other.json")
+    save_calibration(made(devices={**DEVICES, "arm": "B8", "rail": "R9"}), tmp_path / "far.json")
+    with pytest.raises(CalibrationStale, match=r"was made with another one: arm B7; run"):
+        found(tmp_path)
+
+
 def test_that_of_fewer_or_more_devices_is_not_taken(tmp_path: Path) -> None:
     save_calibration(made(devices={"arm": "A1"}), tmp_path / "fewer.json")
     save_calibration(made(devices={**DEVICES, "mirror": "M1"}), tmp_path / "more.json")

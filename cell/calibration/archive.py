@@ -20,6 +20,7 @@ import pinocchio as pin
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
+from cell.calibration.witness import Witness
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
@@ -51,6 +52,7 @@ class Observations:
     configuration: str
     made: float
     kinematics: str = ""
+    witness: Witness | None = None
 
 
 def write_archive(path: Path, observations: Observations) -> None:
@@ -72,6 +74,9 @@ def write_archive(path: Path, observations: Observations) -> None:
     arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
     arrays["scan_same_rest"] = np.array([s.same_rest for s in o.scan], dtype=np.bool_)
     arrays |= _profiles([s.profile for s in o.scan])
+    if o.witness is not None:
+        arrays |= {"witness_columns": o.witness.columns, "witness_sigma": o.witness.sigma}
+        about["witness_rail"] = o.witness.rail
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
@@ -121,11 +126,21 @@ def read_archive(path: Path) -> Observations:
             str(about["configuration"]),
             float(about["made"]),
             str(about.get("kinematics", "")),
+            _read_witness(data, about),
         )
     except KeyError as error:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error
     except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
+
+
+def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness | None:
+    if "witness_rail" not in about:
+        return None
+    columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
+    if columns.ndim != 1 or columns.shape != sigma.shape:
+        raise ValueError("the witness needs a deviation for each of its columns")
+    return Witness(float(about["witness_rail"]), columns, sigma)
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.store import CellCalibration, gathered, solve_observations
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
@@ -42,9 +43,10 @@ def calibrate(
     devices.vehicle.recover()
     given = config, devices, mover, hands.check
     scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
+    witness = look_at_witness(config, devices, hands.keep)
     target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
     tell(0.96, "solving")
-    observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices))
+    observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
     return observations, solve_observations(observations).calibration
 
 

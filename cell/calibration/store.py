@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from cell.calibration.archive import SUFFIX, Observations, write_archive
 from cell.calibration.solve.faults import refuse_wrong_lead
 from cell.calibration.solve.joint import Joint
 from cell.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
+from cell.calibration.witness import Witness
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.report.html import table
@@ -54,9 +55,10 @@ class CellCalibration:
         identities: dict[str, str],
         config: CellConfig,
         kinematics: str = "",
+        witness: Witness | None = None,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config, kinematics)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics, witness)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"
@@ -149,6 +151,7 @@ def gathered(
     identities: dict[str, str],
     config: CellConfig,
     kinematics: str = "",
+    witness: Witness | None = None,
 ) -> Observations:
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
@@ -167,6 +170,7 @@ def gathered(
         config.calibration_hash(),
         time.time(),
         kinematics,
+        witness,
     )
 
 
@@ -174,7 +178,7 @@ def solve_observations(observations: Observations) -> Solved:
     """Both cameras' adjustments; nothing but the observations counts. `RefusedError` when they say too little."""
     o = observations
     scan = adjust_scan(o.scan, o.scan_camera, np.array([1.0, 0.0, 0.0]), o.priors)
-    head = ScanCalibration.of(scan)
+    head = replace(ScanCalibration.of(scan), witness=o.witness)
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
     made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made, o.kinematics)
@@ -249,6 +253,7 @@ def find_calibration(
         raise CalibrationStale(
             f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
             + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + _exchanged(found, identities)
             + "; run `cell calibrate`"
         )
     current = [entry for entry in own if entry.configuration == configuration]
@@ -278,6 +283,20 @@ def find_calibration(
             "set this machine's clock, or run `cell calibrate`"
         )
     return newest
+
+
+def _exchanged(found: list[CellCalibration], identities: dict[str, str]) -> str:
+    """Which devices the calibration that is nearest to these was made with instead, in words."""
+
+    def others(entry: CellCalibration) -> list[str]:
+        names = sorted(entry.identities.keys() | identities.keys())
+        return [name for name in names if entry.identities.get(name) != identities.get(name)]
+
+    if not found:
+        return ""
+    nearest = min(found, key=lambda entry: (len(others(entry)), -entry.made))
+    instead = ", ".join(f"{name} {nearest.identities.get(name, 'none')}" for name in others(nearest))
+    return f". That of {nearest.date} was made with another one: {instead}"
 
 
 def _lens(camera: CameraModel) -> dict[str, float]:

@@ -39,7 +39,8 @@ def solve(
     loaded = load_config(find_config(config, simulated=True))
     if config is not None:
         o = observations
-        observations = replace(gathered(o.scan, o.target, o.identities, loaded, o.kinematics), made=o.made)
+        again = gathered(o.scan, o.target, o.identities, loaded, o.kinematics, o.witness)
+        observations = replace(again, made=o.made)
     solved = solve_observations(observations)
     summary = solved.calibration.summary()
     examination = examine(solved, observations, loaded, job)

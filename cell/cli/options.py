@@ -16,6 +16,7 @@ class Level(StrEnum):
     ideal = "ideal"
     nominal = "nominal"
     harsh = "harsh"
+    workshop = "workshop"
 
 
 class CellClock(StrEnum):

@@ -128,8 +128,9 @@ def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -
 
 
 def _arm_state(arm: Arm) -> str:
-    state = arm.state()
-    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg"
+    state, table = arm.state(), arm.link_table()
+    own = "own kinematics not told" if table is None else f"own kinematics {table.hash()}"
+    return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg, {own}"
 
 
 def _rail_state(rail: Rail) -> str:

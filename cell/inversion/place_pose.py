@@ -35,7 +35,7 @@ class PlacePose:
     share: accepted among those over the surface; coverage: share of the surface that was seen.
     parts_differ: how far from this place a quarter of the surface puts it, beyond three sigma, in tolerances.
     correction: (6,) from the board's pose to this one, base axes, m and rad; disagreement: squared Mahalanobis distance
-    between the two.
+    between the two. notes: for people, what is not as usual.
     """
 
     base_from_surface: pin.SE3
@@ -51,6 +51,7 @@ class PlacePose:
     parts_differ: float
     correction: Array
     disagreement: float
+    notes: tuple[str, ...] = ()
 
     @property
     def sigma(self) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial import cKDTree
 
-from cell.geometry.poses import transform
+from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from drivers.interfaces import Vector
@@ -33,13 +33,20 @@ def part_points(nominal: NominalSurface) -> Vector:
     return nominal.samples[nearest]
 
 
-def stated_bound(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector) -> dict[str, Any]:
+def stated_bound(
+    job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector, grasp: Vector | None = None
+) -> dict[str, Any]:
     """Bounds in mm that hold for 95 % of the part's 45 points, by axis of the surface's frame and for D.
 
-    From the pose's own covariance and from `placing`, the (6, 6) covariance of the flange each time the arm comes to
-    rest. How the claw holds the part is not in it.
+    From the pose's own covariance, from `placing`, the (6, 6) covariance of the flange each time the arm comes to
+    rest, and from `grasp`, the (6, 6) covariance of the part in the claw about the part's origin; without it the part
+    is taken to be held exactly as configured.
     """
     covariances = point_covariances(job, nominal, pose, pose.covariance, placing)
+    if grasp is not None:
+        points, _ = placed_points(job, nominal, pose)
+        part = transform(pose.base_from_surface, job.place.surface_from_part.se3().translation[None])
+        covariances = covariances + through(points - part, grasp)
     turn = pose.base_from_surface.rotation
     errors = 1e3 * np.abs(draws(turn.T @ covariances @ turn))
     distance = np.linalg.norm(errors, axis=-1)
@@ -55,6 +62,21 @@ def point_covariances(job: Job, nominal: NominalSurface, pose: PlacePose, of_pos
     points, place_flange = placed_points(job, nominal, pose)
     covariance = through(points - pose.base_from_surface.translation, of_pose)
     return covariance + through(points - place_flange.translation, placing)
+
+
+def part_covariance(job: Job, pose: PlacePose, placing: Vector) -> Vector:
+    """Covariance (6, 6), m² and rad², surface axes, of surface_from_part as it ends, about the part's origin.
+
+    Of the pose, of the flange as it lets go (`placing`, (6, 6), base axes) and of the grasp.
+    """
+    base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
+    place_flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
+    made = job.grasp.covariance
+    for origin, covariance in ((pose.base_from_surface, pose.covariance), (place_flange, placing)):
+        carried = composition_jacobians(origin, origin.inverse() * base_from_part)[0]
+        made = made + carried @ covariance @ carried.T
+    turn = np.kron(np.eye(2), pose.base_from_surface.rotation.T)
+    return np.asarray(turn @ made @ turn.T)
 
 
 def placed_points(job: Job, nominal: NominalSurface, pose: PlacePose) -> tuple[Vector, pin.SE3]:

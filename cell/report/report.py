@@ -79,7 +79,7 @@ def make_report(
     if isinstance(pose, PlacePose):
         report["place_pose"] = _pose(pose, job)
         report["place_sigma"] = _sigma(pose)
-        report["place_bound_95"] = stated_bound(job, nominal, pose, repeatability)
+        report["place_bound_95"] = stated_bound(job, nominal, pose, repeatability, job.grasp.covariance)
     report["measured"] = measured(result, job, None, report["place_bound_95"])
     if frames.failure is not None:
         report["frames_missing"] = frames.failure

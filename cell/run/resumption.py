@@ -69,7 +69,7 @@ class UnfinishedRun:
             if self.info[name] != value:
                 return None, f"the {name.removesuffix('_hash')} was changed since run {self.folder.name}"
         try:
-            stored = StoredSweep.load(self.folder, calibration.scan.geometry(), job.scan)
+            stored = StoredSweep.load(self.folder, calibration.scan, job.scan, config.laser.exit_point)
         except RefusedError as error:
             return None, str(error)
         return stored, f"the sweep of run {self.folder.name} is used if the board has not moved"

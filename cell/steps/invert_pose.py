@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
+import pinocchio as pin
 
 from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
+from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
 from cell.job import Job
+from cell.reconstruction.cloud import Indices
+from cell.reconstruction.seams import Motions
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction
 from cell.steps.step import JobStep
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
+from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 from statemachine.policy import Step
 from statemachine.runner import StepContext
 
 
-def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface, kinematic: Vector) -> PlacePose:
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """When each line of the cloud was taken, (lines,) in s from any moment, and what the arm's base stands on."""
+
+    times: Vector
+    base_from_vehicle: pin.SE3
+
+
+def invert_pose(
+    scan: Reconstruction,
+    fix: BoardFix,
+    job: Job,
+    nominal: NominalSurface,
+    kinematic: Vector,
+    taken: Lines | None = None,
+) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
     The base is the arm's own, as it realises it where it places; `kinematic` (6, 6) is the covariance of the surface's
     place from what the arm's geometry leaves between calibration, sweep and placing. The prior is the board's pose
-    carried on to the surface. Raises `RefusedError` when scan, surface and board do not fit together and
+    carried on to the surface. With the lines' times a vehicle that rocks is seen and told apart from the pose.
+
+    Raises `RefusedError` when scan, surface and board do not fit together or the vehicle rocks too much, and
     `NotObservable` when a direction is not known to the job's tolerance.
     """
     board_from_surface = job.place_from_board.inverse() * job.surface.place_from_surface.se3()
@@ -30,19 +55,51 @@ def invert_pose(scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalS
     surface = job.surface
     mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
     spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
-    return register(
-        scan.cloud,
-        nominal,
-        Prior(expected, spread),
-        Tolerance(job.place.tolerance, job.place.tolerance_angle),
-        systematic=kinematic,
-        calibration=scan.by_calibration,
-        sweeps=scan.by_poses,
-    )
+
+    def registered(sweeps: Motions, systematic: Vector) -> PlacePose:
+        return register(
+            scan.cloud,
+            nominal,
+            Prior(expected, spread),
+            Tolerance(job.place.tolerance, job.place.tolerance_angle),
+            systematic=systematic,
+            calibration=scan.by_calibration,
+            sweeps=sweeps,
+        )
+
+    found: PlacePose | RefusedError
+    try:
+        found = registered(scan.by_poses, kinematic)
+        pose = found.base_from_surface
+    except RefusedError as refused:
+        # A vehicle that rocks bends the surface, and may be all that is wrong.
+        found, pose = refused, refused.seen.get("pose")
+    rocking = None
+    if taken is not None and isinstance(pose, pin.SE3):
+        rocking = find_rocking(scan.cloud, nominal, pose, taken.times)
+    if rocking is None or taken is None:
+        if isinstance(found, RefusedError):
+            raise found
+        return found
+    times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
+
+    def by_poses(lines: Indices, rows: Indices) -> Vector:
+        shaken = rocking_motions(scan.cloud, lines, rows, vehicle, times, hz)
+        return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
+
+    unknown = rocking_covariance(rocking, vehicle, expected.translation)
+    return replace(registered(by_poses, kinematic + unknown), notes=(words(rocking),))
 
 
 def _at(here: Workplace, context: StepContext) -> PlacePose:
-    return invert_pose(context.made(Reconstruction), context.made(BoardFix), here.job, here.nominal, here.kinematic)
+    # Frames come evenly, lost ones are counted: an id tells the time.
+    ids = np.concatenate([swath.frame_ids for swath in context.made(SweepRecord).swaths])
+    taken = Lines(ids / here.job.scan.frame_rate, here.config.arm.vehicle_from_base.se3().inverse())
+    scan, fix = context.made(Reconstruction), context.made(BoardFix)
+    found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+    for note in found.notes:
+        context.note(text=note)
+    return found
 
 
-STEP = JobStep(Step("invert_pose", 60.0, on_wall=True), _at, PlacePose, needs=(BoardFix, Reconstruction))
+STEP = JobStep(Step("invert_pose", 60.0, on_wall=True), _at, PlacePose, needs=(BoardFix, SweepRecord, Reconstruction))

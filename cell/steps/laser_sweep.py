@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+from cell.calibration.collect.witness import look_at_witness
+from cell.calibration.witness import Pointing
+from cell.calibration.witness import pointing as pointing_since
 from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
@@ -112,15 +116,19 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     if not devices.rail.state().homed_here:
         context.progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
-    return laser_sweep(
-        scan_plans(here.config, here.job, base_from_surface, here.calibration.scan),
+    head, pointing = here.calibration.scan, _pointing(here, context)
+    if pointing is not None:
+        head = head.pointed(pointing, here.config.laser.exit_point)
+    record = laser_sweep(
+        scan_plans(here.config, here.job, base_from_surface, head),
         unhurried(here.job.scan, context.attempt),
-        here.calibration.scan.geometry(),
+        head.geometry(),
         SweepErrors(
             here.repeatability,
             here.config.calibration.rail_sigma,
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
+            here.config.scan_camera.late,
         ),
         here.mover,
         devices,
@@ -128,6 +136,22 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.check,
         context.progress,
     )
+    return replace(record, pointing=pointing)
+
+
+def _pointing(here: Workplace, context: StepContext) -> Pointing | None:
+    """Where the laser points now; None where the calibration saw no witness. `RefusedError` when it was knocked."""
+    head = here.calibration.scan
+    if head.witness is None:
+        return None
+    context.progress(0.0, "looking where the laser points")
+    seen = look_at_witness(here.config, here.devices, here.frames.keep)
+    if seen is None:
+        raise RefusedError(
+            "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
+            "in its place and clean, and that the laser is lit; if so, run `cell calibrate`"
+        )
+    return pointing_since(head.witness, seen, head.camera, head.light_plane, here.config.laser.exit_point)
 
 
 STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _at, SweepRecord, needs=(BoardFix,))

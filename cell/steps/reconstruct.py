@@ -71,7 +71,8 @@ def reconstruct(
         write_cloud(path, built)
         refused.showing(seen={"cloud": built})
         raise
-    geometry, variants = calibration.geometry(), calibration.variants()
+    # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
+    geometry, variants = sweep.swaths[0].builder.geometry, calibration.variants()
     covariances = [swath.covariance for swath in sweep.swaths]
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
@@ -93,9 +94,11 @@ def _at(here: Workplace, context: StepContext) -> Reconstruction:
     path = here.folder / "cloud.ply"
     # The cloud of an earlier sweep must not be taken for this one's.
     path.unlink(missing_ok=True)
+    sweep = context.made(SweepRecord)
+    head = here.calibration.scan
     return reconstruct(
-        context.made(SweepRecord),
-        here.calibration.scan,
+        sweep,
+        head if sweep.pointing is None else head.pointed(sweep.pointing, here.config.laser.exit_point),
         here.job.scan.largest_hole,
         path,
         here.config.arm.vehicle_from_base.se3().inverse(),

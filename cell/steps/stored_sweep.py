@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from cell.calibration import ScanCalibration
+from cell.calibration.witness import Pointing
 from cell.geometry.poses import difference, from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
@@ -45,6 +47,8 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
         "base_from_board": fix.base_from_board.homogeneous,
         "board_covariance": fix.covariance,
     }
+    if sweep.pointing is not None:
+        data["pointing"] = np.array([sweep.pointing.turn, sweep.pointing.sigma])
     for k, swath in enumerate(sweep.swaths):
         data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
         data[f"figures_{k}"] = np.array([swath.lost, swath.residual, swath.shift])
@@ -62,7 +66,7 @@ class StoredSweep:
     board_covariance: Vector
 
     @classmethod
-    def load(cls, folder: Path, geometry: ScanGeometry, scan: ScanSection) -> StoredSweep:
+    def load(cls, folder: Path, head: ScanCalibration, scan: ScanSection, exit_point: Vector) -> StoredSweep:
         """Read it, and extract the stripe from the frames again; `RefusedError` when anything of it is missing."""
         path = folder / FILE
         try:
@@ -70,6 +74,8 @@ class StoredSweep:
                 stored = {name: data[name] for name in data.files}
             if stored["format"] != FORMAT:
                 raise ValueError(f"format {stored['format']}, this program reads {FORMAT}")
+            pointing = Pointing(*map(float, stored["pointing"])) if "pointing" in stored else None
+            geometry = (head if pointing is None else head.pointed(pointing, exit_point)).geometry()
             count = sum(name.startswith("frame_ids_") for name in stored)
             swaths = tuple(_swath(folder, stored, k, geometry, scan) for k in range(count))
             if not swaths:
@@ -77,7 +83,7 @@ class StoredSweep:
             base_from_board, covariance = from_matrix(stored["base_from_board"]), stored["board_covariance"]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise RefusedError(f"{path} cannot be read as a sweep: {error}") from error
-        return cls(folder, SweepRecord(swaths), base_from_board, covariance)
+        return cls(folder, SweepRecord(swaths, pointing), base_from_board, covariance)
 
     def confirmed_by(self, fix: BoardFix) -> SweepRecord:
         """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open.
@@ -88,7 +94,7 @@ class StoredSweep:
         if moved is not None:
             raise CalibrationStale(f"the board has moved by {moved} since the sweep of run {self.folder.name}")
         spread = fix.covariance + self.board_covariance
-        return SweepRecord(tuple(self._loosened(swath, spread) for swath in self.sweep.swaths))
+        return replace(self.sweep, swaths=tuple(self._loosened(swath, spread) for swath in self.sweep.swaths))
 
     def _loosened(self, swath: Swath, spread: Vector) -> Swath:
         """With the motion that may have gone unnoticed, (6, 6) at the board's origin, added to the flange's pose."""

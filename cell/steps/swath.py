@@ -26,12 +26,14 @@ MAX_LOST_FRACTION = 0.05
 class SweepErrors:
     """What a sweep's pose may be off by: `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m²
     and rad²; `rail` one standard deviation of a rail position in m; `shift` the farthest, in m, that a sweep may lie
-    off as a whole because its times are not known better; `rate` seconds of the clock per wall second."""
+    off as a whole because its times are not known better; `rate` seconds of the clock per wall second; `late` the most,
+    in s, that a device may hold a reading back before it puts its time on it."""
 
     repeatability: Vector
     rail: float
     shift: float
     rate: float = 1.0
+    late: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
             hint=f"Shorten the way to the {worst.kind} (baud rate, adapter, network, load of this machine) or sweep "
             "more slowly.",
         )
-    return shift, speed**2 * sum(one.bound**2 for one in known) / 3.0
+    return shift, speed**2 * (sum(one.bound**2 for one in known) + errors.late**2) / 3.0
 
 
 @dataclass(frozen=True, eq=False)

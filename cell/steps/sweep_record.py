@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
+from cell.calibration.witness import NOTED_RAD, Pointing
 from cell.steps.swath import Swath
 from cell.vision import StripeProfile
 from drivers.interfaces import Frame
@@ -13,9 +14,10 @@ from drivers.interfaces import Frame
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """What the sweeps brought, in their order; at least one."""
+    """What the sweeps brought, in their order; at least one. `pointing` of the laser, where a witness told it."""
 
     swaths: tuple[Swath, ...]
+    pointing: Pointing | None = None
 
     @property
     def base_from_flange(self) -> pin.SE3:
@@ -32,6 +34,12 @@ class SweepRecord:
         """The stripe in `middle`."""
         return self.swaths[0].middle_profile
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not as usual, for people."""
+        moved = self.pointing is not None and abs(self.pointing.turn) > NOTED_RAD
+        return (self.pointing.words,) if moved and self.pointing is not None else ()
+
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
@@ -40,5 +48,6 @@ class SweepRecord:
             "lost_frames": sum(swath.lost for swath in self.swaths),
             "points": sum(swath.points for swath in self.swaths),
             "residual_um": [round(1e6 * swath.residual, 2) for swath in self.swaths],
+            "laser_turned_mrad": None if self.pointing is None else round(1e3 * self.pointing.turn, 4),
             "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
         }

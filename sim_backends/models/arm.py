@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sim_backends.clock import WorldClock
+from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
 from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
 from sim_backends.models.arm_truth import TruePose
@@ -54,12 +55,18 @@ class ArmParams:
     `dh` and `dh_error` are (6, 4): a in m, d in m, alpha in rad, joint offset in rad. `dh` is what the controller
     computes with and tells; the error is the true table less that one. `repeatability` holds standard deviations
     per axis in m and rad; `force_noise` in N and N·m; `force_limit` in N is where a protective stop comes;
-    `unlock_delay` in s is how long it cannot be unlocked.
+    `unlock_delay` in s is how long it cannot be unlocked. `memory` in rad is the joints' way over which the
+    error of repeatability lasts (0: drawn at each rest); for `harmonics` and `compliance` see `JointErrors`; `carried`
+    in kg.
     """
 
     dh: Matrix = field(default_factory=lambda: UR10E_DH.copy())
     dh_error: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
     repeatability: tuple[float, float] = (0.0, 0.0)
+    memory: float = 0.0
+    harmonics: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
+    compliance: float = 0.0
+    carried: float = 2.1
     blend_time: float = 0.3
     joint_limit: float = 2 * math.pi
     speed_limits: Vector = field(default_factory=lambda: np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]))
@@ -104,7 +111,10 @@ class ArmModel:
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
-        self._truth = TruePose(Kinematics(params.dh + params.dh_error), params.repeatability, params.blend_time, rng)
+        true = Kinematics(params.dh + params.dh_error)
+        bends = params.harmonics.any() or params.compliance > 0.0
+        joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
+        self._truth = TruePose(true, params.repeatability, params.blend_time, rng, joints, params.memory)
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     # --- the world's side ---

@@ -1,7 +1,8 @@
 """Where the flange truly is: the true kinematics at the encoders' joint angles, and an error of repeatability.
 
 The error is drawn anew for every rest. While the arm moves, it passes smoothly from the last rest's error to the next
-one's, and its variance stays the same on the way.
+one's, and its variance stays the same on the way. Or, with a memory, it is another one only after some way of the
+joints: a place approached again in the same manner has the same error. What the joints are off is in `arm_joints`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 import numpy as np
 
 from sim_backends.history import History
+from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import Kinematics, Matrix, Vector, rotation_matrix
 
 
@@ -18,9 +20,16 @@ class TruePose:
     """True base_from_flange over time of an arm with `kinematics`; errors per axis `sigma` in m and rad."""
 
     def __init__(
-        self, kinematics: Kinematics, sigma: tuple[float, float], blend_time: float, rng: np.random.Generator
+        self,
+        kinematics: Kinematics,
+        sigma: tuple[float, float],
+        blend_time: float,
+        rng: np.random.Generator,
+        joints: JointErrors | None = None,
+        memory: float = 0.0,
     ) -> None:
-        """`blend_time` is how many seconds of motion the error takes to become the next one."""
+        """`blend_time` is how many seconds of motion the error takes to become the next one; with a `memory`, rad, it
+        changes with the joints' way instead, and is another one after about that way."""
         self.pose: Matrix = np.eye(4)
         self._kinematics = kinematics
         self._sigma = np.repeat(sigma, 3)
@@ -30,12 +39,16 @@ class TruePose:
         self._turn = rotation_matrix(self._error[3:])
         self._blend = 1.0
         self._resting = True
+        self._joints = joints
+        self._memory = memory
         self._q: Vector | None = None
         self._history = History()
 
     def update(self, t: float, dt: float, q: Vector, moving: bool) -> None:
         """Follow the joints `q` (6,) to world time `t`, `dt` after the last call, and remember the pose."""
-        if moving:
+        if moving and self._memory > 0.0:
+            self._drift(q)
+        elif moving:
             self._wander(dt)
         self._resting = not moving
         self.look(q)
@@ -44,7 +57,7 @@ class TruePose:
     def look(self, q: Vector) -> Matrix:
         """The true pose (4, 4) at joint angles `q` with the error of this moment; not remembered."""
         if self._q is not q:
-            pose = self._kinematics.forward(q)
+            pose = self._kinematics.forward(q if self._joints is None else self._joints.true(q))
             pose[:3, 3] += self._error[:3]
             pose[:3, :3] = self._turn.dot(pose[:3, :3])
             self.pose, self._q = pose, q
@@ -57,6 +70,15 @@ class TruePose:
     def _draw(self) -> Vector:
         error: Vector = self._rng.normal(size=6) * self._sigma
         return error
+
+    def _drift(self, q: Vector) -> None:
+        """A first-order process over the joints' way, with the same variance everywhere."""
+        way = 0.0 if self._q is None else float(np.linalg.norm(q - self._q))
+        if way > 0.0:
+            kept = math.exp(-way / self._memory)
+            self._error = kept * self._error + math.sqrt(1.0 - kept * kept) * self._draw()
+            self._turn = rotation_matrix(self._error[3:])
+            self._q = None
 
     def _wander(self, dt: float) -> None:
         if self._resting:

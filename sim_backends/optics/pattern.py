@@ -11,12 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.compiled import compiled
-from sim_backends.optics.scene import KINDS, Board
+from sim_backends.optics.scene import KINDS, Board, Grain
 
 Vector = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-PLAIN, MARKED, ASYMMETRIC, DOTS, CHESS = range(5)
+PLAIN, MARKED, ASYMMETRIC, DOTS, CHESS, GRAIN = range(6)
+GRAINS = (0.3e-3, 1.0e-3)
+"""Sizes of a texture's grains, m; each has half of its variance."""
+SPOT_CELL = 5e-3
+"""In each square of this edge there is at most one spot of dust, of albedo a sixth."""
 EDGE, OUTSIDE = -1.0, -2.0
 LINES = 8
 """Scan lines through an edge pixel."""
@@ -44,6 +48,48 @@ def plain_parameters(bounds: tuple[float, float, float, float], albedo: float) -
     return np.array([PLAIN, 1, 1, 1.0, *bounds, albedo, albedo, 0.0, 0.0])
 
 
+def grain_parameters(albedo: float, grain: Grain | None) -> Vector:
+    """Parameters of a surface without an end, same layout: its spots' share of cells and its texture's RMS."""
+    made = plain_parameters((0.0, 0.0, 0.0, 0.0), albedo)
+    if grain is not None and (grain.texture > 0.0 or grain.spots > 0.0):
+        made[0] = GRAIN
+        made[1], made[2] = min(1.0, grain.spots * 1e4 * SPOT_CELL**2), grain.texture
+    return made
+
+
+@compiled
+def chance(i: int, j: int, salt: int) -> float:
+    """A number from 0 to 1 that belongs to the cell (i, j)."""
+    z = (i * 73856093) ^ (j * 19349663) ^ (salt * 83492791)
+    z = (z ^ (z >> 13)) * 1274126177 & 0x7FFFFFFF
+    z = (z ^ (z >> 16)) * 668265263 & 0x7FFFFFFF
+    return float((z ^ (z >> 15)) & 0xFFFFFF) / 16777216.0
+
+
+@compiled
+def grain_at(bx: float, by: float, pattern: Vector) -> float:
+    """Albedo of a textured, dusty surface: smoothed chance at the corners of two grids, then the spots."""
+    value = 0.0
+    for k in range(2):
+        x, y = bx / GRAINS[k], by / GRAINS[k]
+        i, j = math.floor(x), math.floor(y)
+        a, b = x - i, y - j
+        a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)
+        low = (1.0 - a) * chance(i, j, k) + a * chance(i + 1, j, k)
+        high = (1.0 - a) * chance(i, j + 1, k) + a * chance(i + 1, j + 1, k)
+        value += (1.0 - b) * low + b * high - 0.5
+    # Even chances have a variance of 1/12, of which the smoothing keeps 0.55.
+    albedo = pattern[8] * max(0.1, 1.0 + pattern[2] * 3.3 * value)
+    i, j = math.floor(bx / SPOT_CELL), math.floor(by / SPOT_CELL)
+    if chance(i, j, 2) < pattern[1]:
+        x = (i + 0.15 + 0.7 * chance(i, j, 3)) * SPOT_CELL
+        y = (j + 0.15 + 0.7 * chance(i, j, 4)) * SPOT_CELL
+        radius = 0.2e-3 + 0.3e-3 * chance(i, j, 5)
+        if (bx - x) ** 2 + (by - y) ** 2 < radius * radius:
+            albedo = pattern[8] / 6.0
+    return float(albedo)
+
+
 @compiled
 def nearest_dot(bx: float, by: float, pattern: Vector) -> tuple[float, float, bool]:
     """Centre of the dot nearest to a point of the board, and whether it is a ring."""
@@ -65,6 +111,8 @@ def albedo_at(bx: float, by: float, pattern: Vector) -> float:
     kind = int(pattern[0])
     if kind == PLAIN:
         return float(pattern[8])
+    if kind == GRAIN:
+        return grain_at(bx, by, pattern)
     if kind == CHESS:
         p = pattern[3]
         a, b = math.floor(bx / p), math.floor(by / p)

@@ -76,6 +76,7 @@ def expose(
     slopes: Vector,
     points: Vector,
     normals: Vector,
+    factors: Vector,
     intrinsics: Vector,
     camera: Vector,
     plane_normal: Vector,
@@ -85,8 +86,11 @@ def expose(
     pose: Vector,
     pattern: Vector,
 ) -> None:
-    """Draw crossings of one object. On a patterned board the sheet is cut into sub-sheets and sub-rows, each with the
-    albedo under it, so that the edges of dots pull the stripe as they do in a real picture."""
+    """Draw crossings of one object, each with a factor on its light.
+
+    On a patterned board the sheet is cut into sub-sheets and sub-rows, each with the albedo under it, so that the
+    edges of dots pull the stripe as they do in a real picture.
+    """
     patterned = pattern[0] > 0
     width, height = image.shape[1], image.shape[0]
     sheets = 9 if patterned else 1
@@ -114,7 +118,9 @@ def expose(
         span = np.sqrt(lx * lx + ly * ly + lz * lz)
         incidence = abs(mx * lx + my * ly + mz * lz) / span
         a, b = columns[i] - 0.5 * (width - 1), rows[i] - 0.5 * (height - 1)
-        light = brightness * incidence * REFERENCE_RANGE / span * (1.0 - camera[5] * (a * a + b * b) * corner)
+        light = (
+            factors[i] * brightness * incidence * REFERENCE_RANGE / span * (1.0 - camera[5] * (a * a + b * b) * corner)
+        )
         disc = camera[0] / camera[1] * camera[0] * abs(pz - camera[2]) / (pz * (camera[2] - camera[0])) / camera[3]
         lens = camera[4] * camera[4] + disc * disc / 16.0
         slope = min(max(slopes[i], -20.0), 20.0)

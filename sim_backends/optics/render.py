@@ -15,6 +15,7 @@ from sim_backends.optics.sensor import sensor
 from sim_backends.optics.shading import render_mesh
 from sim_backends.optics.speckle import add_speckled
 from sim_backends.optics.stripe import render_stripe
+from sim_backends.optics.sunlight import add_sun
 
 Image = NDArray[np.float32]
 
@@ -53,6 +54,8 @@ def expected_image(
             render_mesh(image, optics, instance, light, exposure)
         else:
             render_rectangle(image, optics, instance, light, exposure)
+    if light.sun is not None:
+        add_sun(image, optics, light.sun)
     if laser is not None:
         stripe = np.zeros_like(image)
         touched = render_stripe(stripe, optics, laser, list(scene), exposure)

@@ -93,16 +93,41 @@ class PlaneInstance:
     albedo: float = 0.5
 
 
+@dataclass(frozen=True)
+class Grain:
+    """How a surface is uneven in colour and gloss, the same at the same place whenever it is seen.
+
+    `texture`: RMS of the albedo, relative, in grains of 0.3 and 1 mm. `spots` of dust per cm², dark, 0.4 to 1 mm
+    across.
+    `gloss`: light mirrored straight into the camera, of that scattered, in a lobe of 0.2 rad.
+    """
+
+    texture: float = 0.0
+    spots: float = 0.0
+    gloss: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class MeshInstance:
-    """A mesh at a pose, of one `albedo`, seen from both sides."""
+    """A mesh at a pose, of one `albedo` with its `grain`, seen from both sides."""
 
     camera_from_mesh: Pose
     mesh: Mesh
     albedo: float = 0.6
+    grain: Grain | None = None
 
 
 SceneObject = BoardInstance | PlaneInstance | MeshInstance
+
+
+@dataclass(frozen=True, eq=False)
+class Sun:
+    """A strip of sunlight `strength` times the room's light, over `low` ≤ x ≤ `high`, m, of the plane z = 0."""
+
+    camera_from_ground: Pose
+    low: float
+    high: float
+    strength: float
 
 
 @dataclass(frozen=True)
@@ -119,6 +144,7 @@ class Light:
     direction: tuple[float, float, float] | None = None
     diffuse: float = 0.6
     surroundings: float = 0.35
+    sun: Sun | None = None
 
 
 @dataclass(frozen=True)
@@ -129,6 +155,9 @@ class LaserOptics:
     camera's z direction. `width` is the standard deviation of the sheet's thickness in m. `brightness` in DN/s: the
     sharp image of a white (albedo 1) surface that faces the laser at 0.130 m. `speckle_contrast` is C, the relative
     standard deviation of a pixel's light, `speckle_px` the standard deviation of the grain's correlation kernel.
+    `bow`: the sheet is off its plane by bow · y²/r, with y across the fan's middle and r along it, m. `end`: angle from
+    the middle, rad, at which the fan has faded to a half (0: never). `shadows` of dust on its window: angle, half width
+    (rad), share of light taken.
     """
 
     origin: tuple[float, float, float] = (-0.035, 0.0, 0.0)
@@ -139,3 +168,6 @@ class LaserOptics:
     brightness: float = 1.25e5
     speckle_contrast: float = 0.15
     speckle_px: float = 0.5
+    bow: float = 0.0
+    end: float = 0.0
+    shadows: tuple[tuple[float, float, float], ...] = ()

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
 from sim_backends.optics.compiled import compiled
-from sim_backends.optics.pattern import plain_parameters
+from sim_backends.optics.pattern import grain_parameters
 from sim_backends.optics.profile import expose
 from sim_backends.optics.scene import LaserOptics, MeshInstance, SceneObject
+from sim_backends.optics.sheet import bend, light_at
 from sim_backends.optics.visibility import laser_frame, lit
 
 Vector = NDArray[np.float64]
@@ -66,6 +67,10 @@ def crossings(optics: CameraOptics, laser: LaserOptics, instance: SceneObject) -
         values,
     )
     values = values[:count]
+    if laser.bow != 0.0 and count:
+        columns, points = values[:, 0].copy(), values[:, 2:5].copy()
+        bend(columns, points, values[:, 5:8].copy(), optics.intrinsics, laser)
+        values[:, 0], values[:, 2:5] = columns, points
     return Crossings(rows[:count], values[:, 0], values[:, 1], values[:, 2:5], values[:, 5:8])
 
 
@@ -98,19 +103,23 @@ def render_stripe(
             found = found.keep(lit(found.points, found.normals, instance, scene, laser))
         if not len(found.rows):
             continue
+        grain = None
         if isinstance(instance, MeshInstance):
-            pose = np.eye(4)
-            pattern = plain_parameters((0.0, 0.0, 0.0, 0.0), instance.albedo)
+            grain = instance.grain
+            pose = np.asarray(instance.camera_from_mesh, dtype=np.float64)
+            pattern = grain_parameters(instance.albedo, grain)
         else:
             pose, pattern = appearance(instance)
+        points, normals = np.ascontiguousarray(found.points), np.ascontiguousarray(found.normals)
         expose(
             image,
             touched,
             found.rows,
             found.columns,
             found.slopes,
-            np.ascontiguousarray(found.points),
-            np.ascontiguousarray(found.normals),
+            points,
+            normals,
+            light_at(points, normals, laser, grain),
             optics.intrinsics,
             camera,
             normal,

@@ -27,18 +27,18 @@ def version_message(version: tuple[int, int, int, int]) -> bytes:
 
 def robot_state(model: ArmModel, runtime_state: int) -> bytes:
     """The state package: the robot's mode, where its tool is, and its kinematics; `runtime_state` is that of RTDE."""
-    return _package(_STATE, _mode(model, runtime_state) + _cartesian(model) + _kinematics(model.params.dh))
+    return robot_mode(model, runtime_state, _cartesian(model), _kinematics(model.params.dh))
 
 
-def _mode(model: ArmModel, runtime_state: int) -> bytes:
+def robot_mode(model: ArmModel, runtime_state: int, *others: bytes) -> bytes:
+    """The state package with the robot's mode as its first part, and `others` behind it."""
     on = model.power is not Power.OFF
     stopped = model.safety is Safety.EMERGENCY_STOP, model.safety is Safety.PROTECTIVE_STOP
     running, paused = runtime_state == 2, runtime_state in (3, 4)
     flags = (True, True, on, *stopped, running, paused)
     speed = model.drive.speed_fraction
-    return _part(
-        0, struct.pack(">Q7?BBdddB", round(1e6 * model.time), *flags, int(model.power), 0, speed, speed, 1.0, 0)
-    )
+    content = struct.pack(">Q7?BBdddB", round(1e6 * model.time), *flags, int(model.power), 0, speed, speed, 1.0, 0)
+    return _package(_STATE, b"".join([_part(0, content), *others]))
 
 
 def _cartesian(model: ArmModel) -> bytes:

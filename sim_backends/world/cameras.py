@@ -6,6 +6,7 @@ Poses come in, pictures go out; time and motion are the world's business.
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,10 +15,20 @@ from numpy.typing import NDArray
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.mesh import Mesh
 from sim_backends.optics.render import render
-from sim_backends.optics.scene import Board, BoardInstance, LaserOptics, Light, MeshInstance, PlaneInstance, SceneObject
+from sim_backends.optics.scene import (
+    Board,
+    BoardInstance,
+    Grain,
+    LaserOptics,
+    Light,
+    MeshInstance,
+    PlaneInstance,
+    SceneObject,
+    Sun,
+)
 from sim_backends.world import nominal
 from sim_backends.world.nominal import inverse
-from sim_backends.world.scene import Lens, Scene, stream
+from sim_backends.world.scene import Lens, Scene, rotation, stream
 from sim_backends.world.surfaces import mesh
 from sim_backends.world.surfaces import surface as named_surface
 
@@ -27,7 +38,12 @@ Picture = NDArray[np.uint8]
 SCAN_TRANSMISSION = 0.4
 """Share of the ambient light that the scan camera's narrow-band filter lets through; the laser passes."""
 TABLE_ALBEDO = 0.45
+WITNESS_ALBEDO = 0.5
 SURFACE_ALBEDO = 0.6
+BOW_AT = (0.130, 0.018)
+"""Where the sheet's bow is told: from the laser, and beside the fan's middle, m."""
+SUN_SPEED = 0.2e-3
+"""m/s: a quarter of a degree a minute, from a window 3 m away."""
 _FAR = {"scan": 0.5, "target": 3.0}
 """Beyond this distance, m, a camera has nothing to see that matters."""
 
@@ -44,7 +60,9 @@ class Cameras:
 
     def __init__(self, scene: Scene, surface: str) -> None:
         self._scene = scene
-        self._optics = {
+        effects = scene.effects
+        self._lens = {"scan": scene.scan_lens, "target": scene.target_lens}
+        self._cold = {
             "scan": _optics(scene, scene.scan_lens, nominal.SCAN_SIZE, nominal.SCAN_FOCUS, SCAN_TRANSMISSION),
             "target": _optics(scene, scene.target_lens, nominal.TARGET_SIZE, nominal.TARGET_FOCUS, 1.0),
         }
@@ -55,7 +73,11 @@ class Cameras:
             normal=(nx, ny, nz),
             distance=scene.light_plane_distance,
             speckle_contrast=scene.deviations.speckle_contrast,
+            bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2,
+            end=effects.sheet_ends,
+            shadows=((-0.06, 0.004, 0.7), (0.035, 0.002, 0.9)) if effects.dust else (),
         )
+        self._grain = Grain(effects.texture, effects.dust, effects.gloss)
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
         shape = named_surface(surface)
@@ -63,18 +85,71 @@ class Cameras:
         self._mesh_radius = float(np.hypot(shape.half_x, shape.half_y)) + 0.015
         self._large = Board(*nominal.LARGE_BOARD)
         self._fine = Board(*nominal.FINE_BOARD)
-        self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._optics}
-        self._busy = {name: threading.Lock() for name in self._optics}
+        self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._cold}
+        self._busy = {name: threading.Lock() for name in self._cold}
 
     def picture(
-        self, camera: str, world_from_camera: Pose, world_from_base: Pose, laser: bool, exposure: float
+        self,
+        camera: str,
+        world_from_camera: Pose,
+        world_from_base: Pose,
+        laser: bool,
+        exposure: float,
+        warm: float = 0.0,
+        t: float = 0.0,
+        camera_from_flange: Pose | None = None,
     ) -> Picture:
-        """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses."""
-        optics = self._optics[camera]
-        objects = self._objects(camera, inverse(world_from_camera), world_from_base)
+        """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses.
+
+        `warm` is how far, of 0 to 1, laser and cameras have warmed up; `t` the world time, s, by which the sun moves.
+        With `camera_from_flange` the plate on the claw is shown where it comes into view.
+        """
+        optics = self._warmed(camera, warm)
+        camera_from_world = inverse(world_from_camera)
+        objects = self._objects(camera, camera_from_world, world_from_base)
+        if camera == "scan" and camera_from_flange is not None:
+            objects += self._witness(camera_from_flange)
         with self._busy[camera]:
-            lit = self._laser if laser and camera == "scan" else None
-            return render(optics, objects, lit, exposure, self._rng[camera], self._light)
+            lit = self.laser(warm) if laser and camera == "scan" else None
+            return render(optics, objects, lit, exposure, self._rng[camera], self._sunny(camera_from_world, t))
+
+    def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
+        """The plate on the claw, if the camera sees any of it."""
+        pose = camera_from_flange @ nominal.FLANGE_FROM_WITNESS
+        corners, optics = _witness_corners(pose), self._cold["scan"]
+        left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
+        return [PlaneInstance(pose, nominal.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
+
+    def lens(self, camera: str, warm: float) -> Lens:
+        """The lens with the shift and zoom of what is `warm`, 0 to 1."""
+        cold, drawn = self._lens[camera], self._scene.workshop
+        zoom, (du, dv) = 1.0 + warm * drawn.zoom, warm * drawn.shift[int(camera == "target")]
+        return replace(cold, fx=cold.fx * zoom, fy=cold.fy * zoom, cx=cold.cx + float(du), cy=cold.cy + float(dv))
+
+    def laser(self, warm: float) -> LaserOptics:
+        """The laser with its plane turned about its exit point and the stripe's direction (the camera's y axis)."""
+        angle = warm * self._scene.workshop.pointing
+        if angle == 0.0:
+            return self._laser
+        turn = rotation(np.array([0.0, angle, 0.0]))
+        nx, ny, nz = (float(v) for v in turn @ self._laser.normal)
+        return replace(self._laser, normal=(nx, ny, nz), distance=float(np.dot((nx, ny, nz), self._laser.origin)))
+
+    def _warmed(self, camera: str, warm: float) -> CameraOptics:
+        if not self._scene.effects.camera_warm_up:
+            return self._cold[camera]
+        # In steps of a hundredth, since every lens has a table of its pixels' rays.
+        lens = self.lens(camera, round(warm, 2))
+        return replace(self._cold[camera], fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
+
+    def _sunny(self, camera_from_world: Pose, t: float) -> Light:
+        """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis."""
+        strength = self._scene.effects.sunlight
+        if not strength:
+            return self._light
+        low = self._scene.workshop.sun_start + SUN_SPEED * t - 0.1
+        ground = camera_from_world @ nominal.WORLD_FROM_PLACE
+        return replace(self._light, sun=Sun(ground, low, low + 0.12, strength))
 
     def _objects(self, camera: str, camera_from_world: Pose, world_from_base: Pose) -> list[SceneObject]:
         scene = self._scene
@@ -94,10 +169,16 @@ class Cameras:
             radius = float(np.hypot(max(-x0, x1), max(-y0, y1)))
             placed.append((BoardInstance(pose, board), pose, radius))
         if camera == "scan":
-            shown = MeshInstance(camera_from_surface, self._mesh, SURFACE_ALBEDO)
+            shown = MeshInstance(camera_from_surface, self._mesh, SURFACE_ALBEDO, self._grain)
             placed.append((shown, camera_from_surface, self._mesh_radius))
-        optics = self._optics[camera]
+        optics = self._cold[camera]
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, _FAR[camera])]
+
+
+def _witness_corners(pose: Pose) -> Pose:
+    half = np.array(nominal.WITNESS_SIZE) / 2.0
+    corners = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+    return corners @ pose[:3, :3].T + pose[:3, 3]
 
 
 def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, far: float) -> bool:

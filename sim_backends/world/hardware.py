@@ -29,6 +29,9 @@ def make_arm(scene: Scene, clock: WorldClock, model: str = "UR10e") -> ArmModel:
         dh_error=scene.dh_error,
         repeatability=(sigma.arm_repeatability / math.sqrt(3.0), sigma.arm_repeatability_rotation),
         force_noise=(sigma.arm_force_noise, _TORQUE_PER_FORCE * sigma.arm_force_noise),
+        memory=scene.effects.path_memory,
+        harmonics=scene.workshop.harmonics,
+        compliance=scene.effects.sag,
         serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)

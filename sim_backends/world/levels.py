@@ -1,13 +1,16 @@
 """How far a world deviates from its nominal geometry: one table of 1σ values for each level.
 
 Every draw is Gaussian and cut at 2.5 σ. `ideal` keeps only what a perfect cell would have too: the sensor's
-quantisation and a little read noise.
+quantisation and a little read noise. `workshop` is `nominal` with all effects of `effects.py`; "nominal+rocking+grasp"
+is a level with just those.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+
+from sim_backends.world.effects import NONE, WORKSHOP, Effects, only
 
 CUT = 2.5
 """Draws lie within this many σ."""
@@ -113,11 +116,40 @@ NOMINAL = Deviations(
 IDEAL = Deviations(**{f.name: 0.0 for f in dataclasses.fields(Deviations)} | {"read_noise": 0.1})
 HARSH = Deviations(**{f.name: 2.5 * getattr(NOMINAL, f.name) for f in dataclasses.fields(Deviations)})
 
-LEVELS = {"ideal": IDEAL, "nominal": NOMINAL, "harsh": HARSH}
+LEVELS = {"ideal": IDEAL, "nominal": NOMINAL, "harsh": HARSH, "workshop": NOMINAL}
 
 
 def deviations(level: str) -> Deviations:
-    """The table of `level`. Raises ValueError that lists the levels."""
-    if level not in LEVELS:
+    """The table of `level`, or of a level with effects as in "nominal+grasp". Raises ValueError that lists them."""
+    rows: dict[str, float] = {}
+    effects = effects_of(level)
+    if effects.grasp:
+        rows |= {"grasp_translation": effects.grasp, "grasp_rotation": 10.0 * effects.grasp}
+    if length := effects.factory_arm:
+        rows |= {"arm_factory_length": length, "arm_factory_angle": 2.0 * length, "arm_factory_slide": 50.0 * length}
+    return dataclasses.replace(LEVELS[_parts(level)[0]], **rows)
+
+
+def effects_of(level: str) -> Effects:
+    """The workshop's effects at `level`. Raises ValueError that lists the levels or the effects."""
+    base, *names = _parts(level)
+    return only(*names) if names else WORKSHOP if base == "workshop" else NONE
+
+
+def number_of(level: str) -> str:
+    """Digits that tell this level from every other one, for serial numbers."""
+    base, *names = _parts(level)
+    every = Effects.names()
+    return str(list(LEVELS).index(base)) + "".join(f"{every.index(name):02d}" for name in sorted(names))
+
+
+def assumed_noise(level: str) -> dict[str, dict[str, float | str]]:
+    """Every σ of `level` with its unit and meaning, and the effects that are on."""
+    return deviations(level).assumed_noise() | effects_of(level).assumed_noise()
+
+
+def _parts(level: str) -> list[str]:
+    base, *names = level.split("+")
+    if base not in LEVELS or (names and base == "workshop"):
         raise ValueError(f"unknown level {level!r}: choose one of {', '.join(LEVELS)}")
-    return LEVELS[level]
+    return [base, *names]

@@ -64,6 +64,9 @@ BASE_FROM_DECK_BOARD = board_pose((-0.60, -0.25, 0.02), (1, 0, 0), (0, 0, -1), L
 FLANGE_FROM_SCAN_CAMERA = pose((0.09, -0.05, 0.08), (0, 1, 0), (0, 0, 1))
 """The scan camera with the carriage at home."""
 FLANGE_FROM_TARGET_CAMERA = pose((-0.10, 0.0, 0.03), (0, 1, 0), (0, 0, 1))
+FLANGE_FROM_WITNESS = pose((0.09, -0.0625, 0.165), (0, 1, 0), (0, 0, 1))
+"""A plate of `WITNESS_SIZE` on the claw: with the carriage at home the laser's line lies on it, beside the sweeps."""
+WITNESS_SIZE = (0.013, 0.012)
 FLANGE_FROM_PART = pose((0.0, 0.0, 0.17), (0, 1, 0), (0, 0, -1))
 FLANGE_FINGERTIPS = np.array([[sx * 0.02, sy * 0.01, 0.155] for sx in (-1, 1) for sy in (-1, 1)])
 """(4, 3) lowest points of the claw, m, in F."""

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.world import nominal
-from sim_backends.world.levels import CUT, LEVELS, Deviations, deviations
+from sim_backends.world.effects import WARMING_K, Effects
+from sim_backends.world.levels import CUT, Deviations, deviations, effects_of, number_of
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -56,12 +57,35 @@ class CameraClock:
 
 
 @dataclass(frozen=True)
+class Workshop:
+    """What was drawn of the workshop's effects; all 0 where they are off.
+
+    `harmonics` (6, 4): each joint's sine and cosine of one turn of its motor, then of two, rad. `sheet_bow`: how
+    far the light sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of
+    the light plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal
+    points, px; `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,),
+    rad. `sun_start` in m.
+    """
+
+    harmonics: Vector
+    sheet_bow: float
+    pointing: float
+    shift: Vector
+    zoom: float
+    rocking: Vector
+    rocking_hz: float
+    rocking_phase: Vector
+    sun_start: float
+
+
+@dataclass(frozen=True)
 class Scene:
     """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `nominal`."""
 
     seed: int
     level: str
     deviations: Deviations
+    effects: Effects
     world_from_vehicle_start: Pose
     vehicle_from_base: Pose
     world_from_surface: Pose
@@ -90,11 +114,12 @@ class Scene:
     light_gradient: Vector
     scan_clock: CameraClock
     target_clock: CameraClock
+    workshop: Workshop
 
     @property
     def serial(self) -> str:
-        """Seven digits that tell this world's hardware from that of every other seed and level."""
-        return f"{self.seed:06d}{list(LEVELS).index(self.level)}"
+        """Seven digits or more that tell this world's hardware from that of every other seed and level."""
+        return f"{self.seed:06d}{number_of(self.level)}"
 
 
 class _Draws:
@@ -110,6 +135,10 @@ class _Draws:
     def scalar(self, name: str, sigma: float) -> float:
         return float(self.vector(name, sigma, 1)[0])
 
+    def even(self, name: str, most: float) -> float:
+        """Anywhere from 0 to `most`."""
+        return most * float(stream(self._seed, name).uniform())
+
     def moved(self, name: str, at: Pose, translation: float, turn: float, about: Sequence[float] = (0, 0, 0)) -> Pose:
         """`at`, moved and turned about the point `about` of its own frame."""
         made = np.eye(4)
@@ -120,7 +149,7 @@ class _Draws:
 
 def draw(seed: int, level: str) -> Scene:
     """Draw the world of `seed` at `level`. Raises ValueError for an unknown level or a negative seed."""
-    sigma = deviations(level)
+    sigma, effects = deviations(level), effects_of(level)
     if seed < 0:
         raise ValueError(f"seed {seed} must be 0 or greater")
     d = _Draws(seed)
@@ -132,6 +161,7 @@ def draw(seed: int, level: str) -> Scene:
         seed=seed,
         level=level,
         deviations=sigma,
+        effects=effects,
         world_from_vehicle_start=start,
         vehicle_from_base=nominal.VEHICLE_FROM_BASE,
         world_from_surface=d.moved(
@@ -171,8 +201,9 @@ def draw(seed: int, level: str) -> Scene:
         suspension=np.abs(d.vector("suspension", sigma.suspension, 2)),
         light_level=1.0 + d.scalar("light_level", sigma.ambient),
         light_gradient=d.vector("light_gradient", sigma.ambient, 2),
-        scan_clock=_clock(d, "scan_clock", sigma),
-        target_clock=_clock(d, "target_clock", sigma),
+        scan_clock=_clock(d, "scan_clock", sigma, effects),
+        target_clock=_clock(d, "target_clock", sigma, effects),
+        workshop=_workshop(d, effects),
     )
 
 
@@ -220,8 +251,25 @@ def _dh_error(d: _Draws, sigma: Deviations) -> Pose:
     return error
 
 
-def _clock(d: _Draws, name: str, sigma: Deviations) -> CameraClock:
+def _clock(d: _Draws, name: str, sigma: Deviations, effects: Effects) -> CameraClock:
     drift = d.scalar(name + ".drift", sigma.camera_clock_drift)
     latency = abs(d.scalar(name + ".latency", sigma.exposure_latency))
     epoch = 1000.0 + abs(d.scalar(name + ".epoch", 1000.0))
-    return CameraClock(drift, epoch, latency)
+    return CameraClock(drift, epoch, latency + d.even(name + ".late", effects.late_stamps))
+
+
+def _workshop(d: _Draws, effects: Effects) -> Workshop:
+    direction = d.even("rocking.direction", 2.0 * np.pi)
+    warm = effects.camera_warm_up * WARMING_K
+    return Workshop(
+        # Four independent terms a joint: half the RMS each, √2 of that as amplitude.
+        harmonics=d.vector("harmonics", effects.joint_harmonics / np.sqrt(2.0), 24).reshape(6, 4),
+        sheet_bow=d.scalar("sheet_bow", effects.sheet_bow),
+        pointing=d.scalar("pointing", effects.laser_pointing) * WARMING_K,
+        shift=d.vector("warm_shift", warm, 4).reshape(2, 2),
+        zoom=1e-5 * WARMING_K * bool(warm),
+        rocking=effects.rocking * np.array([np.cos(direction), np.sin(direction)]),
+        rocking_hz=4.0 * (1.0 + d.scalar("rocking.frequency", 0.05)),
+        rocking_phase=d.vector("rocking.phase", 1.0, 2) * np.pi,
+        sun_start=d.scalar("sun", 0.05),
+    )

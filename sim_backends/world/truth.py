@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sim_backends.world import nominal
+from sim_backends.world.levels import assumed_noise
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import CameraClock, Lens
 from sim_backends.world.surfaces import surface
@@ -33,7 +34,7 @@ def truth(world: World) -> dict[str, Any]:
         "level": scene.level,
         "speed": world.clock.speed,
         "time": t,
-        "assumed_noise": scene.deviations.assumed_noise(),
+        "assumed_noise": assumed_noise(scene.level),
         "surface": {"name": world.surface, "half_x": shape.half_x, "half_y": shape.half_y, "unit": "m"},
         "poses": {
             name: _nested(pose)
@@ -54,9 +55,9 @@ def truth(world: World) -> dict[str, Any]:
                 "surface_from_part": inverse(scene.world_from_surface) @ world_from_part,
             }.items()
         },
-        "scan_lens": _lens(scene.scan_lens),
-        "target_lens": _lens(scene.target_lens),
-        "light_plane": {"normal": _nested(scene.light_plane_normal), "distance": scene.light_plane_distance},
+        "scan_lens": _lens(world.lens("scan", t)),
+        "target_lens": _lens(world.lens("target", t)),
+        "light_plane": world.light_plane(t),
         "rail": {
             "direction": _nested(scene.rail_direction),
             "scale": 1.0 + scene.rail_lead_error,

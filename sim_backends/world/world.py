@@ -6,6 +6,8 @@ the vehicle's lean under the arm, and the chain of poses from the floor to the c
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,10 +18,16 @@ from sim_backends.world import hardware, nominal
 from sim_backends.world.cameras import Cameras
 from sim_backends.world.collisions import ArmPoints, Collisions
 from sim_backends.world.contact import PartContact
-from sim_backends.world.scene import draw
+from sim_backends.world.effects import WARMING_S
+from sim_backends.world.nominal import inverse
+from sim_backends.world.scene import Lens, draw, rotation
 from sim_backends.world.surfaces import surface as named_surface
 
 Pose = NDArray[np.float64]
+
+
+BANDS = 6
+"""In so many bands a rolling shutter is drawn."""
 
 
 class World:
@@ -50,6 +58,7 @@ class World:
         self.collisions = Collisions(self.scene, self.part)
         self.laser = SwitchHistory()
         self._cameras = Cameras(self.scene, surface)
+        self._stood = 0.0
         self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
         self.vehicle.sag = self._sag
         self.vehicle.blocked = self.collisions.blocks
@@ -58,8 +67,15 @@ class World:
     # --- where things are ---
 
     def world_from_base(self, t: float) -> Pose:
-        """True pose (4, 4) of the arm's base at world time `t`, the vehicle's lean included."""
-        return self.vehicle.world_from_vehicle(t) @ self.scene.vehicle_from_base
+        """True pose (4, 4) of the arm's base at world time `t`, the vehicle's lean and rocking included."""
+        drawn = self.scene.workshop
+        carried = self.scene.vehicle_from_base
+        if drawn.rocking.any():
+            roll, pitch = drawn.rocking * np.sin(2.0 * np.pi * drawn.rocking_hz * t + drawn.rocking_phase)
+            tilt = np.eye(4)
+            tilt[:3, :3] = rotation(np.array([roll, pitch, 0.0]))
+            carried = tilt @ carried
+        return self.vehicle.world_from_vehicle(t) @ carried
 
     def world_from_flange(self, t: float) -> Pose:
         """True pose (4, 4) of the flange at world time `t`."""
@@ -77,10 +93,41 @@ class World:
 
     def render(self, camera: str, t_mid: float, exposure: float) -> NDArray[np.uint8]:
         """The picture (height, width) of "scan" or "target": the world as it was at `t_mid`, exposed `exposure` s."""
-        world_from_base = self.world_from_base(t_mid)
-        world_from_flange = world_from_base @ self.arm.base_from_flange(t_mid)
-        world_from_camera = world_from_flange @ self.flange_from_camera(camera, t_mid)
-        return self._cameras.picture(camera, world_from_camera, world_from_base, self.laser.at(t_mid), exposure)
+        readout = self.scene.effects.rolling_shutter
+        if not readout:
+            return self._exposed(camera, t_mid, exposure)
+        # Bands of rows, each at its own time; pictures of the past only, since the world knows no other.
+        bands = [self._exposed(camera, t_mid - readout * (1.0 - k / BANDS), exposure) for k in range(BANDS)]
+        edges = np.linspace(0, bands[0].shape[0], BANDS + 1).astype(int)
+        return np.concatenate([band[a:b] for band, a, b in zip(bands, edges[:-1], edges[1:], strict=True)])
+
+    def _exposed(self, camera: str, t: float, exposure: float) -> NDArray[np.uint8]:
+        world_from_base = self.world_from_base(t)
+        world_from_flange = world_from_base @ self.arm.base_from_flange(t)
+        world_from_camera = world_from_flange @ self.flange_from_camera(camera, t)
+        lit = self.laser.at(t)
+        camera_from_flange = inverse(self.flange_from_camera(camera, t))
+        return self._cameras.picture(
+            camera, world_from_camera, world_from_base, lit, exposure, self.warmth(t), t, camera_from_flange
+        )
+
+    def warmth(self, t: float) -> float:
+        """How far, of 0 to 1, laser and cameras have warmed up since they were switched on, at world time `t`."""
+        return float(1.0 - np.exp(-(t + self._stood) / WARMING_S))
+
+    def lens(self, camera: str, t: float) -> Lens:
+        """The lens of "scan" or "target" as warm as it is at `t`."""
+        return self._cameras.lens(camera, self.warmth(t))
+
+    def light_plane(self, t: float) -> dict[str, Any]:
+        """The light sheet as warm as it is at `t`: normal (3,) and distance, m, of its plane in the scan camera's
+        frame, and its bow y²/r, with y across the fan's middle and r along it from the laser."""
+        laser = self._cameras.laser(self.warmth(t))
+        return {"normal": list(laser.normal), "distance": laser.distance, "bow": laser.bow}
+
+    def stand(self, seconds: float) -> None:
+        """As if the cell had stood idle for so long: nothing moves, laser and cameras warm up."""
+        self._stood += seconds
 
     def warm_up(self) -> None:
         """Render one picture of everything, so that compiling is over before the first client asks for one."""

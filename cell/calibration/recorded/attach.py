@@ -81,13 +81,14 @@ def attach_poses(
             ],
         )
     try:
-        decision = decide(series, boards, options.poses, options.setup)
+        pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
+        decision = decide(series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
         return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
-    return _apply(decision, frames, options)
+    return _apply(decision, frames, pitch, options)
 
 
-def _apply(decision: Decision, frames: Sequence[RecordedFrame], options: Options) -> Understood:
+def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, options: Options) -> Understood:
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
     understood = Understood(
@@ -105,15 +106,15 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], options: Options
             "shift_mm": 1e3 * best.shift,
         },
     )
-    view = next(f.view for f in frames if f.view is not None)
-    problem, refused = scale_problem(best, view.spec.pitch)
+    problem, refused = scale_problem(best, pitch)
     if problem and refused:
         understood.refused = f"no hand-eye: {problem}"
     elif problem:
         understood.notes.append(f"doubt: {problem}")
     for k, record in one.of.items():
         frame = frames[k]
-        frame.pose_from = record.path.name + (f" {record.label}" if record.label and record.label[:1] == "[" else "")
+        several = sum(r.path == record.path for r in one.records) > 1
+        frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
         pose = poses.get(k)
         if pose is None:
             if frame.reason is None:

@@ -17,7 +17,7 @@ from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import empty_result, frame_dict
 from cell.calibration.recorded.series import Series, match_series, read_series
-from cell.calibration.recorded.solution import camera_of, solve_frames
+from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
@@ -57,10 +57,11 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     if pairs and not listing.pictures:
         return calibrate_pairs(pairs)
     series, links, unread = read_series(listing)
+    belonging, strange = match_series(series, listing, links)
     frames = read_frames(listing, spec, links)
     result = empty_result(spec)
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
-    _from_frames(frames, match_series(series, listing, links), options, result)
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
+    _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
@@ -87,6 +88,9 @@ def _from_frames(
         if s.name in (understood.about["source"] or [])
         for r in s.alone
     ]
-    if found is None or options.plan:
+    if found is None:
+        return
+    if options.plan:
+        agreeing(frames, found[0].camera)
         return
     solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)

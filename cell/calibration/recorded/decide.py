@@ -31,6 +31,7 @@ REWEIGHTINGS = 25
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED, SCALE_SIGMAS = 0.015, 0.05, 4.0
 # … and where that other size leaves no more than this share of the scatter.
+SCALE_WRONG = 0.4
 SCALE_BETTER, SCALE_CLEARLY = 0.7, 0.35
 
 
@@ -38,8 +39,8 @@ SCALE_BETTER, SCALE_CLEARLY = 0.7, 0.35
 class Fit:
     """How well flange poses agree with the pictures: medians in rad and m, and their sum as a share of the distance.
 
-    `scale` is by how much the flange's way would have to be longer to go with the board's size, with its σ, and the
-    median that this would leave.
+    `reach` is the board's distance from the camera in m. `scale` is by how much the flange's way would have to be
+    longer to go with the board's size, with its σ; `shift_scaled` is the median in m that this would leave.
     """
 
     series: Series
@@ -52,6 +53,7 @@ class Fit:
     scale: float
     scale_sigma: float
     shift_scaled: float
+    reach: float
 
     @property
     def text(self) -> str:
@@ -83,10 +85,13 @@ class Decision:
 def decide(
     series: Sequence[Series],
     boards: dict[int, list[pin.SE3]],
+    pitch: float,
     wanted: str | None = None,
     setup: str | None = None,
 ) -> Decision:
     """The reading of the series that agrees with the boards that frames (by index) saw, in each order they allow.
+
+    `pitch` of the board in m, as it was named.
 
     Raises RefusedError when none does, or when two do that mean different things; its text names the option to give.
     """
@@ -105,6 +110,10 @@ def decide(
     fits.sort(key=lambda f: f.score)
     best = fits[0]
     if not best.score < AGREES:
+        sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
+        other = min(sized or fits, key=lambda f: f.turn + f.shift_scaled / f.reach)
+        if sized and other.turn + other.shift_scaled / other.reach < 0.5 * AGREES:
+            raise RefusedError(f"read as {other.text}, {scale_problem(other, pitch)[0]}")
         raise RefusedError(
             f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
             "scatter; are they the poses of these pictures, of the flange, and is the board's pitch right?"
@@ -146,12 +155,16 @@ def _fits(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], setup
         for unit, size in UNITS.items():
             shift = float(np.median(_shifts(flanges, seen, rotation, size)[0]))
             tried.append((shift, unit, size))
-        shift, unit, size = min(tried)
         off, scale, sigma = _shifts(flanges, seen, rotation, None)
-        score = turn + shift / reach
-        found.append(
-            Fit(one, reading, side, unit, turn, shift, score, scale / size, sigma / size, float(np.median(off)))
-        )
+        # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
+        shift, unit, size = min(tried)
+        if scale > 4 * sigma > 0:
+            shift, unit, size = min(tried, key=lambda t: abs(math.log(scale / t[2])))
+        score, best = turn + shift / reach, float(np.median(off))
+        if abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma:
+            # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
+            score += 1.0
+        found.append(Fit(one, reading, side, unit, turn, shift, score, scale / size, sigma / size, best, reach))
     return found
 
 

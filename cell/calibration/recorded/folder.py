@@ -79,7 +79,7 @@ def read_frames(listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str
         except PictureRefused as refused:
             frame.refuse(refused.reason, str(refused))
         if frame.reason not in (Reason.UNREADABLE, Reason.CUT):
-            digest = hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
+            digest = frame_key(frame.name) + hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
             if digest in seen:
                 frame.refuse(Reason.DUPLICATE, f"the same file as {seen[digest]}")
             seen.setdefault(digest, frame.name)
@@ -120,16 +120,16 @@ def _join_pairs(frames: list[RecordedFrame], links: Sequence[dict[str, str]]) ->
         board, second = _roles(group)
         if board.view is None or board.reason is not None:
             continue
-        profile = second.profile
+        profile, named = second.profile, LASER_WORDS.search(second.name.lower()) is not None
         if second.view is not None:
             if _apart(board.view, second.view) > SAME_PLACE_PX:
                 continue
-            if second.profile is None or LASER_WORDS.search(second.name.lower()) is None:
+            if second.profile is None or not named:
                 second.refuse(Reason.DUPLICATE, f"it shows what {board.name} shows")
                 continue
         else:
             profile = _stripe_of(second.path, board.view)
-        if profile is not None and board.profile is None:
+        if profile is not None and (named or board.profile is None):
             board.profile, board.stripe_from = profile, second.name
             second.refuse(Reason.LASER_PICTURE, f"the laser's picture of {board.name}")
 

@@ -63,7 +63,8 @@ def read_content(path: Path) -> Content:
         data = loaded.tolist() if isinstance(loaded, np.ndarray) else {k: loaded[k].tolist() for k in loaded.files}
         _walk(path, data, [], None, content)
         return content
-    text = _decoded(path.read_bytes())
+    # As numpy prints its numbers and arrays.
+    text = re.sub(r"(?:np\.|numpy\.)?(?:float\d+|array)\(([^()]*)\)", r"\1", _decoded(path.read_bytes()))
     if not text.strip():
         raise ValueError("it is empty")
     if text.startswith("version https://git-lfs"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -72,17 +73,25 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             alone = sum(r.field == record.field for r in content.records) == 1
             source = (record.path.parent / series_name(record.path.name)) if alone else record.path
             source_name = listing.name(source)
-            groups.setdefault((source_name, record.field, len(record.numbers)), []).append(record)
+            place = "" if alone and record.field in ("row", "matrix") else record.field
+            groups.setdefault((source_name, place, len(record.numbers)), []).append(record)
     found = [
         Series(f"{source}:{place}" if place not in ("", "row", "matrix") else source, records)
         for (source, place, _), records in groups.items()
     ]
     links = [link for content in contents.values() for link in content.links]
+    few = [s for s in found if len(s.records) < LEAST]
+    unread += [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in few]
     return [s for s in found if len(s.records) >= LEAST], links, unread
 
 
-def match_series(series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]) -> list[Series]:
-    """The series that belong to pictures. Raises ConfigError for a folder with several recordings in it."""
+def match_series(
+    series: Sequence[Series], listing: Listing, links: Sequence[dict[str, str]]
+) -> tuple[list[Series], list[tuple[str, str]]]:
+    """The series that belong to pictures, and the names of the others with the reason.
+
+    Raises ConfigError for a folder with several recordings in it.
+    """
     names = [listing.name(p) for p in listing.pictures]
     linked = _linked(names, links)
     for one in series:
@@ -103,8 +112,19 @@ def match_series(series: Sequence[Series], listing: Listing, links: Sequence[dic
         one.alone = [one.records[i] for i in found.alone]
         one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
     belonging = [s for s in series if s.of]
-    _refuse_several(belonging, listing)
-    return belonging
+    others = _others(belonging, listing)
+    if others:
+        # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
+        listing.pictures = [p for p in listing.pictures if p.parent not in others]
+        listing.unread += [(f"{listing.name(p)}/", "a recording of its own: name it with --from") for p in others]
+        own = [s for s in series if not any(r.path.parent in others for r in s.records)]
+        return match_series(own, listing, links)
+    strange = [
+        (s.name, f"{len(s.records)} poses for {len(names)} pictures, and none says which picture it belongs to")
+        for s in series
+        if not s.of
+    ]
+    return belonging, strange if names else []
 
 
 def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, str]:
@@ -118,15 +138,19 @@ def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, 
     return found
 
 
-def _refuse_several(series: Sequence[Series], listing: Listing) -> None:
-    """Refuse a folder whose sub-folders are recordings of their own: their boards and bases need not be the same."""
-    owners: dict[str, set[int]] = {}
+def _others(series: Sequence[Series], listing: Listing) -> list[Path]:
+    """Sub-folders that are recordings of their own, where the folder itself is one, too.
+
+    Raises ConfigError where it is none: their boards and bases need not be the same.
+    """
+    owners: set[Path] = set()
     for one in series:
         folders = {listing.pictures[k].parent for k in one.of}
         if len(one.of) >= LEAST_ALONE and len(folders) == 1:
-            owners.setdefault(listing.name(next(iter(folders))), set()).update(one.of)
-    if len(owners) > 1:
+            owners |= folders
+    if len(owners) > 1 and listing.folder not in owners:
         raise ConfigError(
             f"{listing.folder} holds {len(owners)} recordings, each with poses of its own: "
-            f"{', '.join(sorted(owners))}; give one of these folders with --from"
+            f"{', '.join(sorted(map(listing.name, owners)))}; give one of these folders with --from"
         )
+    return sorted(owners - {listing.folder}) if len(owners) > 1 else []

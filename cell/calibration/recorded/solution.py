@@ -67,6 +67,13 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
             return chosen, plain
 
 
+def agreeing(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
+    """The used frames with a pose that agrees with those of the others; what does not is refused by name."""
+    posed = [f for f in used(frames) if f.base_from_flange is not None]
+    settle_orders(posed, camera)
+    return refuse_misplaced(refuse_odd_ones(posed, camera), camera)
+
+
 def solve_frames(
     frames: Sequence[RecordedFrame],
     found: tuple[Intrinsics, Intrinsics],
@@ -82,10 +89,7 @@ def solve_frames(
     """
     chosen, plain = found
     notes: list[str] = result["notes"]
-    posed = [f for f in used(frames) if f.base_from_flange is not None]
-    if posed:
-        settle_orders(posed, chosen.camera)
-        posed = refuse_misplaced(refuse_odd_ones(posed, chosen.camera), chosen.camera)
+    posed = agreeing(frames, chosen.camera)
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = camera_of(frames, given)

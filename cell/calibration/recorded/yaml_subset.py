@@ -118,7 +118,7 @@ def _flow(text: str, at: int) -> tuple[Any, int]:
         key = ""
         if closing == "}":
             end = text.find(":", at)
-            if end < 0:
+            if end < at + 1:
                 raise ValueError(f"{text[at:][:40]!r} is no pair of key and value")
             key, at = text[at:end].strip(" \"'"), end + 1
             while at < len(text) and text[at] == " ":
@@ -126,8 +126,9 @@ def _flow(text: str, at: int) -> tuple[Any, int]:
         if at < len(text) and text[at] in "[{":
             value, at = _flow(text, at)
         else:
-            match = re.compile(r"[^,\[\]{}]*").match(text, at)
-            assert match is not None
+            match = re.compile(r"[^,\[\]{}]+").match(text, at)
+            if match is None:
+                raise ValueError(f"{text[at:][:40]!r} does not belong into a list")
             value, at = _scalar(match[0].strip()), match.end()
         if closing == "}":
             pairs[key] = value

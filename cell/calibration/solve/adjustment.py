@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ from cell.calibration.solve.blocks import (
 from cell.calibration.solve.normal import Block, Inverse, Normal
 from cell.geometry.camera import Array
 from cell.geometry.poses import difference
+
+if TYPE_CHECKING:
+    from cell.calibration.solve.bow import Bow
 
 DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01, 2.0)
 FOCAL_TIE_PX = 1e-3
@@ -78,7 +82,8 @@ class Adjusted:
 
     The covariance is for the noise in `priors`; `reliable_covariance` allows for the scatter that was found.
     `excess` says by how much the flange's shifts and turns and the rail's readings scatter more than the priors say
-    ("shift", "turn", "rail": found over stated standard deviation; 1 where nothing was found).
+    ("shift", "turn", "rail": found over stated standard deviation; 1 where nothing was found). `bow` is the light
+    sheet's, where one was found.
     """
 
     state: State
@@ -89,6 +94,7 @@ class Adjusted:
     priors: Priors
     iterations: int
     excess: dict[str, float] = field(default_factory=dict)
+    bow: Bow | None = None
 
     @property
     def inflation(self) -> float:
@@ -179,14 +185,14 @@ class Adjustment:
         if len(view.points):
             residual, jacobian = dots_block(state, view, flange, rail)
             sigma = self.priors.dots_scale * view.sigma
-            weight, cost = _huber(np.linalg.norm(residual / sigma[:, None], axis=1))
+            weight, cost = huber(np.linalg.norm(residual / sigma[:, None], axis=1))
             root = (np.sqrt(weight) / sigma)[:, None]
             rows = (jacobian * root[:, :, None]).reshape(-1, COLUMNS)
             made.append(("dots", rows, np.asarray((residual * root).ravel()), cost))
         if len(view.stripe) and state.plane is not None:
             away, jacobian, sigma = stripe_block(state, view, flange, rail)
             sigma = self.priors.stripe_scale * sigma
-            weight, cost = _huber(np.abs(away / sigma))
+            weight, cost = huber(np.abs(away / sigma))
             root = np.sqrt(self.priors.stripe_share * weight) / sigma
             cost *= self.priors.stripe_share
             made.append(("stripe", jacobian * root[:, None], np.asarray(away * root), cost))
@@ -274,7 +280,7 @@ def expected_cost(name: str, block: Block, inverse: Inverse) -> float:
     return redundancy * HUBER_COST.get(name, 1.0)
 
 
-def _huber(size: Array) -> tuple[Array, float]:
+def huber(size: Array) -> tuple[Array, float]:
     """Weights (n,) and cost of whitened residual lengths (n,)."""
     weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
     cost = np.where(size <= HUBER, size**2, 2 * HUBER * size - HUBER**2)

@@ -70,8 +70,8 @@ class State:
         plane = self.plane
         if plane is not None:
             a, b = tangents(plane.n)
-            plane = LightPlane.of(plane.n + step[9] * a + step[10] * b, 1.0)
-            plane = replace(plane, distance=(self.plane.distance if self.plane else 0.0) + float(step[11]))
+            turned = LightPlane.of(plane.n + step[9] * a + step[10] * b, 1.0)
+            plane = replace(plane, normal=turned.normal, distance=plane.distance + float(step[11]))
         own = step[SHARED:].reshape(-1, OWN)
         return State(
             self.camera.with_parameters(self.camera.parameters + step[CAMERA]),

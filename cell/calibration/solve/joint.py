@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
 from cell.calibration.solve.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
+from cell.calibration.solve.bow import with_bow
 from cell.calibration.solve.hand_eye import HandEye, solve_hand_eye
 from cell.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
 from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
@@ -163,7 +164,8 @@ def solve_joint(
     views = [view_data(o, r) for o, r in zip(observations, rows, strict=True)]
     rail = float(np.ptp([o.rail_position for o in observations])) > 1e-3
     free = shared_mask(plane=staged.plane is not None, rail=rail, tangential=tangential)
-    adjusted = Adjustment(views, free, priors).solve(start_state(staged))
+    problem = Adjustment(views, free, priors)
+    adjusted = with_bow(problem, problem.solve(start_state(staged)))
     px, stripe = float("nan"), float("nan")
     if held_out and len(views) > FOLDS:
         px, stripe = _held_out(views, free, adjusted)

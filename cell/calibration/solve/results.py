@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import pinocchio as pin
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
 from cell.calibration.solve.blocks import HAND, SHARED, State
+from cell.calibration.solve.bow import FLAT
 from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped
 from cell.calibration.solve.joint import (
     Joint,
@@ -22,6 +23,7 @@ from cell.calibration.solve.joint import (
 )
 from cell.calibration.solve.joint_checks import joint_checks
 from cell.calibration.solve.reference import Reference
+from cell.calibration.witness import Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
@@ -68,6 +70,10 @@ class ScanCalibration:
     scale). `flange_from_camera` holds at rail position 0. `covariance` (21, 21) in the order of `PARAMETERS`; the light
     plane's tilts are about the tangents of `cell.calibration.solve.blocks.tangents`, the hand-eye's are (translation,
     rotation) in flange axes. `reference` is what a verification compares with; files of older programs have none.
+    `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain` (21,) how the
+    other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual. With a
+    `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
+    camera's frame.
     """
 
     camera: CameraModel
@@ -77,11 +83,17 @@ class ScanCalibration:
     covariance: Array
     quality: Quality
     reference: Reference | None = None
+    bow_sigma: float = 0.0
+    bow_gain: Array = field(default_factory=lambda: np.zeros(KEPT))
+    notes: tuple[str, ...] = ()
+    witness: Witness | None = None
+    pointing: Pointing | None = None
+    exit_point: Array = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:
         """What a joint adjustment with a stripe found."""
-        state, reference = joint.adjusted.state, Reference.of(joint.adjusted)
+        state, reference, bow = joint.adjusted.state, Reference.of(joint.adjusted), joint.adjusted.bow or FLAT
         assert state.plane is not None
         return cls(
             state.camera,
@@ -91,6 +103,9 @@ class ScanCalibration:
             reference.covariance[:KEPT, :KEPT],
             Quality.of(joint),
             reference,
+            bow.sigma * joint.adjusted.inflation,
+            bow.gain[:KEPT],
+            (bow.words,) if bow.sigma else (),
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
@@ -100,6 +115,11 @@ class ScanCalibration:
     def geometry(self) -> ScanGeometry:
         """What triangulation needs."""
         return ScanGeometry(self.camera, self.light_plane, self.rail_direction, self.flange_from_camera)
+
+    def pointed(self, pointing: Pointing, exit_point: Array) -> ScanCalibration:
+        """With the light plane as the laser points now; `exit_point` (3,) of the laser in m, camera frame, as drawn."""
+        plane = turned(self.light_plane, exit_point, pointing.turn)
+        return replace(self, light_plane=plane, pointing=pointing, exit_point=exit_point)
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
@@ -113,35 +133,59 @@ class ScanCalibration:
             np.zeros(0),
         )
         made = []
-        for column in covariance_root(self.covariance).T:
-            moved = state.moved(np.concatenate([column, np.zeros(SHARED - KEPT)]))
+        by_bow = self.bow_sigma * self.bow_gain
+        steps = list(covariance_root(self.covariance - np.outer(by_bow, by_bow)).T)
+        bows = [self.light_plane.bow] * len(steps)
+        if self.bow_sigma:
+            steps.append(by_bow)
+            bows.append(self.light_plane.bow + self.bow_sigma)
+        for step, bow in zip(steps, bows, strict=True):
+            moved = replace(state, plane=self.light_plane.bowed(bow)).moved(
+                np.concatenate([step, np.zeros(SHARED - KEPT)])
+            )
             assert moved.plane is not None
             made.append(ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera))
+        if self.pointing is not None:
+            plane = turned(self.light_plane, self.exit_point, self.pointing.sigma)
+            made.append(replace(self.geometry(), light_plane=plane))
         return made
 
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
         return {
             "camera": _camera_dict(self.camera),
-            "light_plane": {"normal": list(self.light_plane.normal), "distance": self.light_plane.distance},
+            "light_plane": {
+                "normal": list(self.light_plane.normal),
+                "distance": self.light_plane.distance,
+                "bow": self.light_plane.bow,
+                "bow_sigma": self.bow_sigma,
+                "bow_gain": self.bow_gain.tolist(),
+            },
             "rail_direction": self.rail_direction.tolist(),
             "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
             "covariance": self.covariance.tolist(),
             "quality": vars(self.quality),
             "reference": None if self.reference is None else self.reference.as_dict(),
+            "notes": list(self.notes),
+            "witness": None if self.witness is None else self.witness.as_dict(),
         }
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ScanCalibration:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
+        plane = data["light_plane"]
         return cls(
             _camera(data["camera"]),
-            LightPlane.of(data["light_plane"]["normal"], float(data["light_plane"]["distance"])),
+            LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
             np.array(data["rail_direction"], dtype=np.float64),
             from_matrix(data["flange_from_camera"]),
             np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
             Quality(**data["quality"]),
             Reference.read(data.get("reference")),
+            float(plane.get("bow_sigma", 0.0)),
+            np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
+            tuple(data.get("notes", ())),
+            Witness.read(data.get("witness")),
         )
 
 

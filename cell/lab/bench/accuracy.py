@@ -28,7 +28,7 @@ from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.report.bound import part_points
 from cell.report.truth import pose_of
 from drivers.interfaces import Vector
-from sim_backends.world.levels import deviations
+from sim_backends.world.levels import assumed_noise
 
 LIMITS: dict[str, dict[str, float]] = {
     "sensor_scan_mm": {"mean": 0.06, "p85": 0.08},
@@ -40,7 +40,7 @@ LIMITS: dict[str, dict[str, float]] = {
 COVERAGE = (0.90, 0.98)
 COVERAGE_RUNS = 20
 """Fewer runs cannot tell 90 % from 98 %, and their coverage is not held against the limit."""
-_SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def campaign(
@@ -52,7 +52,7 @@ def campaign(
     """
     load_job(job)
     # One thread a process: the sums, and so the figures, are then the same on every machine and the cores are full.
-    for name in _SINGLE_THREADED:
+    for name in SINGLE_THREADED:
         os.environ.setdefault(name, "1")
     runs: list[dict[str, Any]] = []
     pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
@@ -181,7 +181,7 @@ def summed_up(runs: Sequence[dict[str, Any]], level: str) -> dict[str, Any]:
             for name in ("calibration", "target", "registration")
         },
         "outcomes": _outcomes(runs),
-        "assumed_noise": deviations(level).assumed_noise(),
+        "assumed_noise": assumed_noise(level),
     }
     if level == "nominal":
         result["limits"] = {**LIMITS, "coverage_95": {"low": COVERAGE[0], "high": COVERAGE[1]}}

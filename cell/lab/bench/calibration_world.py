@@ -51,7 +51,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class HeadWorld:
-    """The true scan head and the poses (n, 4, 4) base_from_flange and rail positions (n,) in m that it is sent to."""
+    """The true scan head and the poses (n, 4, 4) base_from_flange and rail positions (n,) in m that it is sent to.
+
+    The light sheet is off its plane by `bow` y²/r, with y in m beside the ray from the laser that is nearest to the
+    camera's axis and r along it.
+    """
 
     parameters: Array
     hand: Array
@@ -59,6 +63,7 @@ class HeadWorld:
     flanges: Array
     rails: Array
     spec: BoardSpec
+    bow: float = 0.0
 
     def moved(self, step: Array) -> HeadWorld:
         """Another head, away by a step (26,) of the shared parameters."""
@@ -118,12 +123,26 @@ class HeadWorld:
         place = np.zeros(len(rows))
         pixels = np.zeros((len(rows), 2))
         for _ in range(NEWTON):
-            pixels = project_points(start + place[:, None] * along, self.lens)
-            further = project_points(start + (place + 1e-6)[:, None] * along, self.lens)
+            pixels = project_points(self._on_sheet(start + place[:, None] * along, normal), self.lens)
+            further = project_points(self._on_sheet(start + (place + 1e-6)[:, None] * along, normal), self.lens)
             slope = (further[:, 1] - pixels[:, 1]) / 1e-6
             place = place + np.clip((rows - pixels[:, 1]) / slope, -0.02, 0.02)
-        points = start + place[:, None] * along
+        points = self._on_sheet(start + place[:, None] * along, normal)
         return pixels[:, 0], (points - pose[:3, 3]) @ pose[:3, :2]
+
+    def _on_sheet(self, points: Array, board: Array) -> Array:
+        """Points (n, 3) of the light plane, moved on the board of unit normal `board` to where the bowed sheet is."""
+        length = np.linalg.norm(self.plane)
+        plane = self.plane / length
+        laser = np.array([-0.035, 0.0, 0.0])
+        laser = laser - (plane @ laser - 1.0 / length) * plane
+        middle = np.array([0.0, 0.0, 1.0]) - plane[2] * plane
+        middle /= np.linalg.norm(middle)
+        way = points - laser
+        sag = self.bow * (way @ np.cross(plane, middle)) ** 2 / (way @ middle)
+        side = plane - (plane @ board) * board
+        # The plane's normal points away from the camera; the sag is told along the one that points to the right.
+        return np.asarray(points + np.sign(plane[0]) * sag[:, None] * side / (plane @ side))
 
     def measured(self, pixels: Array, rails: Array) -> Array:
         """Points (n, 3) in the camera's frame at rail position 0 of stripe pixels (n, 2) at rail positions (n,); m."""

@@ -23,6 +23,7 @@ from cell.geometry.covariance import covariance_root
 from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.lab.bench.contact import mean_after_contact
 from cell.lab.bench.scan_errors import by_pose
 from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction import Cloud, calibration_motions, flange_motions
@@ -43,9 +44,9 @@ class Expected:
     """Covariances (6, 6) of (translation, rotation) in base axes about the surface's origin, m² and rad².
 
     `absolute`: of the surface in the arm's true base. `own`: in the base as the arm itself realises it where it places.
-    `placing`: of the part on the surface, with all that placing adds. The mean distances to expect of them over
-    the part's 45 points are `absolute_m`, `own_m` and `placing_m`; `sensor_m` that of single points in the camera's
-    frame at rail zero.
+    `placing`: of the part in the air, with all that placing adds. The mean distances to expect of them over the part's
+    45 points are `absolute_m`, `own_m` and, once contact has let the part rest, `placing_m`; `sensor_m` that of single
+    points in the camera's frame at rail zero.
     """
 
     absolute: Vector
@@ -89,7 +90,8 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
         return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
 
     in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
-    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), mean(placing), mean_distance(in_camera))
+    placed = mean_after_contact(placing, nominal, pose)
+    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), placed, mean_distance(in_camera))
 
 
 def mean_distance(covariances: Vector) -> float:

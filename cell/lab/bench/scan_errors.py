@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_matrix, transform
+from cell.geometry.poses import from_matrix, mean, transform
 from cell.inversion import NominalSurface
 from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction import Cloud
@@ -28,6 +28,8 @@ from cell.report.bound import part_points
 from cell.report.truth import SENSOR_POINTS, pose_of
 from cell.steps.reconstruct import Reconstruction
 from drivers.interfaces import Vector
+from sim_backends.models.arm import ArmParams
+from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import draw
@@ -37,6 +39,7 @@ Indices = NDArray[np.intp]
 NEAR_M = 0.001
 """A scanned point at most this far from one of the part's 45 points stands for it."""
 COVERED = 0.95
+_SAME_PLACE_M = 1e-3
 _SLIDES, _PROBE_PX, _ON_SURFACE_M = 4, 0.2, 2e-6
 
 
@@ -104,7 +107,7 @@ def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -
 def own_base(record: JobRecord) -> pin.SE3:
     """own_from_base: the base as the arm realises it in the posture in which it places, against the true base.
 
-    From the true lengths and zeros of the world's arm; repeatability is not part of it.
+    From the true lengths and zeros of the world's arm and what its joints are off; repeatability is not part of it.
     """
     assert record.rests is not None
     pose = record.results.get("place")
@@ -114,15 +117,21 @@ def own_base(record: JobRecord) -> pin.SE3:
     wanted = (pose if pose is not None else record.results["laser_sweep"]).base_from_flange.homogeneous
     away = np.abs(flanges - wanted).reshape(len(flanges), -1).max(axis=1)
     nearest = int(np.argmin(away))
-    true = Kinematics(told + scene.dh_error).forward(record.rests[nearest])
+    kinematics = Kinematics(told + scene.dh_error)
+    bent = JointErrors(kinematics, scene.workshop.harmonics, scene.effects.sag, ArmParams.carried)
+    true = kinematics.forward(bent.true(record.rests[nearest]))
     return from_matrix(flanges[nearest]) * from_matrix(true).inverse()
 
 
 def surface_at_middle(record: JobRecord) -> pin.SE3:
-    """base_from_surface when the arm was in the middle of all lines: a vehicle leans otherwise wherever it reaches."""
+    """base_from_surface when the arm was in the middle of all lines: a vehicle leans otherwise wherever it reaches.
+
+    Its rocking is averaged out, over all lines that were taken with the arm there.
+    """
     flanges = np.array([shot.base_from_flange[:3, 3] for shot in record.shots])
-    middle = int(np.argmin(np.linalg.norm(flanges - flanges.mean(axis=0), axis=1)))
-    return from_matrix(record.shots[middle].base_from_surface)
+    away = np.linalg.norm(flanges - flanges.mean(axis=0), axis=1)
+    there = np.flatnonzero(away < away.min() + _SAME_PLACE_M)
+    return mean([from_matrix(record.shots[k].base_from_surface) for k in there])
 
 
 def true_geometry(record: JobRecord) -> ScanGeometry:
@@ -133,7 +142,10 @@ def true_geometry(record: JobRecord) -> ScanGeometry:
     camera = CameraModel(made.width, made.height, lens["fx"], lens["fy"], lens["cx"], lens["cy"], tuple(lens["dist"]))
     return ScanGeometry(
         camera,
-        LightPlane.of(np.array(plane["normal"]), plane["distance"]),
+        # The world tells the bow by the distance from the laser, the plane by that along the optical axis.
+        LightPlane.of(np.array(plane["normal"]), plane["distance"]).bowed(
+            plane["bow"] * float(np.sqrt(1.0 - plane["normal"][2] ** 2))
+        ),
         np.array(truth["rail"]["direction"]),
         pose_of(truth, "flange_from_scan_camera"),
     )

@@ -13,6 +13,7 @@ import numpy as np
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.sessions import arm_table
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
@@ -51,9 +52,9 @@ class JobRecord:
     """How one simulated cell did: `outcome` is placed, refused, faulted or aborted, `stage` what it came to.
 
     `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `kinematic` is the
-    configured (6, 6) covariance of a place that the arm goes to; `rests` (n, 6) the joint angles at the end of each
-    motion, rad; `shots` the truth at each line of the cloud, sweep after sweep. `wall_s` are seconds on the wall by
-    stage.
+    configured (6, 6) covariance of a place that the arm goes to, `placing` that of the flange each time it comes to
+    rest; `rests` (n, 6) the joint angles at the end of each motion, rad; `shots` the truth at each line of the cloud,
+    sweep after sweep. `wall_s` are seconds on the wall by stage.
     """
 
     seed: int
@@ -67,6 +68,7 @@ class JobRecord:
     at_sweep: dict[str, Any] | None = None
     at_end: dict[str, Any] | None = None
     kinematic: Vector | None = None
+    placing: Vector | None = None
     rests: Vector | None = None
     shots: list[Shot] = field(default_factory=list)
     wall_s: dict[str, float] = field(default_factory=dict)
@@ -80,17 +82,19 @@ def run_whole_job(
     level: str,
     progress: Progress | None = None,
     calibrated: JobRecord | None = None,
+    stood: float = 0.0,
 ) -> JobRecord:
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
-    `calibrated` is a record of the same cell, whose calibration is used again.
+    `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s
+    before the job.
     """
     cell = VirtualCell(config, seed, level, Path(job.surface.mesh).stem)
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:
         with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
-            Run("job", lambda run: whole.perform(run, Path(folder), calibrated)).result()
+            Run("job", lambda run: whole.perform(run, Path(folder), calibrated, stood)).result()
     except CellError as error:
         failure = classify(error)
         record.outcome, record.reason = failure.outcome.value, failure.reason
@@ -111,7 +115,7 @@ class _WholeJob:
     record: JobRecord
     tell: Progress
 
-    def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None) -> None:
+    def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None, stood: float) -> None:
         """Fill the record; runs go to `folder`."""
         record, devices = self.record, self.cell.devices
         if calibrated is not None:
@@ -123,9 +127,11 @@ class _WholeJob:
         assert record.calibration is not None
         whereabouts = Whereabouts(devices.vehicle)
         whereabouts.say_at_start()
-        record.kinematic = Workplace(
+        workplace = Workplace(
             self.config, self.job, self.nominal, record.calibration, devices, NoFrames(), folder, whereabouts
-        ).kinematic
+        )
+        record.kinematic, record.placing = workplace.kinematic, workplace.repeatability
+        self.cell.world.stand(stood)
         job_run = JobRun(
             run,
             self.config,
@@ -152,12 +158,14 @@ class _WholeJob:
         devices, tell = self.cell.devices, self.tell
         given, keep = (self.config, devices, mover, hands.check), NoFrames().keep
         scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
+        witness = look_at_witness(self.config, devices, keep)
         target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
         self.record.observations = (scan, target)
         tell(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
-        return CellCalibration.solve(scan, target, identities, self.config, arm_table(self.config, self.cell.devices))
+        known = identities, self.config, arm_table(self.config, self.cell.devices), witness
+        return CellCalibration.solve(scan, target, *known)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""

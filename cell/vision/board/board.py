@@ -59,11 +59,24 @@ def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = Non
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image, size)
     if spec.kind in DOTS:
-        return without_outliers(find_dots(image, spec))
+        return without_outliers(_find_dots(image, spec))
     if spec.kind == "aprilgrid":
         return without_outliers(find_tags(image, spec))
     found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
     return without_outliers(found)
+
+
+def _find_dots(image: Image, spec: BoardSpec) -> BoardView:
+    """Dark dots on a bright sheet, else bright dots on a dark one."""
+    try:
+        return find_dots(image, spec)
+    except PictureRefused as refused:
+        if refused.reason is not Reason.NO_BOARD:
+            raise
+        try:
+            return find_dots(np.asarray(255 - image, dtype=np.uint8), spec)
+        except PictureRefused:
+            raise refused from None
 
 
 def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:

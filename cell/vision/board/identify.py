@@ -100,18 +100,23 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
     if most < least_share * len(template) or outside > max(2, MOST_OUTSIDE * most):
         raise PictureRefused(
             Reason.NO_BOARD,
-            f"{len(places)} points in a lattice were found, of which {most} fit the {len(template)} of {spec.name}; "
-            "show the whole board, or name the board that it is",
+            f"{len(places)} points in a lattice of {_size(places)} were found, of which {most} fit the {len(template)} "
+            f"of {spec.name}; show the whole board, or name the board that it is",
         )
     orders = [f for f in best if _spans(f, set(number), template)]
     if not orders:
         whole = most >= WHOLE_SHARE * len(template)
         raise PictureRefused(
             Reason.AMBIGUOUS if whole else Reason.NO_BOARD,
-            f"the {most} points found, of {len(template)}, do not reach all edges of {spec.name}, so their order is "
-            "not certain; show the whole board, or name the board that it is",
+            f"the {most} points found, of {len(template)}, a lattice of {_size(places)}, do not reach all edges of "
+            f"{spec.name}, so their order is not certain; show the whole board, or name the board that it is",
         )
     return [np.array([number.get(tuple(p), (-1, -1)) for p in f.tolist()], dtype=np.intp) for f in orders]
+
+
+def _size(places: Places) -> str:
+    """Steps that the lattice found is long and wide."""
+    return "×".join(map(str, sorted((np.ptp(places, axis=0) + 1).tolist(), reverse=True)))
 
 
 def _by_edges(spec: BoardSpec, places: Places) -> tuple[Places, bool]:

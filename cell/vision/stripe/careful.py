@@ -242,6 +242,21 @@ def _rivals(found: Candidates, chain: Chain) -> Array:
     beside = (away > 3 * found.scale[chain.rows, chain.which][:, None]) & (found.clear[chain.rows] > 6)
     beside &= np.arange(CANDIDATES) != chain.which[:, None]
     rival[chain.rows] = np.where(beside, found.response[chain.rows], 0.0).max(axis=1) / np.maximum(own, 1e-6)
+    return np.maximum(rival, _second_line(found, chain))
+
+
+def _second_line(found: Candidates, chain: Chain) -> Array:
+    """Response of a second line that runs beside the chain over the chain's (m,): its mean in rows where it hides."""
+    scale = float(np.median(found.scale[chain.rows, chain.which]))
+    own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
+    clear = np.where(np.abs(found.place - own[:, None]) > 4 * scale, found.clear, 0.0)
+    other = follow(Candidates(found.rows, found.place, found.response, clear, found.scale))
+    rival = np.zeros(len(found.rows))
+    height = float(np.median(found.response[chain.rows, chain.which]))
+    for one in np.unique(other.piece):
+        rows, which = other.rows[other.piece == one], other.which[other.piece == one]
+        inside = slice(int(rows[0]), int(rows[-1]) + 1)
+        rival[inside] = np.maximum(rival[inside], float(np.median(found.response[rows, which])) / max(height, 1e-6))
     return rival
 
 

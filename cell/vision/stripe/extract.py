@@ -17,6 +17,7 @@ from cell.vision.stripe.planes import FULL, Laser, Picture, as_picture
 from cell.vision.stripe.profile import Array as Array
 from cell.vision.stripe.profile import Axis as Axis
 from cell.vision.stripe.profile import Image as Image
+from cell.vision.stripe.profile import Mark as Mark
 from cell.vision.stripe.profile import Method as Method
 from cell.vision.stripe.profile import StripeProfile as StripeProfile
 from cell.vision.stripe.profile import StripeSettings as StripeSettings
@@ -114,7 +115,7 @@ def _same_range(dark: Any, picture: Picture, settings: StripeSettings) -> Pictur
             False,
             off.full,
         )
-    return Picture(off.value.mean(axis=2), off.saturated.any(axis=2), False, off.full)
+    return Picture(off.value.mean(axis=2), np.asarray(off.saturated.any(axis=2)), False, off.full)
 
 
 def _one_plane(picture: Picture, dark: Any, laser: Laser, settings: StripeSettings) -> tuple[Image, Any]:

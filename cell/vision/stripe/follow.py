@@ -31,6 +31,7 @@ ASIDE, GAP, JUMP = 0.5, 0.4, 30.0
 LONGEST_GAP = 24
 STEEPEST = 2.5
 """A chain moves no more than this many px a row, and one width more."""
+BY_LIGHT = 0.08
 AGAINST = 0.5
 """How much the strongest thing beside the chain in each row counts against it."""
 LEAST_SCORE, LEAST_ROWS = 60.0, 8
@@ -119,10 +120,13 @@ def _noise(response: NDArray[np.float32]) -> float:
 def follow(found: Candidates, spacing: float = 1.0) -> Chain:
     """The chain through `found` whose rows are `spacing` px apart on average."""
     m = len(found.rows)
+    # Of two lines that are clear alike the one with more light; not so much that a dark spot makes the chain jump.
+    light = found.response * found.scale
+    share = light / np.maximum(light.max(axis=1, keepdims=True), 1e-9)
+    gain = np.minimum(found.clear, MOST) * (1 - BY_LIGHT * (1 - share)) - LEAST * (found.clear > 0)
     best, back_row, back_which, opens = _chain(
-        found.rows.astype(np.float64), found.place, np.minimum(found.clear, MOST) - LEAST * (found.clear > 0),
-        found.clear > 0, found.scale, spacing,
-    )  # fmt: skip
+        found.rows.astype(np.float64), found.place, gain, found.clear > 0, found.scale, spacing
+    )
     rows, which, fresh = [], [], []
     end = int(best.argmax())
     r, k = divmod(end, CANDIDATES)

@@ -24,6 +24,8 @@ WIDEST = 6.0
 """σ in px of the widest stripe that the quick search sees whole."""
 BROKEN, REFUSED = 0.03, 0.06
 """Shares of the lines that jump away from both neighbours, and that show a peak which is no stripe."""
+UNEVEN, BRIGHT_DN = 0.25, 25.0
+"""Difference of the albedo on both sides of the stripe, and the light from which it can be seen."""
 FAR_LAG, SAMPLED_LINES = 4, 8
 TEXTURE_DN2, TEXTURE_RATIO = 1.0, 2.0
 """Variance of the background about straight lines, and that of distant pixels over that of near ones: texture."""
@@ -107,6 +109,53 @@ def is_too_wide(fitted: Any, start: Any) -> bool:
             found += 1
             wide += fitted[WIDTH, r] > WIDEST
     return 2 * wide >= found
+
+
+@compiled
+def is_saturated(fitted: Any, start: Any) -> bool:
+    """True when the cores of most stripes are saturated: what flanks look like is seldom a Gaussian."""
+    found, hidden = 0, 0
+    for r in range(fitted.shape[1]):
+        if np.isfinite(fitted[FIT_CENTRE, r]):
+            found += 1
+            hidden += start[r, 0, CORE] > 1
+    return 2 * hidden > found
+
+
+@compiled
+def is_surface_even(dark: Any, fitted: Any) -> bool:
+    """True when the picture without the laser shows no edges of the surface's albedo under the stripe, or is dark."""
+    found, uneven, total = 0, 0, 0.0
+    n = dark.shape[1]
+    if len(dark) < fitted.shape[1]:
+        return True
+    for r in range(fitted.shape[1]):
+        centre, width = fitted[FIT_CENTRE, r], fitted[WIDTH, r]
+        if not np.isfinite(centre):
+            continue
+        left, right = int(centre - 1.5 * width), int(centre + 1.5 * width + 1)
+        if left < 0 or right >= n:
+            continue
+        one, other = float(dark[r, left]), float(dark[r, right])
+        found += 1
+        total += 0.5 * (one + other)
+        uneven += abs(one - other) > UNEVEN * 0.5 * (one + other)
+    return total < BRIGHT_DN * found or uneven <= BROKEN * found
+
+
+@compiled
+def has_rivals(fitted: Any, start: Any) -> bool:
+    """True when centres jump and many lines have a second peak: the wrong one may have been taken."""
+    rivals, found, jumps, before = 0, 0, 0, -1
+    for r in range(fitted.shape[1]):
+        rivals += start[r, 1, ENERGY] > 0
+        if not np.isfinite(fitted[FIT_CENTRE, r]):
+            continue
+        found += 1
+        aside = abs(fitted[FIT_CENTRE, r] - fitted[FIT_CENTRE, before]) if before >= 0 else 0.0
+        jumps += before == r - 1 and aside > 6.0 + 2 * fitted[WIDTH, r]
+        before = r
+    return jumps > 0 and rivals > REFUSED * found
 
 
 @compiled

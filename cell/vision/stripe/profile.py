@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.vision.stripe.marks import Mark as Mark
+from cell.vision.stripe.marks import marks_of
 from cell.vision.stripe.speckle import Speckle
 
 if TYPE_CHECKING:
@@ -84,6 +86,11 @@ class StripeProfile:
     def valid(self) -> NDArray[np.bool_]:
         """True (n,) where there is a stripe."""
         return np.isfinite(self.centres)
+
+    @property
+    def marks(self) -> NDArray[np.uint8]:
+        """Why points may be off by more than they state, sums of `Mark` (n,)."""
+        return marks_of(self)
 
     def pixels(self) -> Array:
         """Pixels (m, 2), x then y, of the m rows that have a stripe, in the order of `rows`."""

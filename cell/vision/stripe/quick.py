@@ -21,7 +21,15 @@ from cell.vision.stripe import without_compiler as stripe_numpy
 from cell.vision.stripe.belief import believe
 from cell.vision.stripe.methods import METHODS
 from cell.vision.stripe.noise import pixel_noise
-from cell.vision.stripe.ordinary import is_line_whole, is_profile_gaussian, is_textured, is_too_wide
+from cell.vision.stripe.ordinary import (
+    has_rivals,
+    is_line_whole,
+    is_profile_gaussian,
+    is_saturated,
+    is_surface_even,
+    is_textured,
+    is_too_wide,
+)
 from cell.vision.stripe.profile import Array, Axis, Image, Method, StripeProfile, StripeSettings
 from cell.vision.stripe.rivals import choose, survey
 from cell.vision.stripe.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
@@ -102,7 +110,10 @@ def read_quickly(
     ordinary = (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
+        and not is_saturated(fitted, start)
         and is_profile_gaussian(work, shade, fitted, start)
+        and not (several and has_rivals(fitted, start))
+        and is_surface_even(shade, fitted)
         and not is_textured(seen)
     )
     if ordinary:

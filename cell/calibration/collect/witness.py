@@ -1,0 +1,55 @@
+"""A look at the witness of the laser's pointing: the rail to its end, the laser on, a few pictures of the plate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from cell.calibration.witness import LEAST_ROWS, Witness
+from cell.config import CellConfig
+from cell.devices.devices import Devices
+from cell.vision import extract
+from drivers.interfaces import Frame
+
+PICTURES = 4
+RATE_HZ = 10.0
+
+
+def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness | None:
+    """The witness now, the carriage left there; None where the cell has none or it is not in the picture."""
+    position = config.laser.witness
+    if position is None:
+        return None
+    devices.rail.move_to(position).wait(30.0)
+    camera = devices.scan_camera
+    camera.configure(config.calibration.stripe_exposure, RATE_HZ)
+    profiles = []
+    with devices.interlocks.purpose("calibration"), devices.laser.lit():
+        for k in range(PICTURES):
+            frame = camera.grab()
+            keep(f"witness-{k + 1}", frame)
+            profiles.append(extract(frame.image))
+    columns = np.array([np.where(profile.double, np.nan, profile.centres) for profile in profiles])
+    sigma = np.array([profile.sigma for profile in profiles])
+    seen = np.isfinite(columns).all(axis=0)
+    mean = np.where(seen, columns.mean(axis=0), np.nan)
+    found = Witness(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
+    return _on_the_plate(found)
+
+
+def _on_the_plate(seen: Witness) -> Witness | None:
+    """Only the longest run of rows without a step: what lies behind the plate moves with the arm."""
+    rows = seen.rows
+    if len(rows) < LEAST_ROWS:
+        return None
+    steps = (np.diff(rows) > 3) | (np.abs(np.diff(seen.columns[rows])) > 3.0)
+    longest = max(np.split(rows, np.flatnonzero(steps) + 1), key=len)
+    if len(longest) < LEAST_ROWS:
+        return None
+    columns = np.full_like(seen.columns, np.nan)
+    # The plate's edges are left out: half of the line is beside them.
+    kept = longest[5:-5]
+    columns[kept] = seen.columns[kept]
+    return replace(seen, columns=columns)

@@ -1,0 +1,124 @@
+"""The laser's pointing since the calibration, by a witness: the line on a plate that is fixed to the claw.
+
+At one end of its travel the rail shows the scan camera that plate, always at the same place. Where the line lies on it
+is looked at with each calibration and before each job. What it has moved is taken for a turn of the light plane about
+the laser's exit and the stripe's direction; a shift of the camera's picture looks the same there and does the same to
+depths, so the turn is right for both. docs/theory.md, section 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.light_plane import LightPlane, triangulate
+from drivers.errors import Measured, RefusedError
+
+LEAST_ROWS = 40
+"""Fewer rows of the plate in the picture are no witness."""
+NOTED_RAD = 0.1e-3
+"""A turn that people are told of."""
+LARGEST_RAD = 3e-3
+"""No warmth turns a laser so far: something was knocked, and the rest of the calibration is not to be trusted."""
+STAYS_RAD = 15e-6
+"""One standard deviation of what plate, rail and camera make of a pointing that has not changed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """The line on the plate with the rail at `rail` m: its column (height,) in px, NaN where it is not seen, and the
+    standard deviation `sigma` (height,) of each."""
+
+    rail: float
+    columns: Array
+    sigma: Array
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        rows = self.rows
+        values = {"columns": self.columns[rows].tolist(), "sigma": self.sigma[rows].tolist()}
+        return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values}
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Witness | None:
+        """From storage; KeyError, TypeError, ValueError or IndexError when it is none."""
+        if data is None:
+            return None
+        columns, sigma = np.full((2, int(data["height"])), np.nan)
+        rows = np.array(data["rows"], dtype=np.intp)
+        columns[rows], sigma[rows] = data["columns"], data["sigma"]
+        return cls(float(data["rail"]), columns, sigma)
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """The rows (n,) that show it."""
+        return np.flatnonzero(np.isfinite(self.columns))
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """How far the light plane has turned since the calibration, rad, and one standard deviation of it."""
+
+    turn: float
+    sigma: float
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        return (
+            f"the laser points {1e3 * self.turn:+.3f} ± {1e3 * self.sigma:.3f} mrad from where it pointed at the "
+            "calibration (seen on its witness); the measurements allow for it"
+        )
+
+
+def pointing(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
+    """The turn of `plane` between two looks at the witness, about `exit_point` (3,), m, camera frame.
+
+    Raises `RefusedError` when the line is not where it can have got to by warmth.
+    """
+    both = np.flatnonzero(np.isfinite(before.columns) & np.isfinite(now.columns))
+    if len(both) < LEAST_ROWS:
+        raise RefusedError(
+            f"the laser's line is seen on {len(both)} rows of the witness that the calibration saw, at least "
+            f"{LEAST_ROWS} are needed: is the witness clean and in its place? If so, run `cell calibrate`"
+        )
+    moved = now.columns[both] - before.columns[both]
+    # A median: a speck on the plate moves some rows only.
+    shift = float(np.median(moved))
+    noise = 1.25 * float(1.4826 * np.median(np.abs(moved - shift))) / np.sqrt(len(both))
+    at = np.column_stack([before.columns[both], both.astype(np.float64)])
+    points, _ = triangulate(camera, plane, at)
+    step = 1e-4
+    per_rad = float(np.median(_columns(camera, turned(plane, exit_point, step), points) - at[:, 0])) / step
+    turn = shift / per_rad
+    found = Pointing(turn, float(np.hypot(noise / abs(per_rad), STAYS_RAD)))
+    if abs(turn) > LARGEST_RAD:
+        raise RefusedError(
+            f"the laser points {1e3 * turn:+.2f} mrad from where it pointed at the calibration, allowed are "
+            f"±{1e3 * LARGEST_RAD:g} mrad: see whether laser or camera were knocked, then run `cell calibrate`",
+            Measured("the laser's pointing has moved by", 1e3 * turn, "mrad", most=1e3 * LARGEST_RAD),
+        )
+    return found
+
+
+def turned(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:
+    """The light plane turned by `angle`, rad, about the stripe's direction through the laser's exit, camera frame."""
+    about = np.cross(plane.n, np.cross(plane.along, plane.n))
+    about /= np.linalg.norm(about)
+    normal = np.cos(angle) * plane.n + np.sin(angle) * np.cross(about, plane.n)
+    # The exit is known as drawn; off the plane by what it is, it stays off by as much.
+    off = float(plane.n @ exit_point) - plane.distance
+    made = LightPlane.of(normal, float(normal @ exit_point) - off)
+    return made.bowed(plane.bow)
+
+
+def _columns(camera: CameraModel, plane: LightPlane, points: Array) -> Array:
+    """Columns (n,) at which `plane` shows on a plate across the optical axis at the depths of `points` (n, 3)."""
+    at = points.copy()
+    for _ in range(3):
+        at[:, 0] -= plane.distances(at) / plane.normal[0]
+    return np.asarray(camera.project(at)[:, 0])

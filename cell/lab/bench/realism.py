@@ -1,0 +1,172 @@
+"""`cell bench realism`: what the workshop's effects do to the product, each alone and all together.
+
+A world is calibrated, stands for a while, in which laser and cameras warm up, and does its job, by the product's own
+runner on the virtual clock. It is well when what was placed lies within what was stated of it, or when the job was
+refused with the effect's name; it is ill when something wrong was told with confidence.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from cell.config import CellConfig, load_config
+from cell.geometry.poses import difference
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job, load_job
+from cell.lab.bench.accuracy import SINGLE_THREADED, figures
+from cell.lab.bench.scan_errors import COVERED
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from cell.report.bound import part_covariance
+from cell.report.truth import pose_of
+from sim_backends.world.effects import Effects
+from sim_backends.world.levels import assumed_noise
+
+STOOD_S = 3600.0
+"""Between calibration and job."""
+PLANE = np.array([0, 1, 5])
+"""Of a part's pose: x, y and the turn about z. Contact decides over the others."""
+ALONE, TOGETHER = "nominal", "workshop"
+WORDS: dict[str, tuple[str, ...]] = {
+    "factory_arm": ("kinematics", "arm"),
+    "joint_harmonics": ("joint", "arm"),
+    "path_memory": ("repeat", "arm"),
+    "sag": ("sag", "arm"),
+    "rocking": ("rock",),
+    "sheet_bow": ("bow", "light sheet"),
+    "laser_pointing": ("laser", "contact"),
+    "camera_warm_up": ("camera",),
+    "grasp": ("grasp", "held"),
+    "late_stamps": ("time",),
+    "rolling_shutter": ("shutter",),
+    "texture": ("texture", "stripe"),
+    "gloss": ("gloss", "stripe"),
+    "dust": ("dust", "stripe"),
+    "sheet_ends": ("covers", "points"),
+    "sunlight": ("light",),
+}
+"""A refusal with one of these words names the effect."""
+
+
+def campaign(
+    effects: Sequence[str], seeds: Sequence[int], job: str, done: Callable[[str], None], workers: int = 0
+) -> dict[str, Any]:
+    """Every effect alone on every seed, then all together if "workshop" is among `effects`; `done` is told of each."""
+    load_job(job)
+    for name in SINGLE_THREADED:
+        os.environ.setdefault(name, "1")
+    runs: list[dict[str, Any]] = []
+    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
+    try:
+        waiting = [pool.submit(one_run, job, seed, effect) for effect in effects for seed in seeds]
+        for future in as_completed(waiting):
+            run = future.result()
+            runs.append(run)
+            done(f"{run['effect']}, seed {run['seed']}: {run['verdict']}")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    runs.sort(key=lambda run: run["seed"])
+    by_effect = {name: summed_up(name, [run for run in runs if run["effect"] == name]) for name in effects}
+    return {"job": job, "seeds": list(seeds), "effects": by_effect}
+
+
+def level_of(effect: str) -> str:
+    """The world's level with this effect: "nominal" and "workshop" are themselves."""
+    return effect if effect in (ALONE, TOGETHER) else f"{ALONE}+{effect}"
+
+
+def one_run(job: str, seed: int, effect: str) -> dict[str, Any]:
+    """One world with one effect: its errors in mm and mrad and whether they lie within what was stated; JSON-ready."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    config, (loaded, mesh) = load_config(None), load_job(job)
+    nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
+    record = run_whole_job(config, loaded, nominal, seed, level_of(effect), stood=STOOD_S)
+    made = figures(record, config, loaded, nominal)
+    run: dict[str, Any] = {key: made[key] for key in ("seed", "outcome", "reason", "stage", "wall_s")}
+    run["effect"] = effect
+    run["chi2"] = {key[5:]: value for key, value in made.items() if key.startswith("chi2_")}
+    run["pose_inside"] = made["covered"]["place_pose"] if "covered" in made else None
+    run["arm_base_mm"] = float(np.mean(made["own"])) if "own" in made else None
+    run["placement_mm"] = float(np.mean(made["placement"])) if "placement" in made else None
+    run["within_tolerance"] = made.get("within_tolerance")
+    run["flags"] = flags_of(record)
+    run |= _part(record, config, loaded)
+    return run | {"verdict": verdict(run)}
+
+
+def flags_of(record: JobRecord) -> list[str]:
+    """What calibration and job said by themselves of what is not as it should be."""
+    flags = [] if record.calibration is None else list(record.calibration.scan.notes)
+    for result in record.results.values():
+        flags += getattr(result, "notes", ())
+    return flags
+
+
+def _part(record: JobRecord, config: CellConfig, job: Job) -> dict[str, Any]:
+    """Where the part ended, in the surface's plane, and whether that is within what was stated of it."""
+    pose = record.results.get("invert_pose")
+    if record.outcome != "placed" or not isinstance(pose, PlacePose) or record.placing is None:
+        return {"part_inside": None}
+    assert record.at_end is not None
+    off = difference(pose_of(record.at_end, "surface_from_part"), job.place.surface_from_part.se3())[PLANE]
+    stated = part_covariance(job, pose, record.placing)[np.ix_(PLANE, PLANE)]
+    return {
+        "part_inside": bool(off @ np.linalg.solve(stated, off) <= chi2.ppf(COVERED, len(PLANE))),
+        "part_off": [1e3 * float(v) for v in off],
+        "part_stated": [1e3 * float(v) for v in np.sqrt(np.diag(stated))],
+    }
+
+
+def verdict(run: dict[str, Any]) -> str:
+    """Inside what was stated; or named: refused by the effect's name; or refused otherwise; or outside.
+
+    What was placed outside is outside, whatever was noted: a note says what the measurements have allowed for.
+    """
+    if run["outcome"] == "placed":
+        return "inside" if run["pose_inside"] and run["part_inside"] else "outside"
+    names = Effects.names() if run["effect"] == TOGETHER else (run["effect"],)
+    words = [word for name in names for word in WORDS.get(name, ())]
+    return "named" if any(word in run["reason"] for word in words) else "refused"
+
+
+def summed_up(effect: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """All worlds of one effect together; shares of those that came to it, None where none did."""
+    count = {name: sum(run["verdict"] == name for run in runs) for name in ("inside", "named", "refused", "outside")}
+    noise = assumed_noise(level_of(effect))
+    return {
+        "size": noise.get(effect),
+        "worlds": len(runs),
+        **count,
+        "pose_inside": _share(runs, "pose_inside"),
+        "part_inside": _share(runs, "part_inside"),
+        "outside_tolerance": sum(run["within_tolerance"] is False for run in runs),
+        "arm_base_mm": _mean(runs, "arm_base_mm"),
+        "placement_mm": _mean(runs, "placement_mm"),
+        "reasons": sorted({run["reason"] for run in runs if run["reason"]}),
+        "flags": sorted({flag for run in runs for flag in run["flags"]}),
+        "runs": list(runs),
+    }
+
+
+def is_well(entry: dict[str, Any]) -> bool:
+    """Whether of an effect's worlds no more than a tenth told something wrong or were refused without its name."""
+    bad = int(entry["outside"]) + int(entry["refused"])
+    return bad <= 0.1 * int(entry["worlds"]) and not entry["outside_tolerance"]
+
+
+def _share(runs: Sequence[dict[str, Any]], name: str) -> float | None:
+    known = [run[name] for run in runs if run[name] is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _mean(runs: Sequence[dict[str, Any]], name: str) -> float | None:
+    known = [run[name] for run in runs if run[name] is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,359 @@
+"""Promises on recordings as people have them: any spelling of a pose is read as it was meant, or asked for by name.
+
+The pictures are warped by OpenCV, the poses written by numpy and scipy: neither comes from what is under test.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cell.calibration.recorded.attach import Options, attach_poses
+from cell.calibration.recorded.folder import RecordedFrame, read_frames
+from cell.calibration.recorded.listing import list_folder
+from cell.calibration.recorded.series import match_series, read_series
+from cell.geometry.camera import CameraModel
+from cell.vision import parse_board
+from drivers.errors import ConfigError
+
+BOARD = parse_board("chessboard:7x5:20mm")
+SIZE = (640, 480)
+CAMERA = CameraModel(*SIZE, 700.0, 700.0, 322.0, 238.0)
+FLANGE_FROM_CAMERA = np.eye(4)
+FLANGE_FROM_CAMERA[:3, :3] = Rotation.from_euler("xyz", (4, -7, 93), degrees=True).as_matrix()
+FLANGE_FROM_CAMERA[:3, 3] = 0.05, -0.03, 0.08
+BASE_FROM_BOARD = np.eye(4)
+BASE_FROM_BOARD[:3, :3] = Rotation.from_euler("xyz", (178, 3, 20), degrees=True).as_matrix()
+BASE_FROM_BOARD[:3, 3] = 0.45, -0.1, 0.02
+VIEWS = (
+    (0, 0, 0),
+    (25, 5, 10),
+    (-20, 15, -30),
+    (8, -28, 60),
+    (-15, -18, 120),
+    (20, 22, -75),
+    (-28, 4, 35),
+    (5, 30, -140),
+)
+
+
+def flange_poses() -> list[np.ndarray]:
+    """base_from_flange (4, 4) of each view of the board, in m."""
+    poses = []
+    for k, angles in enumerate(VIEWS):
+        camera_from_board = np.eye(4)
+        camera_from_board[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        middle = camera_from_board[:3, :3] @ (0.06, 0.04, 0)
+        camera_from_board[:3, 3] = np.array([0.01 * (k % 3 - 1), 0.008 * (k % 2), 0.42 + 0.02 * (k % 4)]) - middle
+        poses.append(BASE_FROM_BOARD @ np.linalg.inv(camera_from_board) @ np.linalg.inv(FLANGE_FROM_CAMERA))
+    return poses
+
+
+POSES = flange_poses()
+
+
+def photograph(base_from_flange: np.ndarray) -> np.ndarray:
+    """The board as CAMERA sees it, warped at four times the size and averaged."""
+    cell, half = 40, 20
+    squares = np.indices((6, 8)).sum(axis=0) % 2 * 200 + 25
+    sheet = np.full((6 * cell + 2 * cell, 8 * cell + 2 * cell), 225, np.uint8)
+    sheet[cell:-cell, cell:-cell] = np.kron(squares, np.ones((cell, cell)))
+    camera_from_board = np.linalg.inv(FLANGE_FROM_CAMERA) @ np.linalg.inv(base_from_flange) @ BASE_FROM_BOARD
+    # Pixels of the sheet to metres on the board: its first inner corner lies at (2, 2) squares, edges between pixels.
+    metres = np.diag([0.02 / cell, 0.02 / cell, 1.0])
+    metres[:2, 2] = -0.04 + 0.5 * 0.02 / cell
+    into = CAMERA.matrix @ camera_from_board[:3, [0, 1, 3]] @ metres
+    large = np.diag([4.0, 4.0, 1.0])
+    large[:2, 2] = 1.5
+    wide = cv2.warpPerspective(sheet, large @ into, (4 * SIZE[0], 4 * SIZE[1]), flags=cv2.INTER_LINEAR, borderValue=90)
+    assert half * 2 == cell
+    return cv2.resize(cv2.GaussianBlur(wide, (0, 0), 2.5), SIZE, interpolation=cv2.INTER_AREA)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    for k, pose in enumerate(POSES):
+        cv2.imwrite(str(folder / f"frame{k + 3:02d}.png"), photograph(pose))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def seen(pictures) -> dict[str, RecordedFrame]:
+    frames = read_frames(list_folder(pictures), BOARD)
+    assert all(f.reason is None for f in frames), [f.text for f in frames]
+    return {f.name: f for f in frames}
+
+
+@pytest.fixture
+def recording(tmp_path, pictures) -> Path:
+    for path in pictures.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    return tmp_path
+
+
+def understand(folder: Path, seen: dict[str, RecordedFrame], **said: str):
+    """Frames with their poses as the product understands them, what it says about them, and what it did not read."""
+    listing = list_folder(folder)
+    series, links, unread = read_series(listing)
+    belonging, strange = match_series(series, listing, links)
+    frames = [RecordedFrame(p, listing.name(p), seen[p.name].view) for p in listing.pictures]
+    return frames, attach_poses(frames, belonging, CAMERA, Options(**said)), [*listing.unread, *unread, *strange]
+
+
+def quaternion(pose: np.ndarray, order: str = "xyzw") -> list[float]:
+    q = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return (q if order == "xyzw" else q[[3, 0, 1, 2]]).tolist()
+
+
+def one_file_each(folder: Path, text: Callable[[np.ndarray], str], name: str = "pose{:02d}.txt") -> None:
+    for k, pose in enumerate(POSES):
+        path = folder / name.format(k + 3)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text(pose))
+
+
+def row(values, separator: str = " ") -> str:
+    return separator.join(f"{v:.9f}" for v in values)
+
+
+def angles(pose: np.ndarray, kind: str, degrees: bool = True) -> np.ndarray:
+    rotation = Rotation.from_matrix(pose[:3, :3])
+    return np.degrees(rotation.as_rotvec()) if kind == "rotvec" else rotation.as_euler(kind, degrees=degrees)
+
+
+def tuples(folder: Path) -> None:
+    one_file_each(folder, lambda p: str((tuple(p[:3, 3]), tuple(quaternion(p)))))
+
+
+def rotation_vectors_in_a_table(folder: Path) -> None:
+    rows = [row([*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for p in POSES]
+    (folder / "poses.txt").write_text("\n".join(rows))
+
+
+def wxyz_in_mm_with_names(folder: Path) -> None:
+    rows = [f"frame{k + 3:02d}.png,{row([*1e3 * p[:3, 3], *quaternion(p, 'wxyz')], ',')}" for k, p in enumerate(POSES)]
+    (folder / "robot.csv").write_text("image,a1,a2,a3,a4,a5,a6,a7\n" + "\n".join(rows))
+
+
+def named_columns_in_another_order(folder: Path) -> None:
+    rows = [row([k + 3, *quaternion(p, "wxyz"), *p[:3, 3]], ";") for k, p in enumerate(POSES)]
+    (folder / "robot.csv").write_text("frame;qw;qx;qy;qz;x;y;z\n" + "\n".join(reversed(rows)))
+
+
+def decimal_commas_with_bom_and_crlf(folder: Path) -> None:
+    rows = [row([*1e3 * p[:3, 3], *angles(p, "ZYX")], ";").replace(".", ",") for p in POSES]
+    (folder / "Stützpunkte.csv").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
+
+
+def roll_pitch_yaw_first(folder: Path) -> None:
+    one_file_each(folder, lambda p: "\n".join(f"{v:.9f}" for v in [*angles(p, "xyz"), *1e3 * p[:3, 3]]))
+
+
+def yaml_in_a_sub_folder(folder: Path) -> None:
+    def text(p: np.ndarray) -> str:
+        x, y, z, w = quaternion(p)
+        t = "".join(f"  {n}: {v:.9f}\n" for n, v in zip("xyz", p[:3, 3], strict=True))
+        return f"position:\n{t}orientation: {{x: {x:.9f}, y: {y:.9f},\n  z: {z:.9f}, w: {w:.9f}}}\n"
+
+    one_file_each(folder, text, "poses/{:d}.yaml")
+
+
+def json_list(folder: Path) -> None:
+    entries = [
+        {"image": f"frame{k + 3:02d}.png", "robot": p.tolist(), "joints": [0.1] * 6} for k, p in enumerate(POSES)
+    ]
+    (folder / "data.json").write_text(json.dumps(entries[::-1]))
+
+
+def opencv_yaml(folder: Path) -> None:
+    parts = [
+        f"pose{k + 3}: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [ {row(p[:3].ravel(), ', ')} ]"
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "robot.yml").write_text("%YAML:1.0\n---\n" + "\n".join(parts) + "\n")
+
+
+def matrices_one_below_the_other(folder: Path) -> None:
+    (folder / "poses.txt").write_text("\n".join(row(line) for p in POSES for line in p))
+
+
+def numpy_stack_by_columns(folder: Path) -> None:
+    np.save(folder / "poses.npy", np.array([p.T for p in POSES]))
+
+
+SPELLINGS = {
+    tuples: ("xyz+quaternion-xyzw", "m", "name"),
+    rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
+    wxyz_in_mm_with_names: ("xyz+quaternion-wxyz", "mm", "name"),
+    named_columns_in_another_order: ("xyz+quaternion-xyzw", "m", "number"),
+    decimal_commas_with_bom_and_crlf: ("xyz+abc-deg", "mm", "order"),
+    roll_pitch_yaw_first: ("rpy-deg+xyz", "mm", "name"),
+    yaml_in_a_sub_folder: ("xyz+quaternion-xyzw", "m", "name"),
+    json_list: ("matrix-4x4", "m", "name"),
+    opencv_yaml: ("matrix-3x4", "m", "name"),
+    matrices_one_below_the_other: ("matrix-4x4", "m", "order"),
+    numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
+}
+
+
+@pytest.mark.parametrize("write", SPELLINGS, ids=lambda w: w.__name__)
+def test_poses_are_read_as_they_were_meant(recording, seen, write):
+    write(recording)
+    frames, understood, unread = understand(recording, seen)
+    assert understood.notes == [], unread
+    about = understood.about
+    assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[write]
+    assert about["setup"] == "eye_in_hand"
+    assert about["turn_deg"] < 0.1
+    assert about["shift_mm"] < 0.5
+    for frame, pose in zip(frames, POSES, strict=True):
+        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def test_a_camera_that_stands_before_the_arm_is_recognised(recording, seen):
+    one_file_each(recording, lambda p: row(np.linalg.inv(p).ravel()))
+    _, understood, _ = understand(recording, seen)
+    assert understood.setup == "eye_to_hand"
+    assert "eye in hand" in understood.about["evidence"]
+
+
+def test_two_fields_that_both_agree_are_asked_for(recording, seen):
+    tool = np.eye(4)
+    tool[:3, 3] = 0, 0.02, 0.15
+    both = [
+        {"file": f"frame{k + 3:02d}.png", "flange": p.tolist(), "tcp": (p @ tool).tolist()} for k, p in enumerate(POSES)
+    ]
+    (recording / "both.json").write_text(json.dumps(both))
+    frames, understood, _ = understand(recording, seen)
+    assert "--pose-field" in understood.notes[0]
+    assert all(f.base_from_flange is None for f in frames)
+    (name,) = [w.rstrip(";,") for w in understood.notes[0].split() if w.startswith("both.json") and "flange" in w]
+    frames, understood, _ = understand(recording, seen, pose_field=name)
+    assert np.abs(frames[0].base_from_flange.homogeneous - POSES[0]).max() < 1e-6
+    with pytest.raises(ConfigError, match="no such poses"):
+        understand(recording, seen, pose_field="tcp2")
+
+
+def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
+    tuples(recording)
+    _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
+    assert "no reading of the poses agrees" in understood.notes[0]
+
+
+def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
+    one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], 1.25 * p[:3, 3]], p[3:]]).ravel()))
+    frames, understood, _ = understand(recording, seen)
+    assert "25.0" in understood.notes[0]
+    assert all(f.base_from_flange is None for f in frames)
+
+
+def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):
+    for k, pose in enumerate(POSES[::-1]):
+        (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
+    _, understood, _ = understand(recording, seen)
+    assert "are they the poses of these pictures" in understood.notes[0]
+
+
+def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
+    names, rows = {}, []
+    for k, (path, pose) in enumerate(zip(sorted(pictures.iterdir()), POSES, strict=True)):
+        name = f"{1690000000 + 2 * k}.250.png"
+        (tmp_path / name).symlink_to(path)
+        names[name] = seen[path.name]
+        rows.append(row([1690000000 + 2 * k + 0.2, *pose[:3, 3], *quaternion(pose)]))
+        rows.append(row([1690000000 + 2 * k + 1.2, *(pose[:3, 3] + 0.1), *quaternion(pose)]))
+    (tmp_path / "trajectory.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
+    frames, understood, _ = understand(tmp_path, names)
+    assert understood.about["matched_by"] == "time"
+    for frame, pose in zip(frames, POSES, strict=True):
+        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def test_what_is_wrong_is_named_with_its_file(recording, seen):
+    tuples(recording)
+    (recording / "pose04.txt").write_text("((0.4, nan, 0.5), (0, 0, 0, 1))")
+    (recording / "pose05.txt").write_text("")
+    (recording / "pose06.txt").write_text("0.1 0.2 0.3")
+    (recording / "pose07.txt").unlink()
+    (recording / "pose88.txt").write_text(str((tuple(POSES[0][:3, 3]), tuple(quaternion(POSES[0])))))
+    (recording / "pictures.zip").write_bytes(b"PK")
+    (recording / ".DS_Store").write_bytes(b"\0")
+    (recording / "gone.png").symlink_to(recording / "nowhere.png")
+    frames, understood, unread = understand(recording, seen)
+    assert understood.about["reading"] == "xyz+quaternion-xyzw"
+    assert "pose04.txt: it holds values that are not finite" in frames[1].text
+    assert [f.name for f in frames if f.base_from_flange is None] == [f"frame{n:02d}.png" for n in (4, 5, 6, 7)]
+    reasons = dict(unread)
+    assert "empty" in reasons["pose05.txt"]
+    assert "3 numbers" in reasons["pose06.txt"]
+    assert "archive" in reasons["pictures.zip"]
+    assert "hidden" in reasons[".DS_Store"]
+    assert "not there" in reasons["gone.png"]
+
+
+def test_one_pose_more_than_pictures_is_not_guessed(recording, seen):
+    rows = [row(p.ravel()) for p in [*POSES, POSES[0]]]
+    (recording / "poses.txt").write_text("\n".join(rows))
+    frames, understood, unread = understand(recording, seen)
+    assert "9 poses for 8 pictures" in dict(unread)["poses.txt"]
+    assert all(f.base_from_flange is None for f in frames)
+    assert "no flange poses" in understood.notes[0]
+
+
+def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
+    for session in ("monday", "tuesday"):
+        (tmp_path / session).mkdir()
+        for path in pictures.iterdir():
+            (tmp_path / session / path.name).symlink_to(path)
+        tuples(tmp_path / session)
+    listing = list_folder(tmp_path)
+    series, links, _ = read_series(listing)
+    with pytest.raises(ConfigError, match="monday, tuesday"):
+        match_series(series, listing, links)
+    for path in (tmp_path / "monday").iterdir():
+        path.rename(tmp_path / path.name)
+    listing = list_folder(tmp_path)
+    series, links, _ = read_series(listing)
+    (own,), _ = match_series(series, listing, links)
+    assert len(own.of) == len(listing.pictures) == len(POSES)
+    assert ("tuesday/", "a recording of its own: name it with --from") in listing.unread
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
+    rng = np.random.default_rng(seed)
+    for write in SPELLINGS:
+        write(recording)
+    for path in [p for p in recording.rglob("*") if p.suffix in (".txt", ".csv", ".yaml", ".yml", ".json")]:
+        data = bytearray(path.read_bytes())
+        for at in rng.integers(0, len(data), 3):
+            data[at] = rng.choice(list(b"[]{}:,;-.\n \0\xffx'\"09"))
+        path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
+    _, _, unread = read_series(list_folder(recording))
+    assert all(len(reason) > 5 for _, reason in unread)
+
+
+def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
+    (tmp_path / "laser").mkdir()
+    for path in sorted(pictures.iterdir())[:2]:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"board_{path.stem[-2:]}.png"), image)
+        dark = np.random.default_rng(1).normal(6, 1, image.shape)
+        across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+        dark += 180 * np.exp(-0.5 * (across / 2.0) ** 2)
+        cv2.imwrite(str(tmp_path / "laser" / f"{int(path.stem[-2:])}.png"), np.clip(dark, 0, 255).astype(np.uint8))
+    frames = read_frames(list_folder(tmp_path), BOARD)
+    assert [(f.name, f.stripe_from) for f in frames if f.reason is None] == [
+        ("board_03.png", "laser/3.png"),
+        ("board_04.png", "laser/4.png"),
+    ]
+    rows = frames[0].profile.rows
+    assert np.abs(frames[0].profile.centres[rows] - (300 + 0.1 * rows)).max() < 0.2
+    assert [f.reason.value for f in frames if f.reason is not None] == ["laser_picture"] * 2

@@ -1,0 +1,96 @@
+"""A vehicle that rocks while the laser sweeps: seen in a made-up scan of known motion, and not seen where it stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.geometry.poses import difference
+from cell.inversion import NominalSurface, Prior, Tolerance, invert_pose
+from cell.inversion.rocking import LARGEST_RAD, Rocking, find_rocking, rocking_covariance, rocking_motions
+from cell.job import load_job
+from cell.reconstruction.cloud import Cloud
+from drivers.errors import RefusedError
+
+JOB, MESH = load_job("pot")
+NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+SURFACE = pin.SE3(pin.utils.rotate("z", 0.3), np.array([0.75, 0.6, 0.05]))
+VEHICLE = pin.SE3(np.eye(3), np.array([-0.3, 0.0, -0.55]))
+RATE, LINES, NOISE = 30.0, 128, 8e-6
+TIMES = np.arange(LINES) / RATE
+
+
+def scanned(roll: float, pitch: float, hz: float, seed: int = 0) -> Cloud:
+    """Lines across the pot, each displaced as the base was turned when it was taken, with noise along the normals."""
+    rng = np.random.default_rng(seed)
+    low, high = NOMINAL.extent
+    along = np.linspace(0.93 * low[0], 0.93 * high[0], LINES)
+    across = np.linspace(0.9 * low[1], 0.9 * high[1], 90)
+    x, y = np.meshgrid(along, across, indexing="ij")
+    start = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + 1e-3)])
+    for _ in range(8):
+        # Straight down onto the surface.
+        _, feet = NOMINAL.feet(start)
+        start[:, 2] -= feet.heights / np.maximum(feet.normals[:, 2], 0.2)
+    points = (start + np.array([0, 0, 1.0]) * NOISE * rng.standard_normal((len(start), 1))) @ SURFACE.rotation.T
+    points = (points + SURFACE.translation).reshape(LINES, 90, 3)
+    wave = np.sin(2 * np.pi * hz * TIMES + 0.7)
+    for k in range(LINES):
+        turn = pin.exp3(wave[k] * np.array([roll, pitch, 0.0]))
+        points[k] = (points[k] - VEHICLE.translation) @ turn.T + VEHICLE.translation
+    spread = np.zeros((LINES, 90, 3), dtype=np.float32)
+    spread[:, :, 2] = NOISE
+    flanges = np.tile(np.eye(4), (LINES, 1, 1))
+    return Cloud(points, spread, np.zeros((LINES, 3)), np.zeros((LINES, 90)), np.arange(LINES) * 5e-4,
+                 np.zeros((LINES, 90), dtype=bool), flanges)  # fmt: skip
+
+
+def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
+    prior = Prior(SURFACE, np.diag([1e-3**2] * 3 + [5e-3**2] * 3))
+
+    def shaken(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        assert hz is not None
+        return rocking_motions(cloud, lines, rows, VEHICLE, TIMES, hz)
+
+    sweeps = None if hz is None else shaken
+    try:
+        return invert_pose(cloud, NOMINAL, prior, Tolerance(6e-4, 6e-3), sweeps=sweeps).base_from_surface
+    except RefusedError as refused:
+        # Unexplained, it may bend the surface too much; that pose is where the looking begins.
+        assert hz is None
+        pose = refused.seen["pose"]
+        assert isinstance(pose, pin.SE3)
+        return pose
+
+
+@pytest.mark.parametrize(("roll", "pitch", "hz"), [(0.0, 1e-4, 4.0), (7e-5, -7e-5, 2.7), (1e-4, 0.0, 9.3)])
+def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: float, pitch: float, hz: float) -> None:
+    cloud = scanned(roll, pitch, hz)
+    found = find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES)
+    assert found is not None
+    assert found.hz == pytest.approx(hz, abs=0.1)
+    beside = SURFACE.translation - VEHICLE.translation
+    assert found.height == pytest.approx(abs(roll * beside[1] - pitch * beside[0]), rel=0.25)
+    before, after = (difference(placed(cloud, f), SURFACE) for f in (None, found.hz))
+    points = 0.03
+    assert np.linalg.norm(after[:3]) + points * np.linalg.norm(after[3:]) < 15e-6
+    assert np.linalg.norm(after) <= np.linalg.norm(before) + 5e-6
+
+
+def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
+    for seed in range(4):
+        cloud = scanned(0.0, 0.0, 4.0, seed)
+        assert find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES) is None
+
+
+def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
+    covariance = rocking_covariance(Rocking(4.0, 1e-4), VEHICLE, SURFACE.translation)
+    beside = float(np.linalg.norm((SURFACE.translation - VEHICLE.translation)[:2]))
+    assert covariance[3, 3] == pytest.approx(0.5 * (1e-4 / beside) ** 2)
+    assert covariance[2, 2] == pytest.approx(0.5 * 1e-4**2)
+
+
+def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
+    with pytest.raises(RefusedError, match=r"rocks.*Wait until it is quiet"):
+        rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD), VEHICLE, SURFACE.translation)

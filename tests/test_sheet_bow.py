@@ -1,0 +1,101 @@
+"""A bowed light sheet: found beside the rest of the calibration where it is, and not where it is not.
+
+The observations come from a generator that shares nothing with the estimator; it tells the bow by the distance from the
+laser, the product by that along the camera's axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from cell.calibration.solve.adjustment import Priors
+from cell.calibration.solve.joint import Joint, solve_joint, solve_staged
+from cell.calibration.solve.results import ScanCalibration
+from cell.calibration.store import nominal_camera
+from cell.config import load_config
+from cell.geometry.light_plane import LightPlane
+from cell.lab.bench.calibration import observe
+from cell.lab.bench.calibration_world import HeadWorld, Noise, draw_head
+
+NOISE = Noise()
+BESIDE, DEPTH = 0.018, 0.130
+
+
+@cache
+def solved(off: float, seed: int) -> tuple[HeadWorld, Joint]:
+    """A head whose sheet is `off` m away from its plane at the place where bows are told, and its calibration."""
+    rng = np.random.default_rng(seed)
+    world = replace(draw_head(rng), bow=off * DEPTH / BESIDE**2)
+    observations = observe(world, NOISE, rng)
+    staged = solve_staged(observations, nominal_camera(load_config(None).scan_camera))
+    priors = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
+    return world, solve_joint(observations, staged, priors, held_out=False)
+
+
+@pytest.mark.parametrize(("off", "seed"), [(50e-6, 1), (-20e-6, 2)])
+def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int) -> None:
+    _, joint = solved(off, seed)
+    bow, plane = joint.adjusted.bow, joint.adjusted.state.plane
+    assert bow is not None and plane is not None
+    found, sigma = (abs(value) * BESIDE**2 / DEPTH for value in (bow.value, bow.sigma))
+    # Along the axis instead of along the fan: the distance is shorter by the cosine.
+    found *= np.hypot(plane.normal[0], plane.normal[1]) ** -1
+    assert found == pytest.approx(abs(off), abs=3e-6)
+    assert abs(found - abs(off)) < 4 * sigma
+    assert sigma < 1e-6
+    # Not hidden in the noise: the stripe's is found as it was drawn.
+    assert joint.adjusted.priors.stripe_scale == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_flat_sheet_stays_flat() -> None:
+    _, joint = solved(0.0, 3)
+    assert joint.adjusted.bow is None
+
+
+def test_points_are_measured_on_the_bowed_sheet() -> None:
+    world, joint = solved(50e-6, 1)
+    calibration = ScanCalibration.of(joint)
+    assert "bowed" in calibration.notes[0]
+    rows = np.arange(20.0, 460.0, 20.0)
+    off = []
+    for view in range(0, len(world.rails), 4):
+        columns, _ = world.stripe(view, np.zeros(7), rows)
+        points, _ = calibration.geometry().solve(
+            np.column_stack([columns, rows]), np.full(len(rows), world.rails[view])
+        )
+        board = world.flanges[view][:3, :3].T @ (world.board[:3, 3] - world.flanges[view][:3, 3])
+        normal = world.flanges[view][:3, :3].T @ world.board[:3, 2]
+        off.append(points @ normal - board @ normal)
+    # Without the bow they lie on an arc 0.17 mm high; what is left is what the whole calibration is off.
+    assert max(np.ptp(one) for one in off) < 0.06e-3
+
+
+def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation() -> None:
+    _, joint = solved(50e-6, 1)
+    calibration = ScanCalibration.of(joint)
+    again = ScanCalibration.from_dict(calibration.as_dict())
+    assert again.light_plane == calibration.light_plane
+    assert again.bow_sigma == calibration.bow_sigma
+    bows = [variant.light_plane.bow for variant in again.variants()]
+    assert bows[-1] - calibration.light_plane.bow == pytest.approx(calibration.bow_sigma)
+    assert set(bows[:-1]) == {calibration.light_plane.bow}
+
+
+def test_rays_meet_the_bowed_sheet_and_its_derivatives_are_right() -> None:
+    sheet = LightPlane.of((1.0, 0.03, -1 / 3.5), -0.035).bowed(0.02)
+    rng = np.random.default_rng(7)
+    rays = np.column_stack([rng.uniform(-0.1, 0.1, 40), rng.uniform(-0.15, 0.15, 40), np.ones(40)])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    points, by_ray, _, by_distance = sheet.intersect_with_jacobians(rays)
+    assert np.abs(sheet.distances(points)).max() < 1e-15
+    assert np.abs(np.cross(points, rays)).max() < 1e-15
+    step = 1e-7
+    for k in range(3):
+        moved = sheet.intersect(rays + step * np.eye(3)[k])
+        assert (moved - points) / step == pytest.approx(by_ray[:, :, k], rel=1e-4, abs=1e-5)
+    moved = replace(sheet, distance=sheet.distance + step).intersect(rays)
+    assert (moved - points) / step == pytest.approx(by_distance, rel=1e-4)

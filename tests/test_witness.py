@@ -1,0 +1,97 @@
+"""The witness of the laser's pointing: what it says of a turned light plane, by pictures of the simulator's optics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.calibration.witness import LARGEST_RAD, Pointing, Witness, pointing, turned
+from cell.geometry.camera import CameraModel
+from cell.geometry.light_plane import LightPlane, triangulate
+from drivers.errors import RefusedError
+from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.scene import LaserOptics, PlaneInstance
+from sim_backends.optics.stripe import crossings
+
+OPTICS = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
+CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
+LASER = LaserOptics()
+PLANE = LightPlane.of(LASER.normal, LASER.distance)
+EXIT = np.array([-0.035, 0.0, 0.0])
+SIGMA = 0.02
+
+
+def pointed(angle: float) -> LaserOptics:
+    """The simulator's laser turned by `angle` about its exit point and the camera's y axis."""
+    nx, ny, nz = LASER.normal
+    normal = (nx * np.cos(angle) + nz * np.sin(angle), ny, nz * np.cos(angle) - nx * np.sin(angle))
+    return replace(LASER, normal=normal, distance=float(np.dot(normal, LASER.origin)))
+
+
+def seen(angle: float, seed: int, shift: float = 0.0, rows: int = 480) -> Witness:
+    """The line on a plate 85 mm away, tilted by 3°, with noise, and the whole picture shifted by `shift` px."""
+    plate = np.eye(4)
+    plate[:3, 3] = -0.0107, 0.0, 0.085
+    tilt = np.deg2rad(3.0)
+    plate[:3, 0] = np.cos(tilt), 0.0, np.sin(tilt)
+    plate[:3, 2] = -np.sin(tilt), 0.0, np.cos(tilt)
+    found = crossings(OPTICS, pointed(angle), PlaneInstance(plate, (0.02, 0.012)))
+    columns = np.full(480, np.nan)
+    columns[found.rows] = found.columns + shift + SIGMA * np.random.default_rng(seed).standard_normal(len(found.rows))
+    columns[rows:] = np.nan
+    return Witness(0.0, columns, np.full(480, SIGMA))
+
+
+@pytest.mark.parametrize("angle", [0.5e-3, -0.2e-3, 0.0])
+def test_the_turn_is_found_and_its_deviation_is_right(angle: float) -> None:
+    off = []
+    for seed in range(6):
+        found = pointing(seen(0.0, seed), seen(angle, 100 + seed), CAMERA, PLANE, EXIT)
+        off.append(abs(found.turn) - abs(angle))
+        assert found.sigma < 0.03e-3
+    assert np.sqrt(np.mean(np.square(off))) < 0.025e-3
+
+
+def test_depths_are_right_again_on_the_turned_plane() -> None:
+    found = pointing(seen(0.0, 1), seen(0.5e-3, 2), CAMERA, PLANE, EXIT)
+    wall = np.eye(4)
+    wall[2, 3] = 0.130
+    there = crossings(OPTICS, pointed(0.5e-3), PlaneInstance(wall, (0.2, 0.2)))
+    pixels = np.column_stack([there.columns, there.rows])
+    before, _ = triangulate(CAMERA, PLANE, pixels)
+    after, _ = triangulate(CAMERA, turned(PLANE, EXIT, found.turn), pixels)
+    assert np.abs(before[:, 2] - 0.130).mean() > 0.2e-3
+    assert np.abs(after[:, 2] - 0.130).mean() < 0.02e-3
+
+
+def test_a_shifted_picture_does_no_harm_to_depths_either() -> None:
+    found = pointing(seen(0.0, 3), seen(0.0, 4, shift=0.3), CAMERA, PLANE, EXIT)
+    wall = np.eye(4)
+    wall[2, 3] = 0.130
+    there = crossings(OPTICS, LASER, PlaneInstance(wall, (0.2, 0.2)))
+    pixels = np.column_stack([there.columns + 0.3, there.rows])
+    before, _ = triangulate(CAMERA, PLANE, pixels)
+    after, _ = triangulate(CAMERA, turned(PLANE, EXIT, found.turn), pixels)
+    assert np.abs(after[:, 2] - 0.130).mean() < 0.2 * np.abs(before[:, 2] - 0.130).mean()
+
+
+def test_a_laser_that_was_knocked_is_refused_with_its_angle() -> None:
+    with pytest.raises(RefusedError, match="laser points") as caught:
+        pointing(seen(0.0, 5), seen(2 * LARGEST_RAD, 6), CAMERA, PLANE, EXIT)
+    assert caught.value.numbers[0].unit == "mrad"
+
+
+def test_a_witness_that_is_covered_is_refused() -> None:
+    with pytest.raises(RefusedError, match="witness clean"):
+        pointing(seen(0.0, 7), seen(0.0, 8, rows=150), CAMERA, PLANE, EXIT)
+
+
+def test_it_is_kept_with_the_calibration() -> None:
+    witness = seen(0.0, 9)
+    again = Witness.read(witness.as_dict())
+    assert again is not None
+    assert np.array_equal(again.columns, witness.columns, equal_nan=True)
+    assert Witness.read(None) is None
+    assert "mrad" in Pointing(0.4e-3, 0.02e-3).words
