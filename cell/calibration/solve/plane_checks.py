@@ -185,7 +185,7 @@ def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: Plane
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
     made.append(
         Check(
-            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, 0.5, 2.0,
+            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, 0.5, 4.0,
             "% of the distance", f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
         )
     )  # fmt: skip
