@@ -262,7 +262,7 @@ def test_refined_hand_eye_shrugs_off_a_wrong_pair():
     flanges = [pin.SE3(pin.exp3(rng.uniform(-1, 1, 3)), rng.uniform(-0.5, 0.5, 3)) for _ in range(30)]
     seen = [perturbed((f * hand).inverse() * board, 1e-4 * rng.normal(size=6)) for f in flanges]
     seen[7] = perturbed(seen[7], (0.05, 0, 0, 0, 0.1, 0))
-    found = refine_hand_eye(flanges, seen, solve_hand_eye(flanges, seen))
+    found, _, _ = refine_hand_eye(flanges, seen, solve_hand_eye(flanges, seen))
     assert np.linalg.norm(difference(found.flange_from_camera, hand)) < 5e-4
 
 

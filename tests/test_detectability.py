@@ -104,7 +104,7 @@ def test_a_good_verdict_says_within_what(calibrated):
     verification = Verification.of(calibration, load_job("pot")[0], look_again(cell, calibration))
     summary = verification.summary()
     assert summary["good"]
-    # In this cell the arm's scatter hides as much as is allowed, of the target camera and not of the laser.
+    # In this cell the arm's scatter hides as much as is allowed, of the target camera and not of the rail.
     assert summary["verdict"] == "good"
     shows, allowed = summary["place"]["shows_from_mm"], summary["place"]["allowed_mm"]
     assert allowed == pytest.approx(0.6)
@@ -113,7 +113,7 @@ def test_a_good_verdict_says_within_what(calibrated):
     assert "allowed at the place are 0.60 mm" in summary["reason"]
     assert "could do that unseen: " in summary["reason"]
     assert "target camera's mount on the flange, turn (up to 0." in summary["reason"]
-    assert "laser's light plane" not in summary["reason"]
+    assert "rail, turn" not in summary["reason"]
     json.dumps(summary, allow_nan=False)
 
 

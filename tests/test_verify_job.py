@@ -29,3 +29,18 @@ def test_verify_tells_a_disturbed_calibration_from_a_good_one(
     assert not found["good"]
     assert "scan camera" in found["suspects"][0]["part"]
     assert found["suspects"][0]["place_error_mm"] > 0.05
+
+
+@pytest.mark.campaign
+def test_cells_that_nobody_touched_are_called_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    alarms, alarmed, changes = 0, 0, 0
+    for seed in range(1, 21):
+        with Cell.open(sim="all", seed=seed, clock="virtual") as cell:
+            cell.calibrate()
+            checks = [cell.verify() for _ in range(3)]
+        bad = sum(not check.good for check in checks)
+        alarms, alarmed, changes = alarms + bad, alarmed + (bad > 0), changes + sum(c.verdict.changed for c in checks)
+    # Checks of one calibration share its error, so its worlds are counted as well: 5 % of 60 and of 20.
+    assert (alarms <= 3, alarmed <= 1) == (True, True)
+    assert changes <= 6

@@ -17,6 +17,7 @@ from cell.calibration.solve.advice import advice
 from cell.calibration.solve.coverage import Coverage
 from cell.calibration.solve.influence import Places, derivatives, influences, place_rms
 from cell.calibration.solve.joint import Joint, paper_plane_of
+from cell.calibration.solve.joint_checks import joint_checks
 from cell.calibration.solve.results import ScanCalibration
 from cell.calibration.store import Solved
 from cell.config import CellConfig
@@ -61,6 +62,14 @@ def examine(solved: Solved, observations: Observations, config: CellConfig, job:
         "target_coverage": target.summary(),
         "noise_found": noise_found(solved.scan),
         "paper_steps": paper_check(solved.scan, observations),
+        "checks": [
+            {"camera": camera, **check.as_dict()}
+            for camera, joint, nominal in (
+                ("scan", solved.scan, observations.scan_camera),
+                ("target", solved.target, observations.target_camera),
+            )
+            for check in joint_checks(joint, nominal)
+        ],
         "influence": influences(by_parameter, covariance),
         "advice": advice(
             solved.scan, board, config.rail.travel, lambda other: place_rms(by_parameter, np.asarray(other))

@@ -61,6 +61,14 @@ def calibrate(
         str | None,
         typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
+            "the arm has no say in it.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
@@ -72,14 +80,18 @@ def calibrate(
     from drivers.errors import ConfigError
 
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
+    given["--camera"] = camera
     if source is None:
         for name, value in given.items():
             if value:
                 raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
         from cell.calibration.recorded.attach import Options
+        from cell.calibration.recorded.known_camera import read_camera
 
-        _from_folder(source, board, Options(poses, pose_field, _setup(setup), plan), json)
+        known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
+        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures")
+        _from_folder(source, board, options, json)
         return
     from cell.calibration.archive import read_archive
     from cell.calibration.report import examine
@@ -114,7 +126,7 @@ def _from_folder(folder: Path, board: str | None, options: Options, json: bool) 
     from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
     from cell.vision import parse_board
-    from drivers.errors import ConfigError
+    from drivers.errors import ConfigError, RefusedError
 
     result = calibrate_folder(folder, None if board is None else parse_board(board), options)
     if json:
@@ -125,5 +137,7 @@ def _from_folder(folder: Path, board: str | None, options: Options, json: bool) 
         raise ConfigError(
             f"no picture in {folder} could be used: is {board} the board in the pictures? The reasons are listed above"
         )
+    if result["refused"]:
+        raise RefusedError("; ".join(result["refused"].values()))
     if not options.plan and result["intrinsics"] is None and result["hand_eye"] is None:
         raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result['notes'])}")

@@ -39,6 +39,9 @@ def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> N
     for row in figures["advice"]:
         table.add_row(row["what"], row["kind"], f"{row['then_mm']:.4f}", f"{100 * row['gain']:.1f} %")
     console.print(table)
+    for check in figures["checks"]:
+        if check["text"]:
+            console.print(f"doubtful ({check['camera']} camera): {check['text']}", markup=False, soft_wrap=True)
     for path in pictures:
         console.print(f"picture: {path}", markup=False, soft_wrap=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,10 +26,10 @@ def print_recorded(result: Mapping[str, Any]) -> None:
         values.add_row("RMS of the board's points", f"{camera['rms_px']:.4f}", "px")
     if hand is not None:
         setup = f"hand-eye ({hand['setup'].replace('_', ' ')})"
-        for axis, value in zip("xyz", hand["translation_mm"], strict=True):
-            values.add_row(f"{setup} {axis}", f"{value:.3f}", "mm")
-        for axis, value in zip("xyz", hand["rotation_vector_rad"], strict=True):
-            values.add_row(f"{setup} rotation {axis}", f"{value:.5f}", "rad")
+        for axis, value, sigma in zip("xyz", hand["translation_mm"], hand["sigma_mm"], strict=True):
+            values.add_row(f"{setup} {axis}", f"{value:.3f} ± {sigma:.3f}", "mm")
+        for axis, value, sigma in zip("xyz", hand["rotation_vector_rad"], hand["sigma_deg"], strict=True):
+            values.add_row(f"{setup} rotation {axis}", f"{value:.5f} ± {math.radians(sigma):.5f}", "rad")
         values.add_row("scatter of the board", f"{hand['scatter_mm']:.3f}", "mm")
         values.add_row("scatter of the board", f"{hand['scatter_deg']:.4f}", "deg")
     if plane is not None:
@@ -37,10 +38,17 @@ def print_recorded(result: Mapping[str, Any]) -> None:
         low, high = plane["depth_range_mm"]
         values.add_row("light plane seen from the camera at", f"{low:.0f} … {high:.0f}", "mm")
         values.add_row("light plane RMS", f"{plane['rms_mm']:.4f}", "mm")
+        if plane["sigma_place_mm"] is not None:
+            values.add_row("light plane σ where it was seen", f"{plane['sigma_place_mm']:.4f}", "mm")
+            values.add_row("light plane σ of its normal", f"{plane['sigma_normal_deg']:.4f}", "deg")
     if values.row_count:
         console.print(values)
     if result["flatness"] is not None:
         console.print(_flatness(result["flatness"]))
+    if result["checks"]:
+        console.print(_checks(result["checks"]))
+    for part, text in result["refused"].items():
+        console.print(f"REFUSED {part.replace('_', '-')}: {text}", markup=False, soft_wrap=True)
     for note in result["notes"]:
         console.print(note, markup=False, soft_wrap=True)
 
@@ -73,6 +81,17 @@ def _frames(frames: Sequence[Mapping[str, Any]]) -> Table:
             rms,
             frame["text"],
         )
+    return table
+
+
+def _checks(checks: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("checks", ("of", "what", "found", "doubtful from", "refused from", "unit"), right=2)
+    for check in checks:
+        found = "not known" if check["value"] is None else f"{check['value']:.3g}"
+        mark = {"ok": "", "doubt": " ?", "refused": " !"}[check["verdict"]]
+        limit = "" if check["refused_from"] is None else f"{check['refused_from']:.3g}"
+        part = check["part"].replace("_", "-")
+        table.add_row(part, check["name"], found + mark, f"{check['doubt_from']:.3g}", limit, check["unit"])
     return table
 
 

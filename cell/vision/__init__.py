@@ -14,13 +14,17 @@ if TYPE_CHECKING:
     from cell.vision.board.spec import BoardSpec, parse_board
     from cell.vision.board.view import BoardView
     from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-    from cell.vision.stripe.extract import StripeProfile, StripeSettings, extract
+    from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract
+    from cell.vision.stripe.planes import read_colours
+    from cell.vision.stripe.read import read_stripe
     from cell.vision.stripe.stream import StripeStream
 
 __all__ = [
     "BoardPose",
     "BoardSpec",
     "BoardView",
+    "Laser",
+    "Mark",
     "PictureRefused",
     "Reason",
     "StripeProfile",
@@ -31,7 +35,9 @@ __all__ = [
     "extract",
     "find_board",
     "parse_board",
+    "read_colours",
     "read_picture",
+    "read_stripe",
 ]
 
 _ROOMS = {
@@ -39,7 +45,9 @@ _ROOMS = {
     "board.spec": ("BoardSpec", "parse_board"),
     "board.view": ("BoardView",),
     "pictures": ("PictureRefused", "Reason", "check_picture", "read_picture"),
-    "stripe.extract": ("StripeProfile", "StripeSettings", "extract"),
+    "stripe.extract": ("Laser", "Mark", "StripeProfile", "StripeSettings", "extract"),
+    "stripe.planes": ("read_colours",),
+    "stripe.read": ("read_stripe",),
     "stripe.stream": ("StripeStream",),
 }
 

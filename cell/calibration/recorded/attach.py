@@ -26,13 +26,16 @@ class Options:
     """What a person said instead of leaving it to the data; None where nothing was said.
 
     `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
-    eye_to_hand; `plan`: only say what was understood.
+    eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
+    `hold_camera` the arm has no say in it.
     """
 
     poses: str | None = None
     pose_field: str | None = None
     setup: str | None = None
     plan: bool = False
+    camera: CameraModel | None = None
+    hold_camera: bool = False
 
 
 @dataclass
@@ -42,6 +45,8 @@ class Understood:
     setup: str | None = None
     about: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    refused: str = ""
+    """Why there are poses, and none can be used; empty when they can, or there are none."""
 
 
 def attach_poses(
@@ -79,7 +84,7 @@ def attach_poses(
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
         decision = decide(series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
-        return Understood(about={"source": [s.name for s in series]}, notes=[f"no hand-eye: {error}"])
+        return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
     return _apply(decision, frames, pitch, options)
 
 
@@ -102,8 +107,10 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
         },
     )
     problem, refused = scale_problem(best, pitch)
-    if problem:
-        understood.notes.append(f"no hand-eye: {problem}" if refused else f"doubt: {problem}")
+    if problem and refused:
+        understood.refused = f"no hand-eye: {problem}"
+    elif problem:
+        understood.notes.append(f"doubt: {problem}")
     for k, record in one.of.items():
         frame = frames[k]
         several = sum(r.path == record.path for r in one.records) > 1

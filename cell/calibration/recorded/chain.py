@@ -1,13 +1,14 @@
 """The whole measuring chain from recorded frames with flange poses: camera, hand-eye, light plane and its flatness.
 
-The camera may ride on the flange or stand before it, and nobody need say which.
+The camera may ride on the flange or stand before it, and nobody need say which. What is kept is what predicts frames
+that were left out best, and it is checked against figures that do not come from the same fit.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,61 +25,154 @@ from cell.calibration.recorded.result import (
     plane_dict,
     seen_depths,
 )
-from cell.calibration.solve.blocks import PLANE
-from cell.calibration.solve.flatness import Flatness, choose_arm, flatness, leave_one_out
-from cell.calibration.solve.joint import Joint, Staged, solve_joint, solve_staged, start_state
+from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, SHARED, stripe_block
+from cell.calibration.solve.checks import Check
+from cell.calibration.solve.choice import Choice, choose_solution
+from cell.calibration.solve.closed_form import points_on_boards
+from cell.calibration.solve.flatness import Flatness, flatness, leave_one_out
+from cell.calibration.solve.hand_eye_checks import hand_eye_checks
+from cell.calibration.solve.intrinsics import Intrinsics
+from cell.calibration.solve.joint import Staged, solve_staged, start_state
+from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_of_cameras
+from cell.calibration.solve.scale import Scale, metric_scale
+from cell.calibration.solve.starts import stripe_means
 from cell.geometry.camera import PARAMETER_NAMES
-from cell.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
-TANGENTIAL_VIEWS = 12
+Setup = str
+STRANGE_SHARE, STRANGE_TURN = 0.15, math.radians(10.0)
+LEAST_FRAMES = 4
+"""With three poses everything fits: there is no fourth to disagree."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What frames with poses give."""
+    """What frames with poses give. `stripes` says why a frame's stripe is not used, by the frame's place."""
 
     setup: str
+    observations: list[ScanObservation]
     staged: Staged
-    joint: Joint
-    tried: dict[str, float]
+    choice: Choice
+    stripes: dict[int, str]
+    no_plane: str
+    plane_known: PlaneKnown | None
+    scale: Scale | None
     flat_staged: Flatness | None
     flat: Flatness | None
     left_out: Flatness | None
 
 
-def solve_chain(frames: Sequence[RecordedFrame], known: str | None = None) -> Chain:
-    """Staged and joint solution with the camera as `known`, on the flange or before it, or whichever fits."""
+def solve_chain(
+    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: Setup | None = None, hold_camera: bool = False
+) -> Chain:
+    """Closed form and joint solution with the camera on the flange, or before it, whichever fits; `known` says which.
+
+    Raises RefusedError when there are too few frames, or they do not determine a hand-eye.
+    """
+    if len(frames) < LEAST_FRAMES:
+        raise RefusedError(
+            f"{len(frames)} frames have a flange pose; a hand-eye that can be checked needs {LEAST_FRAMES} or more"
+        )
+    setup, observations, staged = _placed(frames, pictures, known)
+    scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)
+    _refuse_strangers(staged, scale)
+    staged, stripes, no_plane = _with_plane(observations, staged, pictures)
+    choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
+    known_plane = _plane_known(choice, staged, observations, pictures)
+    if scale is not None and scale.believed:
+        unsure = np.zeros(SHARED)
+        unsure[HAND.start : HAND.start + 3] = np.abs(scale.shift)
+        best, closed = (replace(s, unsure=unsure) for s in (choice.best, choice.closed))
+        choice = replace(choice, best=best, closed=closed)
+        if known_plane is not None:
+            reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
+            known_plane = replace(known_plane, place=math.hypot(known_plane.place, (scale.value - 1) * reach))
+    return Chain(
+        setup,
+        observations,
+        staged,
+        choice,
+        stripes,
+        no_plane,
+        known_plane,
+        scale,
+        flatness(start_state(staged), observations, staged),
+        flatness(choice.best.adjusted.state, observations, staged),
+        leave_one_out(observations, staged, choice.best),
+    )
+
+
+def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
+    """Refuse poses that have nothing to do with the pictures: no adjustment could make sense of them."""
+    found = staged.hand_eye
+    reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
+    if found.scatter_m < STRANGE_SHARE * reach and found.scatter_rad < STRANGE_TURN:
+        return
+    text = (
+        f"the poses and the pictures do not belong together: by the poses the board, which lies still, moves by "
+        f"{1e3 * found.scatter_m:.0f} mm and {math.degrees(found.scatter_rad):.1f}° RMS (allowed "
+        f"{100 * STRANGE_SHARE:.0f} % of its distance, {1e3 * STRANGE_SHARE * reach:.0f} mm, and "
+        f"{math.degrees(STRANGE_TURN):.0f}°)"
+    )
+    if scale is not None and scale.unit is not None and found.scatter_rad < STRANGE_TURN:
+        raise RefusedError(f"{text}; the flange's positions seem to be in {scale.unit}, not in m")
+    raise RefusedError(
+        f"{text}; are they of the same frames, in m, base_from_flange, and is the order of quaternions or angles right?"
+    )
+
+
+def _plane_known(
+    choice: Choice, staged: Staged, observations: Sequence[ScanObservation], pictures: Intrinsics
+) -> PlaneKnown | None:
+    """How well the light plane is known, None without one."""
+    plane = choice.best.adjusted.state.plane
+    if plane is None or staged.plane is None:
+        return None
+    lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
+    others = [p for k in lit if (p := choice.best.left.states[k].plane) is not None]
+    cloud = np.concatenate(points_on_boards(staged, observations))
+    views = [o.view for o in observations if o.view is not None]
+    moved = planes_of_cameras(pictures, views, [o.profile for o in observations], staged.plane.rows)
+    return PlaneKnown.of(plane, others, cloud, () if choice.best.camera_free else moved)
+
+
+def _placed(
+    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: Setup | None
+) -> tuple[str, list[ScanObservation], Staged]:
+    """Camera on the flange or before it, whichever leaves the board scattered less, without the stripe."""
     best: tuple[float, str, list[ScanObservation], Staged] | None = None
     for setup in ("eye_in_hand", "eye_to_hand") if known is None else (known,):
         observations = [_observation(f, invert=setup == "eye_to_hand") for f in frames]
-        lit = sum(o.profile is not None for o in observations) >= 2
-        staged = None
-        for stripe in (True, False) if lit else (False,):
-            try:
-                staged = solve_staged(observations, stripe=stripe)
-                break
-            except RefusedError:
-                if not stripe:
-                    raise
-        assert staged is not None
+        staged = solve_staged(observations, stripe=False, camera=pictures.camera)
         if best is None or staged.hand_eye.scatter_m < 0.5 * best[0]:
             best = staged.hand_eye.scatter_m, setup, observations, staged
     assert best is not None
-    _, setup, observations, staged = best
-    tangential = len(observations) >= TANGENTIAL_VIEWS
-    priors, tried = choose_arm(observations, staged, tangential)
-    joint = solve_joint(observations, staged, priors, tangential)
-    state = joint.adjusted.state
-    return Chain(
-        setup,
-        staged,
-        joint,
-        tried,
-        flatness(start_state(staged), observations, staged),
-        flatness(state, observations, staged),
-        leave_one_out(observations, staged, state, joint.adjusted.priors, tangential),
-    )
+    return best[1:]
+
+
+def _with_plane(
+    observations: list[ScanObservation], staged: Staged, pictures: Intrinsics
+) -> tuple[Staged, dict[int, str], str]:
+    """The closed form with its light plane, without stripes that are of another line; why, and why there is none."""
+    wrong: dict[int, str] = {}
+    if sum(o.profile is not None for o in observations) < 2:
+        return staged, wrong, "fewer than two frames show a laser stripe"
+    while True:
+        lit = [replace(o, profile=None) if k in wrong else o for k, o in enumerate(observations)]
+        try:
+            found = solve_staged(lit, camera=pictures.camera)
+        except RefusedError as error:
+            return staged, wrong, str(error)
+        assert found.plane is not None
+        more = odd_stripes(points_on_boards(found, lit))
+        for k, (o, rows) in enumerate(zip(lit, found.plane.rows, strict=True)):
+            if o.profile is not None and len(rows):
+                text = crooked(pictures.camera, *stripe_means(o.profile, rows, 120))
+                if text is not None:
+                    more[k] = text
+        if not more:
+            return found, wrong, ""
+        wrong |= more
 
 
 def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
@@ -87,59 +181,122 @@ def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
     return ScanObservation(frame.view, frame.profile, pose, 0.0, frame.name)
 
 
-def report_chain(chain: Chain, frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
+def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
+    """The absolute checks of hand-eye and light plane."""
+    made = hand_eye_checks(chain.choice, chain.staged.camera_from_board, pictures)
+    if chain.scale is not None:
+        made.append(chain.scale.check())
+    best, staged = chain.choice.best, chain.staged
+    state = best.adjusted.state
+    known = chain.plane_known
+    if state.plane is None or staged.plane is None or known is None:
+        return made
+    cloud = np.concatenate(points_on_boards(staged, chain.observations))
+    lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
+    rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
+    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known)
+    apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
+    tilt = math.degrees(known.tilt)
+    made.append(
+        Check(
+            "light_plane", "plane with the arm against plane of the pictures", apart, max(1.0, 4 * tilt),
+            max(4.0, 8 * tilt), "deg", "the arm's poses and the board's in the pictures do not agree about it",
+        )
+    )  # fmt: skip
+    return made
+
+
+def _own_noise(chain: Chain) -> float:
+    """What the stripe's own stated σ makes in m on the board, RMS."""
+    state = chain.choice.best.adjusted.state
+    flanges = state.flanges or [v.base_from_flange for v in chain.choice.best.views]
+    parts = [
+        stripe_block(state, view, flange, 0.0)[2]
+        for view, flange in zip(chain.choice.best.views, flanges, strict=True)
+        if len(view.stripe)
+    ]
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> None:
     """Put camera, hand-eye, light plane, noise and flatness into the result, lengths in mm."""
-    adjusted, state = chain.joint.adjusted, chain.joint.adjusted.state
+    best, choice = chain.choice.best, chain.choice
+    adjusted, state, sigma = best.adjusted, best.adjusted.state, best.sigma
     boards = [
-        f * state.flange_from_camera * board_pose(frame.view, state.camera).camera_from_board
-        for f, frame in zip((v.base_from_flange for v in chain.joint.views), frames, strict=True)
-        if frame.view is not None
+        o.base_from_flange * state.flange_from_camera * board
+        for o, board in zip(chain.observations, chain.staged.camera_from_board, strict=True)
     ]
     apart = [b.translation - state.base_from_board.translation for b in boards]
     turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]
-    sigma = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))
-    result["intrinsics"] = {
-        **camera_dict(state.camera),
-        "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
-        "held_out_at_reported_poses_rms_px": math.sqrt(2) * chain.joint.held_out_px,
-        "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[:4].tolist(), strict=True)),
-        "method": "joint adjustment",
-    }
+    if best.camera_free:
+        result["intrinsics"] = {
+            **camera_dict(state.camera),
+            "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
+            "held_out_rms_px": math.sqrt(2) * best.left.figures["dots_px"],
+            "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[CAMERA][:4].tolist(), strict=True)),
+            "lens": pictures.model.name,
+            "method": best.name,
+        }
+    figures = {key: finite(value) for key, value in best.left.figures.items()}
     result["hand_eye"] = {
-        "method": "joint adjustment",
+        "method": best.name,
         **hand_eye_dict(chain.setup, state.flange_from_camera),
         "scatter_mm": 1e3 * float(np.sqrt(np.mean(np.sum(np.square(apart), axis=1)))),
         "scatter_deg": math.degrees(float(np.sqrt(np.mean(np.square(turns))))),
-        "sigma_mm": (1e3 * sigma[15:18]).tolist(),
-        "sigma_deg": np.degrees(sigma[18:21]).tolist(),
-        "frames": len(frames),
-        "closed_form": closed_form_dict(chain.setup, chain.staged.hand_eye),
-    }
-    result["noise"] = {
-        "arm_translation_mm": 1e3 * adjusted.priors.arm_translation,
-        "arm_rotation_deg": math.degrees(adjusted.priors.arm_rotation),
-        "arm_chosen_by": "least error of left-out frames; tried mm: figure",
-        "arm_tried": chain.tried,
-        "chi2_per_dof": adjusted.chi2_per_dof,
-    }
-    if state.plane is None or chain.staged.plane is None:
-        result["notes"].append("no light plane: no frame shows a laser stripe on the board in a usable way")
-        return
-    result["light_plane"] = {
-        **plane_dict(state.plane),
-        "rms_mm": 1e3 * adjusted.stripe_rms_m,
-        "depth_range_mm": seen_depths(state.plane, state.camera, [v.stripe for v in chain.joint.views]),
-        "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
-        "method": "joint adjustment",
-        "staged": {
-            **plane_dict(chain.staged.plane.plane),
-            "rms_mm": 1e3 * chain.staged.plane.rms,
-            "cross_ratio_check_mm": None if chain.staged.paper is None else finite_mm(chain.staged.paper.cross_ratio_m),
+        "sigma_mm": (1e3 * sigma[HAND][:3]).tolist(),
+        "sigma_deg": np.degrees(sigma[HAND][3:]).tolist(),
+        "formal_sigma_mm": (1e3 * best.formal[HAND][:3]).tolist() if best.joint else None,
+        "left_out": figures,
+        "frames": len(chain.observations),
+        "closed_form": {
+            **closed_form_dict(chain.setup, chain.staged.hand_eye),
+            "left_out": {key: finite(value) for key, value in choice.closed.left.figures.items()},
         },
     }
-    names = [f.name for f in frames]
-    rows = chain.staged.plane.rows
-    result["stripe_points"] = {n: len(r) for n, r in zip(names, rows, strict=True)}
+    result["noise"] = {
+        "arm_translation_mm": 1e3 * choice.arm[0],
+        "arm_rotation_deg": math.degrees(choice.arm[1]),
+        "arm_by": "variance components, with the camera of the pictures; the pictures' own scatter is in it",
+        "arm_weight_mm": 1e3 * adjusted.priors.arm_translation if best.joint else None,
+        "tried": [
+            {"solution": s.name, "arm_weight_mm": 1e3 * s.adjusted.priors.arm_translation if s.joint else None}
+            | {"left_out_mm": finite(s.figure()), **{k: finite(v) for k, v in s.left.figures.items()}}
+            for s in choice.tried
+        ],
+        "chi2_per_dof": finite(adjusted.chi2_per_dof),
+    }
+    if chain.setup == "eye_to_hand":
+        result["notes"].append(
+            "by the poses the camera stands still and the board moves with the flange; if the camera rides on the "
+            "flange, the poses are those of the base in the flange (inverse)"
+        )
+    _report_plane(chain, result)
+
+
+def _report_plane(chain: Chain, result: dict[str, Any]) -> None:
+    best, staged = chain.choice.best, chain.staged
+    state, names = best.adjusted.state, [o.name for o in chain.observations]
+    result["notes"] += [f"{names[k]}: {text} Its stripe is not used." for k, text in chain.stripes.items()]
+    if state.plane is None or staged.plane is None:
+        result["notes"].append(f"no light plane: {chain.no_plane}")
+        return
+    known = chain.plane_known
+    result["light_plane"] = {
+        **plane_dict(state.plane),
+        "rms_mm": 1e3 * best.adjusted.stripe_rms_m,
+        "depth_range_mm": seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)]),
+        "sigma_distance_mm": 1e3 * float(best.sigma[PLANE][2]),
+        "sigma_place_mm": None if known is None else 1e3 * known.place,
+        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
+        "stripe_noise_mm": 1e3 * _own_noise(chain),
+        "method": best.name,
+        "staged": {
+            **plane_dict(staged.plane.plane),
+            "rms_mm": 1e3 * staged.plane.rms,
+            "cross_ratio_check_mm": None if staged.paper is None else finite_mm(staged.paper.cross_ratio_m),
+        },
+    }
+    result["stripe_points"] = {n: len(r) for n, r in zip(names, staged.plane.rows, strict=True)}
     if chain.flat is not None:
         result["flatness"] = {
             **flatness_dict(chain.flat, names),
@@ -147,3 +304,8 @@ def report_chain(chain: Chain, frames: Sequence[RecordedFrame], result: dict[str
             "leave_one_out": None if chain.left_out is None else flatness_dict(chain.left_out, names),
             "staged": None if chain.flat_staged is None else flatness_dict(chain.flat_staged, names),
         }
+
+
+def finite(value: float) -> float | None:
+    """None for what is not known."""
+    return value if math.isfinite(value) else None

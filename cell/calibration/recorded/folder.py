@@ -146,13 +146,16 @@ def _linked(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) ->
 
 
 def _roles(group: Sequence[RecordedFrame]) -> tuple[RecordedFrame, RecordedFrame]:
-    """The board's picture and the second one: by their names, else that without a board, else the longer name."""
+    """The board's picture and the second one: by their names, else that without a board, else the longer name.
+
+    Of a picture in two formats the larger file lost less.
+    """
     lit = [LASER_WORDS.search(f.name.lower()) is not None for f in group]
     if lit[0] != lit[1]:
         return (group[1], group[0]) if lit[0] else (group[0], group[1])
     if (group[0].view is None) != (group[1].view is None):
         return (group[1], group[0]) if group[0].view is None else (group[0], group[1])
-    first, second = sorted(group, key=lambda f: (len(f.name), f.name))
+    first, second = sorted(group, key=lambda f: (len(f.name), -f.path.stat().st_size))
     return first, second
 
 

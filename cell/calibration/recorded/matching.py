@@ -15,7 +15,7 @@ from cell.calibration.recorded.listing import PICTURES, natural
 # Words that say what is in a file and not which frame it is of.
 ROLES = (
     "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
-    "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|left|right"
+    "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
 )
 CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
 
@@ -123,13 +123,13 @@ def _stem(name: str) -> str:
 
 def _plain(name: str) -> str:
     """The name without the words that say what is in a file."""
-    words = re.split(r"[\s_\-.]+|(?<=[a-z])(?=\d)", _stem(name).lower())
+    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
     return "-".join(str(int(w)) if w.isdecimal() else w for w in words if w and not re.fullmatch(ROLES, w))
 
 
 def series_name(name: str) -> str:
     """A file's name with its numbers taken out: files of one series have the same."""
-    return re.sub(r"\d+", "N", name)
+    return re.sub(r"\d+", "N", name.lstrip("_"))
 
 
 def ordered(names: Sequence[str]) -> list[int]:

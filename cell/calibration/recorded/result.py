@@ -37,6 +37,9 @@ def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
         "frames_rms": {},
         **dict.fromkeys(keys),
         "notes": [],
+        "checks": [],
+        "refused": {},
+        "refused_values": {},
     }
 
 
@@ -62,8 +65,11 @@ def intrinsics_dict(found: Intrinsics) -> dict[str, Any]:
     return {
         **camera_dict(found.camera),
         "rms_px": found.point_rms_px,
-        "held_out_rms_px": math.sqrt(2) * found.held_out_px,
+        "held_out_rms_px": math.sqrt(2) * found.held_out_px if math.isfinite(found.held_out_px) else None,
         "sigma_px": dict(zip(PARAMETER_NAMES[:4], found.sigma[:4].tolist(), strict=True)),
+        "formal_sigma_px": dict(zip(PARAMETER_NAMES[:4], found.formal[:4].tolist(), strict=True)),
+        "lens": found.model.name,
+        "lens_tried_rms_px": {name: v for name, v in found.tried.items() if math.isfinite(v)},
         "method": "pictures alone",
     }
 

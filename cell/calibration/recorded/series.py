@@ -112,13 +112,13 @@ def match_series(
         one.alone = [one.records[i] for i in found.alone]
         one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
     belonging = [s for s in series if s.of]
-    others = _others(belonging, listing)
-    if others:
+    below = _others(belonging, listing)
+    if below:
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
-        listing.pictures = [p for p in listing.pictures if p.parent not in others]
-        listing.unread += [(f"{listing.name(p)}/", "a recording of its own: name it with --from") for p in others]
-        own = [s for s in series if not any(r.path.parent in others for r in s.records)]
-        return match_series(own, listing, links)
+        listing.pictures = [p for p in listing.pictures if p.parent not in below]
+        listing.unread += [(f"{listing.name(p)}/", "a recording of its own: name it with --from") for p in below]
+        kept = [s for s in series if not any(r.path.parent in below for r in s.records)]
+        return match_series(kept, listing, links)
     strange = [
         (s.name, f"{len(s.records)} poses for {len(names)} pictures, and none says which picture it belongs to")
         for s in series

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cell.calibration.solve.blocks import (
     CAMERA,
     COLUMNS,
+    FLANGE,
     HAND,
     OWN,
     PLANE,
@@ -36,7 +37,10 @@ from cell.geometry.poses import difference
 if TYPE_CHECKING:
     from cell.calibration.solve.bow import Bow
 
-DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01)
+DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01, 2.0)
+FOCAL_TIE_PX = 1e-3
+# What a recorded arm may repeat to, m and rad.
+ARM_RANGE, ARM_TURN_RANGE = (1e-6, 1e-2), (1e-6, 5e-2)
 HUBER = 2.5
 # Mean robust cost of a Gaussian residual, per component, for the dots' two components together and the stripe's one.
 _OVER, _DENSITY = math.erfc(HUBER / math.sqrt(2)), math.exp(-(HUBER**2) / 2)
@@ -56,7 +60,9 @@ class Priors:
 
     `arm_translation` (m) and `arm_rotation` (rad) per axis of a reported flange pose, `rail` (m) of a rail reading.
     With `estimate_arm` the first two are starting values only and the residuals decide. `dots_scale` multiplies the
-    σ of the dots, `stripe_scale` that of the stripe; the residuals always decide on these.
+    σ of the dots, `stripe_scale` that of the stripe; the residuals always decide on these. Of the
+    stripe's points `stripe_share` count, as if the others repeated them. `lens` are the deviations of
+    k1, k2, p1, p2, k3 from 0; with `one_focal` fx is fy.
     """
 
     arm_translation: float = 3e-5
@@ -65,6 +71,9 @@ class Priors:
     estimate_arm: bool = False
     dots_scale: float = 2.0
     stripe_scale: float = 1.0
+    stripe_share: float = 1.0
+    lens: tuple[float, float, float, float, float] = DISTORTION_PRIOR
+    one_focal: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +165,8 @@ class Adjustment:
             if normal.promised(step) < settled * normal.total + 1e-9:
                 break
             used += 1
+            if not np.isfinite(step).all():
+                break
             candidate = state.moved(step)
             new = self.normal_at(candidate)
             if np.isfinite(new.total) and new.total <= normal.total * (1 + 1e-12):
@@ -167,36 +178,63 @@ class Adjustment:
                     break
         return state, normal, used
 
+    def rows_of(self, k: int, state: State) -> list[tuple[str, Array, Array, float]]:
+        """Of view `k`: group, whitened rows (m, 34) and residuals (m,), robust weights included, and robust cost."""
+        view, flange, rail = self.views[k], state.flanges[k], float(state.rails[k])
+        made = []
+        if len(view.points):
+            residual, jacobian = dots_block(state, view, flange, rail)
+            sigma = self.priors.dots_scale * view.sigma
+            weight, cost = huber(np.linalg.norm(residual / sigma[:, None], axis=1))
+            root = (np.sqrt(weight) / sigma)[:, None]
+            rows = (jacobian * root[:, :, None]).reshape(-1, COLUMNS)
+            made.append(("dots", rows, np.asarray((residual * root).ravel()), cost))
+        if len(view.stripe) and state.plane is not None:
+            away, jacobian, sigma = stripe_block(state, view, flange, rail)
+            sigma = self.priors.stripe_scale * sigma
+            weight, cost = huber(np.abs(away / sigma))
+            root = np.sqrt(self.priors.stripe_share * weight) / sigma
+            cost *= self.priors.stripe_share
+            made.append(("stripe", jacobian * root[:, None], np.asarray(away * root), cost))
+        return made
+
     def normal_at(self, state: State) -> Normal:
         """The normal equations at a state whose flanges and rails are those of the views, with the present priors."""
         normal = Normal(self.rests, self.free, self.own_free)
         settles = np.diff(self.rests, prepend=-1) > 0
-        for k, (view, flange, rail) in enumerate(zip(self.views, state.flanges, state.rails, strict=True)):
-            if len(view.points):
-                residual, jacobian = dots_block(state, view, flange, float(rail))
-                sigma = self.priors.dots_scale * view.sigma
-                white = residual / sigma[:, None]
-                weight, cost = huber(np.linalg.norm(white, axis=1))
-                root = (np.sqrt(weight) / sigma)[:, None]
-                rows = (jacobian * root[:, :, None]).reshape(-1, COLUMNS)
-                normal.add_view("dots", k, rows, (residual * root).ravel(), cost)
-            if len(view.stripe) and state.plane is not None:
-                residual, jacobian, sigma = stripe_block(state, view, flange, float(rail))
-                sigma = self.priors.stripe_scale * sigma
-                weight, cost = huber(np.abs(residual / sigma))
-                root = np.sqrt(weight) / sigma
-                normal.add_view("stripe", k, jacobian * root[:, None], residual * root, cost)
+        for k, (view, rail) in enumerate(zip(self.views, state.rails.tolist(), strict=True)):
+            for name, rows, residual, cost in self.rows_of(k, state):
+                share = self.priors.stripe_share if name == "stripe" else 1.0
+                normal.add_view(name, k, rows, residual, cost, share)
             if settles[k]:
-                apart = -difference(flange, view.base_from_flange)
-                shift, turn = self.priors.arm_translation, self.priors.arm_rotation
-                normal.add_prior("shift", k, 0, apart[:3] / shift, shift)
-                normal.add_prior("turn", k, 3, apart[3:] / turn, turn)
+                white = self.arm_prior(k, state)[1]
+                normal.add_prior("shift", k, 0, white[:3], self.priors.arm_translation)
+                normal.add_prior("turn", k, 3, white[3:], self.priors.arm_rotation)
             if self.own_free[6]:
                 normal.add_prior("rail", k, 6, np.array([view.rail - rail]) / self.priors.rail, self.priors.rail)
-        lens = np.arange(4, 8)[self.free[4:8]]
-        deviation = np.array(DISTORTION_PRIOR)[lens - 4]
-        normal.add_shared_prior("lens", lens, -state.camera.parameters[lens] / deviation, deviation)
+        normal.add_shared_rows("lens", *self.lens_prior(state))
         return normal
+
+    def lens_prior(self, state: State) -> tuple[Array, Array]:
+        """Whitened rows (m, 27) and residuals (m,) of what is known of any lens, for the terms that are free."""
+        lens = np.arange(4, 9)[self.free[4:9]]
+        rows = np.zeros((len(lens), SHARED))
+        rows[np.arange(len(lens)), lens] = 1 / np.array(self.priors.lens)[lens - 4]
+        camera = state.camera.parameters
+        residual = -rows[:, :9] @ camera
+        if self.priors.one_focal and self.free[:2].all():
+            tie = np.zeros((1, SHARED))
+            tie[0, 0], tie[0, 1] = 1 / FOCAL_TIE_PX, -1 / FOCAL_TIE_PX
+            rows, residual = np.vstack([rows, tie]), np.append(residual, -tie[0, :9] @ camera)
+        return rows, residual
+
+    def arm_prior(self, k: int, state: State) -> tuple[Array, Array]:
+        """Whitened rows (6, 34) and residuals (6,) of the reported flange pose of view `k`."""
+        apart = -difference(state.flanges[k], self.views[k].base_from_flange)
+        rows = np.zeros((6, COLUMNS))
+        weight = 1 / np.repeat([self.priors.arm_translation, self.priors.arm_rotation], 3)
+        rows[np.arange(6), np.arange(FLANGE.start, FLANGE.stop)] = weight
+        return rows, np.asarray(apart * weight)
 
     def _update_noise(self, normal: Normal) -> None:
         """Scale each group's σ so that its χ² meets its redundancy."""
@@ -211,8 +249,8 @@ class Adjustment:
             p,
             dots_scale=max(p.dots_scale * factors.get("dots", 1.0), LEAST_SCALE),
             stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), LEAST_SCALE),
-            arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), 1e-6, 5e-3)),
-            arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), 1e-6, 2e-2)),
+            arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), *ARM_RANGE)),
+            arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), *ARM_TURN_RANGE)),
         )
 
 

@@ -7,7 +7,7 @@ the hand-eye. It also settles the order of boards that look the same turned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
@@ -19,90 +19,128 @@ from cell.vision.board.board import board_pose
 from cell.vision.pictures import Reason
 from drivers.errors import RefusedError
 
-LARGEST_ANGLE = np.deg2rad(3.0)
+# Turns that differ by so much, and by so many times what is usual in the folder, are of another pose or picture.
+LEAST_ANGLE, ODD_ANGLE_RATIO = float(np.deg2rad(0.5)), 5.0
+MOST_ODD = 0.45
 # A board further from where the others see it than this share of its distance, and than this many times what is
 # usual in the folder, was not where the flange pose says.
-MISPLACED_SHARE, MISPLACED_RATIO = 0.012, 5.0
+MISPLACED_SHARE, MISPLACED_RATIO = 0.008, 6.0
 REWEIGHTINGS = 40
+ORDER_ROUNDS = 5
 LEAST_OFF_M = 1e-4
 
 
 def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
-    """Give boards that look the same turned the order that agrees with the flange's turns, frame after frame."""
-    placed: list[tuple[pin.SE3, pin.SE3]] = []
-    for frame in frames:
-        assert frame.view is not None and frame.base_from_flange is not None
-        options = frame.view.turns()
-        poses = [board_pose(view, camera).camera_from_board for view in options]
-        if placed and len(options) > 1:
-            flange = frame.base_from_flange
-            misfit = [np.median([angle_apart(flange, pose, f, p) for f, p in placed]) for pose in poses]
-            best = int(np.argmin(misfit))
-        else:
-            best = 0
-        frame.view = options[best]
-        placed.append((frame.base_from_flange, poses[best]))
+    """Give boards that look the same turned the order that agrees with the flange's turns.
+
+    Frame after frame at first, then each against all others until none changes. The first frame's order stands.
+    """
+    options = [[] if f.view is None else f.view.turns() for f in frames]
+    if all(len(views) < 2 for views in options):
+        return
+    poses = [[board_pose(view, camera).camera_from_board for view in views] for views in options]
+    flanges = [f.base_from_flange for f in frames]
+    chosen = [0] * len(frames)
+
+    def best(k: int, others: Sequence[int]) -> int:
+        misfit = [np.median([angle_apart(flanges[k], pose, flanges[j], poses[j][chosen[j]]) for j in others])
+                  for pose in poses[k]]  # fmt: skip
+        return int(np.argmin(misfit))
+
+    for k in range(1, len(frames)):
+        chosen[k] = best(k, range(k))
+    for _ in range(ORDER_ROUNDS):
+        before = list(chosen)
+        for k in range(1, len(frames)):
+            chosen[k] = best(k, [j for j in range(len(frames)) if j != k])
+        if chosen == before:
+            break
+    for frame, views, turn in zip(frames, options, chosen, strict=True):
+        frame.view = views[turn]
 
 
 def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
-    """Refuse frames whose turn disagrees with most others by more than 3°; the rest."""
-    kept = list(frames)
-    poses = {id(f): board_pose(f.view, camera).camera_from_board for f in kept if f.view is not None}
-    apart: Array = np.zeros((len(kept), len(kept)))
-    for (i, a), (j, b) in product(enumerate(kept), repeat=2):
-        if i != j:
-            apart[i, j] = angle_apart(a.base_from_flange, poses[id(a)], b.base_from_flange, poses[id(b)])
-    index = list(range(len(kept)))
+    """Refuse frames whose turn disagrees with most others by far more than these with each other; the rest."""
+    boards, flanges = _poses(frames, camera)
+    odd = odd_turns(flanges, boards)
+    for k, off in odd.items():
+        frames[k].refuse(
+            Reason.TURNED,
+            f"the board is the wrong way round: it turned by {np.degrees(off):.1f}° more or less than the "
+            "flange did between this frame and the others; is the picture turned or mirrored, or the pose of another "
+            "frame?",
+        )
+    return [f for k, f in enumerate(frames) if k not in odd]
+
+
+def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
+    """Refuse frames whose flange pose puts the board far from where the others see it; the rest."""
+    boards, flanges = _poses(frames, camera)
+    misplaced = misplacements(flanges, boards)
+    for k, (off, others) in misplaced.items():
+        frames[k].refuse(
+            Reason.NO_POSE,
+            f"the flange pose puts the board {1e3 * off:.0f} mm from where the other frames see it, which agree "
+            f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
+        )
+    return [f for k, f in enumerate(frames) if k not in misplaced]
+
+
+def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int, float]:
+    """The frames that disagree about the turns with most others, worst first, and by how much in rad.
+
+    Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
+    """
+    count = len(flanges)
+    apart: Array = np.zeros((count, count))
+    for i, j in combinations(range(count), 2):
+        apart[i, j] = apart[j, i] = angle_apart(flanges[i], boards[i], flanges[j], boards[j])
+    odd: dict[int, float] = {}
+    index = list(range(count))
     while len(index) > 2:
         inner = apart[np.ix_(index, index)] + np.diag(np.full(len(index), np.nan))
         typical = np.nanmedian(inner, axis=1)
         worst = int(np.argmax(typical))
-        if typical[worst] < LARGEST_ANGLE:
+        usual = float(np.median(np.delete(typical, worst)))
+        if typical[worst] < max(LEAST_ANGLE, ODD_ANGLE_RATIO * usual):
             break
-        frame = kept[index[worst]]
-        frame.refuse(
-            Reason.TURNED,
-            f"the board is the wrong way round: it turned by {np.degrees(typical[worst]):.0f}° more or less than the "
-            "flange did between this frame and the others; is the picture turned or mirrored, or the pose of another "
-            "frame?",
-        )
+        odd[index[worst]] = float(typical[worst])
         del index[worst]
-    return [kept[i] for i in index]
+    return odd if len(odd) < MOST_ODD * count else {}
 
 
-def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
-    """Refuse frames whose flange pose puts the board far from where the others see it; the rest.
+def misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int, tuple[float, float]]:
+    """The frames that put the board elsewhere than most, worst first: how far in m, and how well the others agree.
 
-    The worst goes first. Nothing is refused where no hand-eye can be had.
+    Nothing is misplaced where no hand-eye can be had, or where most frames would be.
     """
-    kept = list(frames)
-    while len(kept) > 3:
+    index, found = list(range(len(flanges))), {}
+    while len(index) > 3:
         try:
-            off, reach = _misplacements(kept, camera)
+            off, reach = _misplacements([flanges[k] for k in index], [boards[k] for k in index])
         except RefusedError:
             break
         worst = int(np.argmax(off / reach))
         others = float(np.median(np.delete(off, worst)))
         if off[worst] < max(MISPLACED_SHARE * reach[worst], MISPLACED_RATIO * others):
             break
-        kept[worst].refuse(
-            Reason.NO_POSE,
-            f"the flange pose puts the board {1e3 * off[worst]:.0f} mm from where the other frames see it, which agree "
-            f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
-        )
-        del kept[worst]
-    return kept
+        found[index[worst]] = (float(off[worst]), others)
+        del index[worst]
+    return found if len(found) < MOST_ODD * len(flanges) else {}
 
 
-def _misplacements(frames: Sequence[RecordedFrame], camera: CameraModel) -> tuple[Array, Array]:
+def _poses(frames: Sequence[RecordedFrame], camera: CameraModel) -> tuple[list[pin.SE3], list[pin.SE3]]:
+    boards = [board_pose(f.view, camera).camera_from_board for f in frames if f.view is not None]
+    return boards, [f.base_from_flange for f in frames if f.base_from_flange is not None]
+
+
+def _misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Array, Array]:
     """How far each frame's board (n,) lies from where most put it, and from the camera (n,), both in m.
 
     For the camera on the flange or standing before it, whichever fits better.
     """
-    boards = [board_pose(f.view, camera).camera_from_board for f in frames if f.view is not None]
-    reported = [f.base_from_flange for f in frames if f.base_from_flange is not None]
     reach = np.array([np.linalg.norm(b.translation) for b in boards])
-    tried = [_away(flanges, boards) for flanges in (reported, [f.inverse() for f in reported])]
+    tried = [_away(poses, boards) for poses in (flanges, [f.inverse() for f in flanges])]
     return min(tried, key=lambda off: float(np.median(off))), reach
 
 

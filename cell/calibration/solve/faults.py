@@ -15,6 +15,7 @@ from scipy.special import fdtrc
 
 from cell.calibration.solve.adjustment import Adjusted
 from cell.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
+from cell.calibration.solve.board_shape import surface_shapes
 from cell.calibration.solve.consistency import angle_apart
 from cell.geometry.camera import Array
 from cell.geometry.poses import difference, from_parts, perturbed
@@ -89,7 +90,7 @@ def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> No
         residual, jacobian = dots_block(state, view, flange, float(rail))
         # Board columns are derivatives by a move of the board: along its normal they are what a dot's height does.
         height = jacobian[:, :, 21:24] @ state.base_from_board.rotation[:, 2]
-        shapes = height[:, :, None] * _shapes((view.points - middle) / half)[:, None, :]
+        shapes = height[:, :, None] * surface_shapes((view.points - middle) / half)[:, None, :]
         wanted = np.concatenate([jacobian[:, :, CAMERA][:, :, :8], shapes], axis=2).reshape(-1, 11)
         pose, _ = np.linalg.qr(jacobian[:, :, FLANGE].reshape(-1, 6))
         both = np.column_stack([wanted, residual.ravel()]) / np.repeat(view.sigma, 2)[:, None]
@@ -105,21 +106,17 @@ def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> No
     variance = float(np.sum((measured - design @ solution) ** 2)) / freedom
     bend = solution[8:]
     test = float(bend @ np.linalg.solve(covariance[8:, 8:] * variance, bend)) / 3
-    heights = _shapes((whole - middle) / half) @ bend
+    heights = surface_shapes((whole - middle) / half) @ bend
     size, allowed = float(np.ptp(heights)), LARGEST_BEND * 2 * half
     if size > allowed and fdtrc(3, freedom, test) < CHANCE:
-        across = [np.ptp(_shapes((whole - middle) * axis / half) @ bend) for axis in (np.eye(3)[0], np.eye(3)[1])]
+        across = [
+            np.ptp(surface_shapes((whole - middle) * axis / half) @ bend) for axis in (np.eye(3)[0], np.eye(3)[1])
+        ]
         raise RefusedError(
             f"the {board} board is not flat: its dots stand {1e3 * size:.2f} mm out of a plane "
             f"({1e3 * across[0]:.2f} mm along its rows, {1e3 * across[1]:.2f} mm down its columns), allowed "
             f"{1e3 * allowed:.2f} mm; see how it is fastened, flatten or replace it, then run `cell calibrate`"
         )
-
-
-def _shapes(at: Array) -> Array:
-    """The second-degree shapes (n, 3) at places (n, 3) in half diagonals: along x, twisted, along y."""
-    x, y = at[:, 0], at[:, 1]
-    return np.column_stack([x * x, x * y, y * y])
 
 
 def refuse_slipped(

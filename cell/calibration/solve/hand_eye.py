@@ -87,10 +87,12 @@ def solve_hand_eye(
 
 def refine_hand_eye(
     base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3], start: HandEye, balance: float = 0.3
-) -> HandEye:
+) -> tuple[HandEye, Array, Array]:
     """Hand-eye and board together by robust least squares on the poses; 1 rad counts like `balance` m.
 
-    For pairs of poses without pictures; where there are pictures the joint adjustment does better. The rail rests.
+    Also the deviations (6,) of the hand-eye, m and rad, by leaving each pair out in turn, and how far (n,) in m each
+    left-out pair puts the board from where the others do. For pairs of poses without pictures; where there are
+    pictures the joint adjustment does better. The rail rests.
     """
     hand_eye, board = start.flange_from_camera, start.base_from_board
     weight = np.array([1.0, 1.0, 1.0, balance, balance, balance])
@@ -111,13 +113,26 @@ def refine_hand_eye(
         size = np.linalg.norm(here, axis=1)
         robust = 1 / (1 + (size / (2 * np.median(size) + 1e-12)) ** 2)
         root = np.repeat(np.sqrt(robust), 6)
-        step = np.linalg.lstsq(np.column_stack(columns) * root[:, None], -here.ravel() * root, rcond=None)[0]
+        design, right = np.column_stack(columns) * root[:, None], -here.ravel() * root
+        step = np.linalg.lstsq(design, right, rcond=None)[0]
         hand_eye, board = perturbed(hand_eye, step[:6]), perturbed(board, step[6:])
         if np.abs(step).max() < 1e-12:
             break
-    return _scatter(
-        base_from_flange, camera_from_board, np.zeros(len(base_from_flange)), hand_eye, start.rail_direction
+    count = len(base_from_flange)
+    found = _scatter(base_from_flange, camera_from_board, np.zeros(count), hand_eye, start.rail_direction)
+    blocks, rights = design.reshape(count, 6, 12), right.reshape(count, 6)
+    whole, pull = design.T @ design, design.T @ right
+    steps = np.array(
+        [np.linalg.lstsq(whole - j.T @ j, pull - j.T @ r, rcond=None)[0] for j, r in zip(blocks, rights, strict=True)]
     )
+    off = np.array(
+        [
+            np.linalg.norm(difference(f * perturbed(hand_eye, d[:6]) * c, perturbed(board, d[6:]))[:3])
+            for f, c, d in zip(base_from_flange, camera_from_board, steps, strict=True)
+        ]
+    )
+    spread = steps[:, :6] - steps[:, :6].mean(axis=0)
+    return found, np.sqrt((count - 1) / count * np.sum(spread**2, axis=0)), off
 
 
 def _scatter(

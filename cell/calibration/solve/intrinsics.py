@@ -1,20 +1,22 @@
 """A camera from pictures of a board alone, without flange poses: adjusted with dots as circles, the lens as needed.
 
-Distortion is kept only when it predicts views that were left out clearly better: a few pictures of a small board fit
-any lens.
+Which terms of the lens are free is decided on views that were left out: a few pictures of a small board fit any lens,
+and a lens that is held wrongly moves focal length and principal point by many times their stated deviation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.adjustment import VARIANCE_ROUNDS, Adjustment, Priors
+from cell.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
 from cell.calibration.solve.blocks import BOARD, CAMERA, HAND, SHARED, State, ViewData
-from cell.calibration.solve.starts import LEAST_VIEWS, zhang
+from cell.calibration.solve.board_shape import Bend, bend_of
+from cell.calibration.solve.left_out import LeftOut, leave_out
+from cell.calibration.solve.starts import zhang
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
 from cell.vision.board.view import BoardView
@@ -22,18 +24,69 @@ from drivers.errors import RefusedError
 
 # Poses that nothing is known of: each picture's own.
 UNKNOWN = Priors(arm_translation=10.0, arm_rotation=10.0)
-BETTER = 0.9
+LEAST_LEFT_OUT = 4
+"""Views below which leaving one out says nothing."""
+TANGENTIAL_VIEWS = 12
+ROUNDS = 3
+# A term beyond the first ones has to predict left-out views better by this share, and by this many of its deviations.
+CLEARLY_BETTER, CLEAR_DEVIATIONS = 0.005, 1.0
+CENTRED_LENS = 0.002
+"""Deviation of p1 and p2 of a lens that nothing is known of; the makers centre their lenses."""
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """Which of k1, k2, p1 and p2, k3 are free, and whether fx and fy are one."""
+
+    name: str
+    k1: bool = False
+    k2: bool = False
+    tangential: bool = False
+    k3: bool = False
+    one_focal: bool = False
+
+    @property
+    def free(self) -> list[bool]:
+        """Of the nine parameters of a camera, in the order of `PARAMETER_NAMES`."""
+        return [True] * 4 + [self.k1, self.k2, self.tangential, self.tangential, self.k3]
+
+    def priors(self, priors: Priors) -> Priors:
+        """The priors with what is known of such a lens."""
+        k1, k2, _, _, k3 = DISTORTION_PRIOR
+        return replace(priors, lens=(k1, k2, CENTRED_LENS, CENTRED_LENS, k3), one_focal=self.one_focal)
+
+    def held(self, camera: CameraModel) -> CameraModel:
+        """The camera with the terms that are not free at 0."""
+        return camera.with_parameters(np.where(self.free, camera.parameters, 0.0))
+
+
+PLAIN = LensModel("no distortion")
+RADIAL = (LensModel("k1", k1=True), LensModel("k1, k2", k1=True, k2=True))
+FURTHER = (
+    ("k3", {"k1": True, "k2": True, "k3": True}),
+    ("tangential", {"tangential": True}),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """A camera, RMS per component in px: of each view (n,), of all, and of left-out views (NaN with too few)."""
+    """A camera, RMS per component in px: of each view (n,), of all, and of left-out views (NaN with too few).
+
+    `sigma` (9,) is the larger of what the residuals say and of the scatter between calibrations that lack one view.
+    `formal` (9,) the former alone. `tried` has the RMS of left-out views of each lens model that was tried.
+    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations.
+    """
 
     camera: CameraModel
     view_rms: Array
     rms_px: float
     held_out_px: float
     sigma: Array
+    formal: Array = field(default_factory=lambda: np.zeros(9))
+    covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
+    model: LensModel = PLAIN
+    tried: dict[str, float] = field(default_factory=dict)
+    bend: Bend | None = None
 
     @property
     def point_rms_px(self) -> float:
@@ -41,66 +94,119 @@ class Intrinsics:
         return float(np.sqrt(2) * self.rms_px)
 
 
-def calibrate_camera(views: Sequence[BoardView], lens: bool) -> Intrinsics:
-    """Zhang's start and the adjustment, with two radial terms (`lens`) or none. Raises RefusedError."""
-    camera, _ = zhang(views, lens=lens)
-    camera, sigma = _adjusted(views, camera, lens)
-    rms = np.array([_pose_rms(view, camera) for view in views])
-    weights = np.array([len(v.ids) for v in views])
-    total = float(np.sqrt(np.average(rms**2, weights=weights)))
-    return Intrinsics(camera, rms, total, _held_out(views, camera, lens), sigma)
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    model: LensModel
+    camera: CameraModel
+    covariance: Array
+    left: LeftOut | None
+    bend: Bend | None
+
+    @property
+    def held_out(self) -> float:
+        return float("nan") if self.left is None else self.left.figures["dots_px"]
 
 
 def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
-    """The camera with the lens model that the views support, and the one without distortion."""
-    plain = calibrate_camera(views, lens=False)
+    """The camera with the lens model that the views support, and the one without distortion. Raises RefusedError."""
+    start, _ = zhang(views, lens=False)
+    plain = _fitted(PLAIN, start, _data(views, start))
+    if len(views) < LEAST_LEFT_OUT:
+        # Too few to choose a lens: what one with distortion would say is not known better.
+        try:
+            other = _fitted(RADIAL[0], start, _data(views, start)).camera
+        except (RefusedError, np.linalg.LinAlgError):
+            other = None
+        found = _intrinsics(plain, views, {}, other)
+        return found, found
+    fits = [plain]
     try:
-        curved = calibrate_camera(views, lens=True)
+        curved, _ = zhang(views)
+        data = _data(views, curved)
+        fits += [_fitted(model, curved, data) for model in RADIAL]
     except RefusedError:
-        return plain, plain
-    return (curved if curved.held_out_px < BETTER * plain.held_out_px else plain), plain
+        curved, data = start, _data(views, start)
+    best = min(fits, key=lambda fit: fit.held_out)
+    for name, terms in FURTHER:
+        if name == "tangential" and len(views) < TANGENTIAL_VIEWS:
+            continue
+        more = _fitted(replace(best.model, name=f"{best.model.name}, {name}", **terms), curved, data)
+        fits.append(more)
+        if _clearly_better(more, best):
+            best = more
+    one = _fitted(replace(best.model, name=f"{best.model.name}, fx = fy", one_focal=True), best.camera, data)
+    fits.append(one)
+    if one.held_out <= best.held_out:
+        best = one
+    tried = {fit.model.name: float(np.sqrt(2)) * fit.held_out for fit in fits}
+    return _intrinsics(best, views, tried), _intrinsics(plain, views, tried)
 
 
-def _adjusted(
-    views: Sequence[BoardView], camera: CameraModel, lens: bool, variance_rounds: int = VARIANCE_ROUNDS
-) -> tuple[CameraModel, Array]:
-    """Camera and the standard deviations (9,) of its parameters."""
-    data = [
+def fit_camera(views: Sequence[BoardView], model: LensModel) -> Intrinsics:
+    """The camera with a given lens model. Raises RefusedError."""
+    start, _ = zhang(views, lens=model.k1)
+    return _intrinsics(_fitted(model, start, _data(views, start)), views, {})
+
+
+def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
+    """A camera that is known, with the views' residuals in it; its own deviation is not known here."""
+    rms = np.array([board_pose(view, camera).rms_px for view in views])
+    return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=LensModel("given"))
+
+
+def _clearly_better(more: _Fit, less: _Fit) -> bool:
+    """True when a richer lens predicts the left-out views better, by more than a view or two may do by chance."""
+    if more.left is None or less.left is None or not more.held_out < (1 - CLEARLY_BETTER) * less.held_out:
+        return False
+    gain = less.left.squares - more.left.squares
+    return bool(gain.sum() > CLEAR_DEVIATIONS * np.sqrt(len(gain)) * gain.std(ddof=1))
+
+
+def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
+    free = np.zeros(SHARED, dtype=np.bool_)
+    free[CAMERA] = model.free
+    free[HAND] = free[BOARD] = False
+    adjustment = Adjustment(data, free, model.priors(UNKNOWN))
+    at = State(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
+    result = adjustment.solve(at, ROUNDS)
+    left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
+    bend = bend_of(adjustment, result.state) if left is not None else None
+    return _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
+
+
+def _intrinsics(
+    fit: _Fit, views: Sequence[BoardView], tried: dict[str, float], other: CameraModel | None = None
+) -> Intrinsics:
+    """`other` is a camera that explains the views as well: how far it is away is not known better."""
+    rms = np.array([board_pose(view, fit.camera).rms_px for view in views])
+    formal = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    covariance = fit.covariance
+    if fit.left is not None:
+        scattered = fit.left.covariance[CAMERA, CAMERA]
+        if np.any(np.diag(scattered)[:4] > formal[:4] ** 2):
+            covariance = fit.covariance + scattered
+    for moved in (
+        None if fit.bend is None or not fit.bend.believed else fit.bend.camera,
+        None if other is None else other.parameters - fit.camera.parameters,
+    ):
+        if moved is not None:
+            covariance = covariance + np.outer(moved, moved)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Intrinsics(
+        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend
+    )  # fmt: skip
+
+
+def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
+    nothing = np.zeros(0)
+    return [
         ViewData(
-            v.object_points,
-            v.pixels,
-            v.sigma,
-            v.dot_radius,
-            np.zeros((0, 2)),
-            np.zeros(0),
-            board_pose(v, camera).camera_from_board.inverse(),
-            0.0,
+            v.object_points, v.pixels, v.sigma, v.dot_radius, np.zeros((0, 2)), nothing,
+            board_pose(v, camera).camera_from_board.inverse(), 0.0,
         )
         for v in views
-    ]
-    free = np.zeros(SHARED, dtype=np.bool_)
-    free[CAMERA] = [True] * 4 + [lens] * 2 + [False] * 3
-    free[HAND] = free[BOARD] = False
-    start = State(camera, None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
-    result = Adjustment(data, free, UNKNOWN).solve(start, variance_rounds)
-    return result.state.camera, np.sqrt(np.diag(result.covariance))[CAMERA]
+    ]  # fmt: skip
 
 
-def _pose_rms(view: BoardView, camera: CameraModel) -> float:
-    return board_pose(view, camera).rms_px
-
-
-def _held_out(views: Sequence[BoardView], camera: CameraModel, lens: bool) -> float:
-    """RMS in px of each view at its best pose, with the camera adjusted to the others."""
-    if len(views) <= LEAST_VIEWS:
-        return float("nan")
-    folds = min(len(views), 8)
-    squares = []
-    for fold in range(folds):
-        kept = [v for k, v in enumerate(views) if k % folds != fold]
-        try:
-            other, _ = _adjusted(kept, camera, lens, variance_rounds=1)
-            squares += [_pose_rms(v, other) ** 2 for v in views[fold::folds]]
-        except RefusedError:
-            return float("nan")
-    return float(np.sqrt(np.mean(squares)))
+def _mean(rms: Array, views: Sequence[BoardView]) -> float:
+    return float(np.sqrt(np.average(rms**2, weights=[len(v.ids) for v in views])))

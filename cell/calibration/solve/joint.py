@@ -18,6 +18,7 @@ from cell.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_o
 from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts
+from cell.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
 STRIPE_POINTS = 120
@@ -61,11 +62,19 @@ def solve_staged(
     rail_direction: Array | None = None,
     stripe: bool = True,
     lens: bool = True,
+    camera: CameraModel | None = None,
 ) -> Staged:
-    """Camera, then hand-eye, then light plane, each from the result before. All observations need a view."""
+    """Camera, then hand-eye, then light plane, each from the result before. All observations need a view.
+
+    A `camera` that is known already is not estimated again.
+    """
     every, observations = observations, [o for o in observations if not o.same_rest]
     views = [o.view for o in observations if o.view is not None]
-    camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
+    if camera is None:
+        camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
+    else:
+        found = [board_pose(view, camera) for view in views]
+        view_rms, poses = np.array([f.rms_px for f in found]), [f.camera_from_board for f in found]
     with_view = [o for o in observations if o.view is not None]
     hand_eye = solve_hand_eye(
         [o.base_from_flange for o in with_view], poses, [o.rail_position for o in with_view], rail_direction
@@ -212,14 +221,6 @@ def effective_hand_eye_covariance(joint: Joint) -> Array:
         return np.asarray(covariance[HAND, HAND], dtype=np.float64)
     mean = np.mean(parts, axis=0)
     return np.asarray(0.5 * (mean + mean.T), dtype=np.float64)
-
-
-def without(staged: Staged, index: int) -> Staged:
-    """The staged start without the rows of one observation."""
-    if staged.plane is None:
-        return staged
-    rows = [r for k, r in enumerate(staged.plane.rows) if k != index]
-    return replace(staged, plane=replace(staged.plane, rows=rows))
 
 
 def _rms(values: Array) -> float:

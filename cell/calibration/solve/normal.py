@@ -25,7 +25,7 @@ class Block:
     cross: Array
     own: Array
     squares: float = 0.0
-    count: int = 0
+    count: float = 0.0
 
 
 @dataclass(eq=False)
@@ -69,8 +69,8 @@ class Normal:
         """The robust sum of squares."""
         return float(sum(block.squares for block in self.groups.values()))
 
-    def add_view(self, name: str, view: int, jacobian: Array, residual: Array, cost: float) -> None:
-        """Rows (m, 34) of one view, whitened, with their whitened residuals (m,)."""
+    def add_view(self, name: str, view: int, jacobian: Array, residual: Array, cost: float, share: float = 1.0) -> None:
+        """Rows (m, 34) of one view, whitened, with their whitened residuals (m,), a share of which is independent."""
         block = self.groups[name]
         shared, own = jacobian[:, :SHARED], jacobian[:, SHARED:]
         block.shared += shared.T @ shared
@@ -79,7 +79,7 @@ class Normal:
         self.right += shared.T @ residual
         self.right_own[view] += own.T @ residual
         block.squares += cost
-        block.count += len(residual)
+        block.count += share * len(residual)
 
     def add_prior(self, name: str, view: int, first: int, white: Array, deviation: float) -> None:
         """Whitened departures (m,) of a view's own parameters from `first` on, each with one standard deviation."""
@@ -88,11 +88,11 @@ class Normal:
         self.right_own[view, index] += white / deviation
         self._count(name, white)
 
-    def add_shared_prior(self, name: str, index: NDArray[np.intp], white: Array, deviation: Array) -> None:
-        """Whitened departures (m,) of shared parameters, with their standard deviations (m,)."""
-        self.groups[name].shared[index, index] += 1 / deviation**2
-        self.right[index] += white / deviation
-        self._count(name, white)
+    def add_shared_rows(self, name: str, rows: Array, residual: Array) -> None:
+        """Whitened rows (m, 27) on the shared parameters alone, with their whitened residuals (m,)."""
+        self.groups[name].shared += rows.T @ rows
+        self.right += rows.T @ residual
+        self._count(name, residual)
 
     def step(self, damping: float) -> Array:
         """The damped step (27 + 7 per view,); views of one rest have the flange's in common."""

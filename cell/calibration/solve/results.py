@@ -21,6 +21,7 @@ from cell.calibration.solve.joint import (
     solve_joint,
     solve_staged,
 )
+from cell.calibration.solve.joint_checks import joint_checks
 from cell.calibration.solve.reference import Reference
 from cell.calibration.witness import Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
@@ -29,6 +30,7 @@ from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, from_parts
 from cell.reconstruction.build import ScanGeometry
 from cell.vision.board.board import board_pose
+from drivers.errors import RefusedError
 
 PARAMETERS = (
     "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
@@ -242,7 +244,8 @@ def adjust_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> Joint:
     """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
-    return _solve(observations, solve_staged(observations, nominal, rail_direction), priors, "scan", "fine")
+    staged = solve_staged(observations, nominal, rail_direction)
+    return _solve(observations, staged, priors, "scan", "fine", nominal)
 
 
 def calibrate_target(
@@ -255,11 +258,18 @@ def calibrate_target(
 def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
     """The joint adjustment of a camera without laser and rail."""
     same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
-    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large")
+    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large", nominal)
 
 
-def _solve(observations: Sequence[ScanObservation], staged: Staged, priors: Priors, camera: str, board: str) -> Joint:
-    """The joint adjustment, after and before the checks for faults that have a name."""
+def _solve(
+    observations: Sequence[ScanObservation],
+    staged: Staged,
+    priors: Priors,
+    camera: str,
+    board: str,
+    nominal: CameraModel,
+) -> Joint:
+    """The joint adjustment, after and before the checks for faults that have a name, and the absolute ones."""
     rests = [o for o in observations if not o.same_rest]
     names = [o.name for o in rests]
     if all(o.view is not None for o in rests):
@@ -271,6 +281,9 @@ def _solve(observations: Sequence[ScanObservation], staged: Staged, priors: Prio
         poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
         alone = [view for view in joint.views if not view.same_rest]
         refuse_slipped(camera, names, joint.adjusted, alone, poses)
+    wrong = [check.text for check in joint_checks(joint, nominal) if check.verdict == "refused"]
+    if wrong:
+        raise RefusedError(f"the {camera} camera's calibration: {'; '.join(wrong)}")
     return joint
 
 

@@ -112,13 +112,19 @@ def plane_from_board(
             f"the stripe was seen on the board in {len(points)} frames, all along one line; a light plane needs the "
             "board at different distances or tilts"
         )
+    plane, rms = robust_plane(cloud)
+    return PlaneStart(plane, rms, rows)
+
+
+def robust_plane(cloud: Array) -> tuple[LightPlane, float]:
+    """Plane of points (n, 3) in m without those that lie off it, and the RMS distance in m of the rest."""
     keep = np.ones(len(cloud), dtype=np.bool_)
     plane = LightPlane.fit(cloud)
     for _ in range(5):
         away = np.abs(plane.distances(cloud))
         keep = away < 4 * 1.4826 * max(float(np.median(away)), 1e-9)
         plane = LightPlane.fit(cloud[keep])
-    return PlaneStart(plane, float(np.sqrt(np.mean(plane.distances(cloud[keep]) ** 2))), rows)
+    return plane, float(np.sqrt(np.mean(plane.distances(cloud[keep]) ** 2)))
 
 
 def stripe_pixels(profile: StripeProfile, rows: NDArray[np.intp]) -> Array:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.blocks import (
@@ -32,6 +33,9 @@ from cell.geometry.camera import Array
 LEAST_DOTS_PX = 0.02
 # 8 ms at 12 mm/s: generous, so that a busy computer does not look like a moved laser.
 SWEEP_RAIL_M = 1e-4
+# The same for one picture of a sweep: 4 ms. It is left out of account but for the question whether the stripes are
+# straight and flat: a stripe's own scatter, along the laser, would look like the rail's and turn the light plane.
+SWEEP_PICTURE_M = 5e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +89,7 @@ def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evide
     own = np.concatenate([np.tile(arm, rests), rails])
     prior[np.arange(SHARED, size), np.arange(SHARED, size)] = own
     kinds: dict[str, list[tuple[Array, Array]]] = {"dots": [], "stripe": []}
+    along: list[Array] = []
     for look in looks:
         index = np.concatenate([
             np.arange(SHARED), SHARED + 6 * look.rest + np.arange(6), [SHARED + 6 * rests + look.stop]
@@ -97,6 +102,7 @@ def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evide
         if len(view.stripe) and state.plane is not None:
             residual, jacobian, sigma = stripe_block(state, view, view.base_from_flange, view.rail)
             kinds["stripe"].append(_white(residual, jacobian, reference.stripe_scale * sigma, index, size))
+            along.append(kinds["stripe"][-1][1][:, index[-1:]])
     rows = [pair for pairs in kinds.values() for pair in pairs]
     normal = np.sum([j.T @ j for _, j in rows], axis=0)
     right = np.sum([j.T @ r for r, j in rows], axis=0)
@@ -105,7 +111,8 @@ def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evide
     shared = information[:SHARED, :SHARED]
     # Dots may be anywhere that a camera's move or lens puts them, the stripe on any plane.
     dots = _misfit(kinds["dots"], np.r_[CAMERA, SHARED:size])
-    return Evidence(score[:SHARED], 0.5 * (shared + shared.T), dots, _misfit(kinds["stripe"], np.r_[BOARD]))
+    stripe = _misfit(kinds["stripe"], np.r_[BOARD], block_diag(*along) * SWEEP_PICTURE_M if along else None)
+    return Evidence(score[:SHARED], 0.5 * (shared + shared.T), dots, stripe)
 
 
 def dots_of(photo: ScanObservation) -> ViewData:
@@ -123,15 +130,21 @@ def dots_of(photo: ScanObservation) -> ViewData:
     )
 
 
-def _misfit(rows: list[tuple[Array, Array]], columns: NDArray[np.intp]) -> float:
-    """RMS of what is left of whitened residuals after the best fit of some parameters; NaN without rows."""
+def _misfit(rows: list[tuple[Array, Array]], columns: NDArray[np.intp], noise: Array | None = None) -> float:
+    """RMS of what is left of whitened residuals (n,) after the best fit of some parameters; NaN without rows.
+
+    `noise` (n, k) is what k further unknowns do to the residuals, each as large as its own standard deviation.
+    """
     if not rows:
         return float("nan")
     residual, jacobian = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    chosen = jacobian[:, columns]
+    count, chosen = len(residual), jacobian[:, columns]
+    if noise is not None:
+        known = np.hstack([np.zeros((noise.shape[1], len(columns))), np.eye(noise.shape[1])])
+        chosen, residual = np.vstack([np.hstack([chosen, noise]), known]), np.pad(residual, (0, noise.shape[1]))
     chosen = chosen / np.maximum(np.linalg.norm(chosen, axis=0), 1e-30)
     left = residual - chosen @ np.linalg.lstsq(chosen, residual, rcond=1e-9)[0]
-    return float(np.sqrt(np.mean(left**2)))
+    return float(np.sqrt(np.sum(left**2) / count))
 
 
 def _white(residual: Array, jacobian: Array, sigma: Array, index: NDArray[np.intp], size: int) -> tuple[Array, Array]:

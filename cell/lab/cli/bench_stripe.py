@@ -18,6 +18,7 @@ def register(app: typer.Typer) -> None:
 def stripe(
     pictures: Annotated[int, typer.Option(min=1, max=100, help="Pictures of 1024 rows for each condition.")] = 3,
     accuracy: Annotated[bool, typer.Option(help="Errors beside the Cramér–Rao bound.")] = True,
+    profiles: Annotated[bool, typer.Option(help="Other profiles, widths, texture, colour and depth.")] = True,
     speed: Annotated[bool, typer.Option(help="Time per frame beside others.")] = True,
     picture: Annotated[Path | None, typer.Option(help="Draw RMS over bound against the width here.")] = None,
     json: JsonOption = False,
@@ -26,7 +27,7 @@ def stripe(
     from rich.console import Console
     from rich.progress import Progress
 
-    from cell.lab.bench import stripe_accuracy, stripe_speed
+    from cell.lab.bench import stripe_accuracy, stripe_profiles, stripe_speed
     from drivers.errors import ConfigError
 
     if picture is not None and not accuracy:
@@ -42,6 +43,8 @@ def stripe(
             result["speed"] = stripe_speed.compare(progress)
         if accuracy:
             result["accuracy"] = stripe_accuracy.campaign(progress, pictures)
+        if profiles:
+            result["profiles"] = stripe_profiles.campaign(progress, pictures)
     if picture is not None:
         stripe_accuracy.draw_picture(result["accuracy"]["rows"], picture)
     if json:
@@ -56,6 +59,35 @@ def _without_nan(data: Any) -> Any:
     if isinstance(data, list):
         return [_without_nan(value) for value in data]
     return None if isinstance(data, float) and data != data else data
+
+
+def _profiles(result: dict[str, Any]) -> Any:
+    """The table of stripes as workshops have them."""
+    from rich.table import Table
+
+    limits = result["limits"]
+    low, high = limits["stated_over_true"]
+    table = Table(
+        title="stripes of a workshop, simulated: RMS about the mean beside the profile's own bound; limits: efficiency "
+        f"≥ {limits['least_efficiency']}, stated σ / true {low}–{high}, found ≥ {limits['least_found']:.0%}, "
+        f"false ≤ {limits['most_false']:.0%}"
+    )
+    for name in ("scene", "width px", "bound px", "RMS px", "efficiency", "stated σ / true", "found", "false"):
+        table.add_column(name, justify="left" if name == "scene" else "right")
+    for name in ("Steger px", "centre of gravity px", "within limits"):
+        table.add_column(name, justify="right")
+
+    def number(value: float | None, digits: int) -> str:
+        return "" if value is None else f"{value:.{digits}f}"
+
+    for row in result["rows"]:
+        table.add_row(
+            row["scene"], f"{row['width_px']:.1f}", number(row["bound_px"], 4), number(row["rms_px"], 4),
+            number(row["efficiency"], 2), number(row["stated_over_true"], 2), number(row["found"], 3),
+            number(row["false"], 3), number(row["steger_px"], 3), number(row["centre_of_gravity_px"], 3),
+            "yes" if row["within_limits"] else "no",
+        )  # fmt: skip
+    return table
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -81,6 +113,8 @@ def _print(result: dict[str, Any]) -> None:
                 f"{row['stated_over_true']:.2f}", f"{row['found']:.3f}",
             )  # fmt: skip
         console.print(table)
+    if "profiles" in result:
+        console.print(_profiles(result["profiles"]))
     if "speed" in result:
         height, width = result["speed"]["shape"]
         table = Table(title=f"speed at {width}×{height} px, {result['speed']['frames']} pictures streaming by")

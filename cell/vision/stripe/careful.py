@@ -32,8 +32,8 @@ BINNED_WIDTH = 4.0
 """A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
 ABOUT_AS_WELL = 0.75
 """Mixes of colours that show the line by this share of the best are compared by what they know of its centres."""
-KNOWN_PX = 0.03
-MOST_WANDER = 2.5
+KNOWN_PX, FLANKS_ALONE = 0.03, 0.5
+MOST_WANDER = 8.0
 SURE = 3.5
 """Least amplitude of a stripe in its standard deviations."""
 LEAST_SCORE = 0.35
@@ -106,7 +106,7 @@ def read_carefully(
     fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
     sigma = carried(fitted, variance, correlation)
-    out = _believed(fitted, sigma, at, shape, k, lines, plane)
+    out = _believed(fitted, sigma, at, shape, k, lines, plane, noise)
     # A surface may be rough: lines that wander tell of errors only where something is there to make them.
     unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
     factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
@@ -148,8 +148,10 @@ def _knowledge(
     good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
     sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
-    # A line that is known very well says no more than that it is.
-    return float(np.sum(1 / (KNOWN_PX**2 + sigma**2)))
+    # A line that is known very well says no more than that it is; flanks are a poorer witness than a whole profile.
+    core = np.abs(fitted.x[good]) < width
+    hidden = np.asarray(core & np.isinf(fitted.variance[good])).any(axis=1)
+    return float(np.sum((1 - FLANKS_ALONE * hidden) / (KNOWN_PX**2 + sigma**2)))
 
 
 def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:
@@ -292,11 +294,13 @@ def _albedo(shade: NDArray[np.float32] | None, usable: NDArray[np.bool_]) -> NDA
 
 
 def _believed(
-    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane
+    fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane, noise: Noise,
 ) -> Careful:  # fmt: skip
     """The fits that are a stripe, in px of the picture and lines of all of it."""
     width = shape.width
-    keep = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
+    # Speckle makes a stripe's height uncertain, not that there is one.
+    clear = np.minimum(fitted.amplitude_sigma, np.sqrt(noise.floor))
+    keep = fitted.good & (fitted.amplitude > SURE * clear)
     keep &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     keep &= sigma < np.maximum(1.0, 0.7 * width)
     if keep.any():

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cell import compiled
 from cell.vision.stripe.careful import choose_mix, read_carefully
-from cell.vision.stripe.planes import FULL, Laser, Picture, as_picture
+from cell.vision.stripe.planes import FULL, Picture, as_picture
+from cell.vision.stripe.planes import Laser as Laser
 from cell.vision.stripe.profile import Array as Array
 from cell.vision.stripe.profile import Axis as Axis
 from cell.vision.stripe.profile import Image as Image
@@ -97,6 +98,13 @@ def _carefully(
         axis, seen.centres, seen.sigma, seen.amplitude, seen.width, seen.saturated,
         double & np.isfinite(seen.centres), None, None, seen.rival, seen.misfit, seen.learned,
     )  # fmt: skip
+
+
+def subtracted(image: Any, dark: Any, settings: StripeSettings) -> tuple[Picture, Picture | None]:
+    """A picture and the one without the laser, in the same DN. Raises ValueError as `extract` does."""
+    _check(image, dark)
+    picture = as_picture(image, settings.saturation_dn)
+    return picture, None if dark is None else _same_range(dark, picture, settings)
 
 
 def _same_range(dark: Any, picture: Picture, settings: StripeSettings) -> Picture:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cell.vision.stripe.shape import Shape, gaussian, learn
 from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, fit_shape
+from cell.vision.stripe.shaped_speckle import speckled
 
 Array = NDArray[np.float64]
 
@@ -24,6 +23,7 @@ FAINT = 0.012
 """Of the peak: below this share a halo has ended."""
 BETTER, SURE = 0.01, 4.0
 """Held-out lines have to fit better by this share, and by so many standard deviations, for a profile to be believed."""
+FAINT_SPECKLE = 0.03
 FREE_SCALE, SHARED_SCALE, LEAST_SCALE = 0.25, 0.15, 0.001
 """Standard deviations of the logarithm of a line's scale: before it is known, and the least ever assumed."""
 
@@ -46,7 +46,7 @@ def learn_profile(
             return plain, FREE_SCALE, noise
         width = plain.width * float(np.exp(np.clip(np.median(fitted.log_scale[clear]), -0.7, 0.7)))
         plain = gaussian(width, REACH * width + 2)
-    noise = speckled(fitted, clear, noise)
+    noise = speckled(fitted, clear, noise, plain)
     spread = _spread(fitted, clear)
     if clear.sum() < LEAST_LINES:
         return plain, spread, noise
@@ -66,8 +66,13 @@ def learn_profile(
     )
     if not _better(of_taught, of_plain):
         return plain, spread, noise
-    shape, fitted, clear = _rounds(plane, lines, starts, width, reach, noise)
-    noise = speckled(fitted, clear, replace(noise, contrast=0.0))
+    # What a Gaussian misfits by looked like speckle: with the profile's own residuals once more, from none on.
+    noise = Noise(noise.floor, noise.gain)
+    for _ in range(2):
+        shape, fitted, clear = _rounds(plane, lines, starts, width, reach, noise)
+        noise = speckled(fitted, clear, noise, shape)
+        if noise.contrast < FAINT_SPECKLE:
+            break
     freely = fit_shape(plane, lines, starts, shape, noise, FREE_SCALE)
     return shape, _spread(freely, clear & _clear(freely, plane)), noise
 
@@ -186,15 +191,3 @@ def _better(one: Fitted, other: Fitted) -> bool:
     gain = gain[np.abs(gain - np.median(gain)) <= np.quantile(np.abs(gain - np.median(gain)), 0.95)]
     chance = float(gain.std()) / np.sqrt(len(gain))
     return bool(gain.mean() > SURE * chance and gain.mean() > BETTER * np.median(one.chi2[good]))
-
-
-def speckled(fitted: Fitted, clear: NDArray[np.bool_], noise: Noise) -> Noise:
-    """The noise with the contrast that the residuals under the stripe show beyond the photons', at most 1."""
-    usable = np.isfinite(fitted.variance[clear])
-    stripe = np.where(usable, fitted.stripe[clear], 0.0)
-    plain = fitted.variance[clear] - (noise.contrast * fitted.stripe[clear]) ** 2
-    excess = np.where(usable, fitted.residual[clear] ** 2 - np.where(usable, plain, 0.0), 0.0)
-    # One misfit line is not to speak for all.
-    by_line = np.sum(excess * stripe**2, axis=1) / np.maximum(np.sum(stripe**4, axis=1), 1e-12)
-    contrast2 = float(np.median(by_line)) * 1.3
-    return replace(noise, contrast=float(np.sqrt(np.clip(contrast2, 0.0, 1.0))))

@@ -20,8 +20,10 @@ ASKED = 200
 LEAST_ASKED = 30
 PATTERN, SIGNIFICANT = 0.08, 3.0
 """A mean residual of this share of the noise's power, and so many times what chance makes, is another profile."""
-WIDEST = 6.0
+WIDEST = 4.5
 """σ in px of the widest stripe that the quick search sees whole."""
+HARDLY_ANY = 0.05
+"""Share of the lines."""
 BROKEN, REFUSED = 0.03, 0.06
 """Shares of the lines that jump away from both neighbours, and that show a peak which is no stripe."""
 UNEVEN, BRIGHT_DN = 0.25, 25.0
@@ -102,13 +104,13 @@ def is_line_whole(fitted: Any, start: Any) -> bool:
 
 @compiled
 def is_too_wide(fitted: Any, start: Any) -> bool:
-    """True when the stripes that were found are wider than the search's window takes, or none was."""
+    """True when the stripes that were found are wider than the search's window takes, or hardly any was."""
     found, wide = 0, 0
     for r in range(fitted.shape[1]):
         if np.isfinite(fitted[FIT_CENTRE, r]):
             found += 1
             wide += fitted[WIDTH, r] > WIDEST
-    return 2 * wide >= found
+    return 2 * wide >= found or found < HARDLY_ANY * fitted.shape[1]
 
 
 @compiled

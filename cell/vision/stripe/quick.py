@@ -22,6 +22,7 @@ from cell.vision.stripe.belief import believe
 from cell.vision.stripe.methods import METHODS
 from cell.vision.stripe.noise import pixel_noise
 from cell.vision.stripe.ordinary import (
+    HARDLY_ANY,
     has_rivals,
     is_line_whole,
     is_profile_gaussian,
@@ -105,7 +106,7 @@ def read_quickly(
     profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
     if like is not None and (like.learned is not None or like.speckle is not None):
         return profile, Verdict.ORDINARY if like.learned is None else Verdict.NOT_ORDINARY
-    if like is not None and not profile.valid.any() and not like.valid.any():
+    if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
         return profile, Verdict.ORDINARY
     ordinary = (
         is_line_whole(fitted, start)

@@ -21,6 +21,8 @@ LARGEST_STEP, LARGEST_SCALE_STEP = 0.7, 0.25
 """Of the centre in stripe widths, and of the logarithm of the scale."""
 CONVERGED = 0.02
 LEAST_PIXELS = 7
+ALBEDO_DOUBT = 0.2
+"""By which share of its deviation from the surroundings the albedo is off where its edges are blurred."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,8 @@ def fit_shape(
     usable = inside & plane.usable[at]
     shade = 0.0 if plane.shade is None else plane.shade[at].astype(np.float64)
     albedo = 1.0 if plane.albedo is None else plane.albedo[at].astype(np.float64)
+    # What is lighter or darker than its surroundings is not known exactly to be so.
+    speckle = noise.contrast**2 + (ALBEDO_DOUBT * (1 - 1 / albedo)) ** 2
     expected = np.zeros(len(lines)) if log_scales is None else log_scales
     centre, log_scale = starts - origin, expected.copy()
     ramp = np.broadcast_to(offset / half, value.shape)
@@ -99,7 +103,7 @@ def fit_shape(
     inverse = np.zeros((len(lines), PARAMETERS, PARAMETERS))
     for _ in range(STEPS):
         stripe, jacobian, mean = _model(offset, centre, log_scale, amplitude, level, slope, shape, ramp, albedo)
-        variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + (noise.contrast * stripe) ** 2
+        variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + speckle * stripe**2
         weight = usable / variance
         weighted = jacobian * weight[:, None, :]
         normal = weighted @ np.swapaxes(jacobian, 1, 2)
@@ -123,7 +127,7 @@ def fit_shape(
         if not going.any():
             break
     stripe, jacobian, mean = _model(offset, centre, log_scale, amplitude, level, slope, shape, ramp, albedo)
-    variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + (noise.contrast * stripe) ** 2
+    variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + speckle * stripe**2
     weight = usable / variance
     residual = np.where(usable, value - mean, 0.0)
     influence = np.einsum("mp,mpk->mk", inverse[:, 0], jacobian * weight[:, None, :])

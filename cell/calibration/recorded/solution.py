@@ -1,0 +1,195 @@
+"""From frames whose boards, stripes and poses were read to a result that has been checked, or refused part by part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cell.calibration.collect.stripe_on_board import on_plane
+from cell.calibration.recorded.chain import check_chain, report_chain, solve_chain
+from cell.calibration.recorded.folder import RecordedFrame, used
+from cell.calibration.recorded.result import intrinsics_dict, plane_dict, seen_depths
+from cell.calibration.solve.camera_checks import camera_checks
+from cell.calibration.solve.checks import Check, refused_parts
+from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
+from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
+from cell.calibration.solve.plane_checks import (
+    PlaneKnown,
+    crooked,
+    odd_stripes,
+    plane_checks,
+    planes_of_cameras,
+    planes_without_one,
+)
+from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels
+from cell.geometry.camera import Array, CameraModel
+from cell.vision.board.board import board_pose
+from cell.vision.pictures import Reason
+from drivers.errors import RefusedError
+
+# A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
+ODD_RATIO, ODD_PX = 3.5, 0.4
+LEAST_FRAMES = 3
+OBLIQUE = math.radians(75.0)
+
+
+def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None) -> tuple[Intrinsics, Intrinsics]:
+    """Camera of all used frames, and that without distortion; frames refused whose points miss by far more than others.
+
+    A `given` camera is taken as it is. Raises RefusedError where the frames give none.
+    """
+    while True:
+        kept = used(frames)
+        views = [f.view for f in kept if f.view is not None]
+        chosen, plain = choose_lens(views) if given is None else (given_camera(given, views),) * 2
+        worst = int(np.argmax(chosen.view_rms))
+        typical = float(np.median(chosen.view_rms))
+        if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
+            kept[worst].refuse(
+                Reason.RESIDUAL,
+                f"the board's points miss their places by {math.sqrt(2) * chosen.view_rms[worst]:.2f} px, in the other "
+                f"frames by {math.sqrt(2) * typical:.2f} px: is it another board, bent, or moved in the exposure?",
+            )
+            continue
+        oblique = False
+        for frame in kept:
+            assert frame.view is not None
+            angle = board_pose(frame.view, chosen.camera).obliquity
+            if angle > OBLIQUE:
+                oblique = True
+                frame.refuse(
+                    Reason.OBLIQUE, f"the board is seen {math.degrees(angle):.0f}° from square, allowed are 75°"
+                )
+        if not oblique:
+            return chosen, plain
+
+
+def agreeing(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
+    """The used frames with a pose that agrees with those of the others; what does not is refused by name."""
+    posed = [f for f in used(frames) if f.base_from_flange is not None]
+    settle_orders(posed, camera)
+    return refuse_misplaced(refuse_odd_ones(posed, camera), camera)
+
+
+def solve_frames(
+    frames: Sequence[RecordedFrame],
+    found: tuple[Intrinsics, Intrinsics],
+    result: dict[str, Any],
+    setup: str | None = None,
+    given: CameraModel | None = None,
+    hold_camera: bool = False,
+) -> None:
+    """Put camera, hand-eye, light plane and their checks into the result; a part that fails a check is refused.
+
+    `found` is the camera of the frames as `camera_of` gave it; `setup` says where the camera is if that is known. With
+    `hold_camera` the arm has no say in the camera.
+    """
+    chosen, plain = found
+    notes: list[str] = result["notes"]
+    posed = agreeing(frames, chosen.camera)
+    if len(used(frames)) < len(chosen.view_rms):
+        try:
+            chosen, plain = camera_of(frames, given)
+        except RefusedError as error:
+            notes.append(f"no intrinsics: {error}")
+            return
+        posed = [f for f in posed if f.reason is None]
+    rest = used(frames)
+    result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
+    result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
+    result["intrinsics_without_distortion"] = intrinsics_dict(plain)
+    views = [f.view for f in rest if f.view is not None]
+    checks = camera_checks(chosen, views, given=given is not None)
+    if posed:
+        if len(rest) > len(posed):
+            notes.append(
+                f"{len(rest) - len(posed)} used frames have no flange pose: they count for the intrinsics only"
+            )
+        try:
+            chain = solve_chain(posed, chosen, setup, hold_camera or given is not None)
+            checks += check_chain(chain, chosen)
+            report_chain(chain, chosen, result)
+        except (RefusedError, np.linalg.LinAlgError) as error:
+            result["refused"]["hand_eye"] = f"no hand-eye: {error}"
+    else:
+        notes.append("no used frame has a flange pose: no hand-eye, no flatness")
+    if result["light_plane"] is None and result["hand_eye"] is None:
+        checks += _report_plane(rest, chosen, result)
+    apply_checks(checks, result)
+
+
+def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
+    """Write the checks into the result, say what is doubtful, and take out what is refused.
+
+    What was found of a refused part stays beside the reason, under `refused_values`, where nobody takes it unawares.
+    A light plane and a hand-eye rest on the camera: they are refused with it.
+    """
+    result["checks"] = [check.as_dict() for check in checks]
+    result["notes"] += [f"doubtful: {check.text}" for check in checks if check.verdict == "doubt"]
+    failed = {part: "; ".join(check.text for check in found) for part, found in refused_parts(checks).items()}
+    if "intrinsics" in failed:
+        for part in ("hand_eye", "light_plane"):
+            if result[part] is not None and part not in failed:
+                failed[part] = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
+    for part, text in failed.items():
+        result["refused"][part] = text
+        result["refused_values"][part] = result[part]
+        result[part] = None
+    if "hand_eye" in failed or "light_plane" in failed:
+        result["flatness"] = None
+
+
+def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[Check]:
+    """The light plane from pictures alone, when the stripe is in them, and its checks."""
+    camera = pictures.camera
+    views = [f.view for f in frames if f.view is not None]
+    profiles = [f.profile for f in frames]
+    notes: list[str] = result["notes"]
+    if sum(p is not None for p in profiles) < 2:
+        notes.append("no light plane: fewer than two frames show a laser stripe")
+        return []
+    poses = [board_pose(v, camera).camera_from_board for v in views]
+    while True:
+        try:
+            plane = plane_from_board(camera, poses, views, profiles)
+        except RefusedError as error:
+            result["refused"]["light_plane"] = f"no light plane: {error}"
+            return []
+        clouds = [
+            np.zeros((0, 3)) if p is None or not len(r) else on_plane(camera, pose, stripe_pixels(p, r))
+            for p, r, pose in zip(profiles, plane.rows, poses, strict=True)
+        ]
+        wrong = odd_stripes(clouds)
+        noise = []
+        for k, (p, r) in enumerate(zip(profiles, plane.rows, strict=True)):
+            if p is not None and len(r):
+                means = stripe_means(p, r, 120)
+                noise.append(float(np.sqrt(np.mean(means[1] ** 2))))
+                text = crooked(camera, *means)
+                if text is not None:
+                    wrong[k] = text
+        if not wrong:
+            break
+        notes += [f"{frames[k].name}: {text} Its stripe is not used." for k, text in wrong.items()]
+        profiles = [None if k in wrong else p for k, p in enumerate(profiles)]
+    seen = [stripe_pixels(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None]
+    cloud: Array = np.concatenate(clouds)
+    lit = sum(len(c) > 0 for c in clouds)
+    others = planes_without_one(clouds)
+    moved = planes_of_cameras(pictures, views, profiles, plane.rows)
+    known = PlaneKnown.of(plane.plane, others, cloud, moved)
+    own = float(np.sqrt(np.mean(np.square(noise)))) * float(np.median(cloud[:, 2])) / camera.fx
+    result["light_plane"] = {
+        **plane_dict(plane.plane),
+        "rms_mm": 1e3 * plane.rms,
+        "depth_range_mm": seen_depths(plane.plane, camera, seen),
+        "sigma_place_mm": None if known is None else 1e3 * known.place,
+        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
+        "stripe_noise_mm": 1e3 * own,
+        "method": "fit on the board's poses",
+    }
+    result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
+    return plane_checks(plane.rms, own, cloud, lit, known)

@@ -1,0 +1,99 @@
+"""Is the board flat? What a board bent or twisted like a second-degree surface would explain, and what it did.
+
+A bent board moves focal length and principal point by many times their formal deviation, and leaves small residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.calibration.solve.adjustment import Adjustment
+from cell.calibration.solve.blocks import CAMERA, FLANGE, State
+from cell.geometry.camera import Array
+
+SHAPES = 3
+SIGNIFICANT, CERTAIN = 4.0, 2.0
+"""Deviations, by leaving views out, from which a bend is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """How far in m the board's points stand out of a plane, its deviation, and what the camera's parameters (9,) would
+    move if that were taken into account. `share` is the bend over the board's diagonal,
+    `certain` by how many of its deviations left-out views are predicted better with it."""
+
+    height: float
+    sigma: float
+    share: float
+    certain: float
+    camera: Array
+    camera_sigma: Array
+
+    @property
+    def believed(self) -> bool:
+        """True when it is more than the views' scatter makes, and left-out views are predicted better with it."""
+        return self.height > SIGNIFICANT * self.sigma and self.certain > CERTAIN
+
+
+def bend_of(adjustment: Adjustment, state: State) -> Bend:
+    """The bend that the dots speak of, at the solution of an adjustment to pictures alone, lens and poses free."""
+    whole = max((v.points for v in adjustment.views), key=len)
+    middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+    half = 0.5 * float(np.linalg.norm(np.ptp(whole, axis=0)))
+    lens = np.flatnonzero(adjustment.free[CAMERA])
+    lens_rows, lens_right = adjustment.lens_prior(state)
+    size = len(lens) + SHAPES
+    prior, pull = np.zeros((size, size)), np.zeros(size)
+    prior[: len(lens), : len(lens)] = (lens_rows.T @ lens_rows)[np.ix_(lens, lens)]
+    pull[: len(lens)] = (lens_rows.T @ lens_right)[lens]
+    parts, wide = [], []
+    for k, view in enumerate(adjustment.views):
+        for _, rows, residual, _ in adjustment.rows_of(k, state):
+            height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
+            shapes = np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
+            wanted = np.column_stack([rows[:, lens], height[:, None] * shapes, residual])
+            pose = np.linalg.qr(rows[:, FLANGE])[0]
+            wanted -= pose @ (pose.T @ wanted)
+            parts.append((wanted[:, :-1].T @ wanted[:, :-1], wanted[:, :-1].T @ wanted[:, -1]))
+            wide.append(wanted)
+    information = prior + np.sum([h for h, _ in parts], axis=0)
+    gradient = pull + np.sum([g for _, g in parts], axis=0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+
+    def solved(h: Array, g: Array) -> Array:
+        unit = scale[: len(g)]
+        return np.asarray(unit * np.linalg.lstsq(h * unit[:, None] * unit, unit * g, rcond=1e-12)[0])
+
+    found = solved(information, gradient)
+    over = surface_shapes((whole - middle) / half)
+    heights = over @ found[len(lens) :]
+    left = [solved(information - h, gradient - g) for h, g in parts]
+    flat = slice(0, len(lens))
+    without = [solved((information - h)[flat, flat], (gradient - g)[flat]) for h, g in parts]
+    gain = np.array(
+        [
+            np.sum((w[:, -1] - w[:, flat] @ plain) ** 2) - np.sum((w[:, -1] - w[:, :-1] @ bent) ** 2)
+            for w, plain, bent in zip(wide, without, left, strict=True)
+        ]
+    )
+    others = np.array([over @ values[len(lens) :] for values in left])
+    count = len(parts)
+    spread = np.sqrt((count - 1) / count * np.sum((others - others.mean(axis=0)) ** 2, axis=0))
+    low, high = int(np.argmin(heights)), int(np.argmax(heights))
+    camera, camera_sigma = np.zeros(9), np.zeros(9)
+    camera[lens] = found[: len(lens)]
+    formal = scale * np.sqrt(np.diag(np.linalg.pinv(information * scale[:, None] * scale)))
+    moved = np.array([values[: len(lens)] for values in left])
+    scattered = np.sqrt((count - 1) / count * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
+    camera_sigma[lens] = np.maximum(formal[: len(lens)], scattered)
+    size_m = float(heights[high] - heights[low])
+    certain = float(gain.sum() / max(np.sqrt(count) * gain.std(ddof=1), 1e-9))
+    return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera, camera_sigma)
+
+
+def surface_shapes(at: Array) -> Array:
+    """The second-degree shapes (n, 3) at places (n, 3) in half diagonals: along x, twisted, along y."""
+    x, y = at[:, 0], at[:, 1]
+    return np.column_stack([x * x, x * y, y * y])

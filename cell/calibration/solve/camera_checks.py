@@ -1,0 +1,119 @@
+"""Is the camera known, and is its lens the one that the model has? Deviations, residual map, terms against priors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cell.calibration.solve.adjustment import DISTORTION_PRIOR
+from cell.calibration.solve.checks import Check
+from cell.calibration.solve.intrinsics import CENTRED_LENS, Intrinsics
+from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
+from cell.geometry.circles import seen_centres
+from cell.geometry.poses import transform
+from cell.vision.board.board import board_pose
+from cell.vision.board.view import BoardView
+
+CELLS = (8, 6)
+LEAST_IN_CELL = 6
+
+
+def camera_checks(found: Intrinsics, views: Sequence[BoardView], *, given: bool = False) -> list[Check]:
+    """Checks of a camera from pictures: how well it is known, how it fits, what is systematic in what is left over."""
+    camera = found.camera
+    width = max(camera.width, camera.height)
+    off, board = _residuals(views, camera)
+    rms = float(np.sqrt(np.mean(off**2))) * np.sqrt(2)
+    made = [
+        Check(
+            "intrinsics", "RMS of the board's points", 1e3 * rms / width, 1.0, 5.0, "‰ of the picture",
+            f"{rms:.2f} px: board, lens model or pictures are not what they are taken for",
+        ),
+        _map(off, views, camera, board),
+    ]  # fmt: skip
+    if given:
+        return made
+    focal = 100 * float(np.max(found.sigma[:2] / camera.parameters[:2]))
+    centre = 100 * float(np.max(found.sigma[2:4])) / width
+    advice = "tilt the board more, to several sides and up to 45°, and cover the whole picture"
+    made.append(
+        Check(
+            "intrinsics", "σ of the focal length", focal, 2.0, 10.0, "%",
+            f"{len(views)} views give fx = {camera.fx:.0f} ± {found.sigma[0]:.0f} px; {advice}",
+        )
+    )  # fmt: skip
+    made.append(
+        Check(
+            "intrinsics", "σ of the principal point", centre, 3.0, 10.0, "% of the picture",
+            f"({camera.cx:.0f} ± {found.sigma[2]:.0f}, {camera.cy:.0f} ± {found.sigma[3]:.0f}) px; {advice}",
+        )
+    )  # fmt: skip
+    made.append(_terms(found))
+    if found.bend is not None and found.bend.believed:
+        made.append(
+            Check(
+                "intrinsics", "bend of the board", 100 * found.bend.share, 0.15, 3.0, "% of its diagonal",
+                f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx by "
+                f"{abs(found.bend.camera[0]):.1f} px and the principal point by "
+                f"{float(np.hypot(*found.bend.camera[2:4])):.1f} px; glue it to something flat",
+            )
+        )  # fmt: skip
+    return made
+
+
+def _terms(found: Intrinsics) -> Check:
+    """The lens's largest term against what lenses have."""
+    usual = np.array([*DISTORTION_PRIOR[:2], CENTRED_LENS, CENTRED_LENS, DISTORTION_PRIOR[4]])
+    shift = np.abs(np.array(found.camera.dist)) / usual
+    worst = int(np.argmax(shift))
+    return Check(
+        "intrinsics", f"{PARAMETER_NAMES[4 + worst]} against what lenses have", float(shift[worst]), 3.0, np.inf, "σ",
+        f"{found.camera.dist[worst]:.3g} where {usual[worst]:g} is usual: a lens of another kind (fisheye), a board "
+        "that is bent, or pictures that do not tell",
+    )  # fmt: skip
+
+
+def _map(off: Array, views: Sequence[BoardView], camera: CameraModel, board: Array) -> Check:
+    """What repeats in the residuals, by place in the picture and by point of the board, and which of both it is."""
+    pixels = np.concatenate([v.pixels for v in views])
+    at = np.clip((pixels / (camera.width, camera.height) * CELLS).astype(int), 0, np.array(CELLS) - 1)
+    by_picture = _systematic(off, at[:, 0] + CELLS[0] * at[:, 1])
+    by_board = _systematic(off, board)
+    largest = max(by_picture, by_board)
+    noise = float(np.sqrt(np.mean(off**2)))
+    if by_picture >= by_board:
+        words = (
+            "by place in the picture: the lens is not what the model has (a fisheye, or a scaled or cropped picture)"
+        )
+    else:
+        words = "by point of the board: the board is bent or not printed to size"
+    return Check(
+        "intrinsics", "what repeats in the residuals", largest, max(0.25, 0.8 * noise), max(3.0, 1e-3 * camera.width),
+        "px", f"{largest:.2f} px RMS of {noise:.2f} px repeat {words}",
+    )  # fmt: skip
+
+
+def _systematic(off: Array, group: Array) -> float:
+    """RMS in px of the groups' means beyond what noise makes; residuals (n, 2), groups (n,)."""
+    _, member, count = np.unique(group, return_inverse=True, return_counts=True)
+    enough = count >= LEAST_IN_CELL
+    if not enough.any():
+        return 0.0
+    means = np.column_stack([np.bincount(member, off[:, k]) for k in (0, 1)]) / count[:, None]
+    within = float(np.mean((off - means[member]) ** 2))
+    weight = count[enough]
+    beyond = np.mean(means[enough] ** 2, axis=1) - within / weight
+    return float(np.sqrt(max(0.0, np.average(beyond, weights=weight))))
+
+
+def _residuals(views: Sequence[BoardView], camera: CameraModel) -> tuple[Array, Array]:
+    """Residuals (n, 2) in px of all views at their best poses, and the points' ids (n,)."""
+    off = []
+    for view in views:
+        pose = board_pose(view, camera).camera_from_board
+        points = transform(pose, view.object_points)
+        if view.dot_radius > 0:
+            points = seen_centres(points, pose.rotation[:, 2], view.dot_radius)
+        off.append(view.pixels - camera.project(points))
+    return np.concatenate(off), np.concatenate([v.ids for v in views])

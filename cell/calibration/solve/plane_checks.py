@@ -1,0 +1,193 @@
+"""Is the light plane a plane, and is it known? Straightness of each stripe, stripes of another line, scatter, size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.collect.stripe_on_board import on_plane
+from cell.calibration.solve.checks import Check
+from cell.calibration.solve.intrinsics import Intrinsics
+from cell.calibration.solve.starts import robust_plane, stripe_pixels
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.covariance import covariance_root
+from cell.geometry.light_plane import LightPlane
+from cell.vision.board.board import board_pose
+from cell.vision.board.view import BoardView
+from cell.vision.stripe.extract import StripeProfile
+
+CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0
+"""A stripe whose centres leave a straight line by more than all of these is not one line of light on a flat board."""
+ODD_SHARE, ODD_RATIO = 0.02, 6.0
+"""A stripe further than this share of its distance, and than so many times the others, from the others' plane."""
+LEAST_STRIPES, LEAST_CHECKED = 3, 4
+THIN = 40
+MOST_PAIRS = 400
+
+
+def straightness(camera: CameraModel, pixels: Array, sigma: Array) -> tuple[float, float]:
+    """RMS distance in px of stripe points (n, 2) from a straight line in the undistorted picture, and their own σ."""
+    ideal = camera.normalised(pixels) * (camera.fx, camera.fy)
+    centred = ideal - np.nanmean(ideal, axis=0)
+    across = centred @ np.linalg.svd(centred, full_matrices=False)[2][1]
+    return float(np.sqrt(np.mean(across**2))), float(np.sqrt(np.mean(sigma**2)))
+
+
+def crooked(camera: CameraModel, pixels: Array, sigma: Array) -> str | None:
+    """What is wrong with a stripe on a flat board that is not straight; None when it is."""
+    off, own = straightness(camera, pixels, sigma)
+    allowed = max(CROOKED_PX, CROOKED_SHARE * float(np.linalg.norm(np.ptp(pixels, axis=0))), CROOKED_SIGMAS * own)
+    if off < allowed:
+        return None
+    return (
+        f"its stripe is not straight on the board: {off:.1f} px RMS from a line, its own noise is {own:.2f} px, "
+        f"allowed {allowed:.1f} px; is it one line of light, and does it lie on the board?"
+    )
+
+
+def odd_stripes(clouds: Sequence[Array]) -> dict[int, str]:
+    """Which frames' stripe points (n, 3) in the camera frame, in m, are of another line of light than most; why.
+
+    The plane is that of the pair of frames to which most others are nearest, so that a third of them may be wrong.
+    """
+    lit = [k for k, cloud in enumerate(clouds) if len(cloud) >= LEAST_STRIPES]
+    if len(lit) < LEAST_STRIPES + 1:
+        return {}
+    thin = {k: clouds[k][:: max(1, len(clouds[k]) // THIN)] for k in lit}
+    pairs = list(combinations(lit, 2))
+    best: tuple[float, Array] | None = None
+    for i, j in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
+        both = np.concatenate([thin[i], thin[j]])
+        spread = np.linalg.svd(both - both.mean(axis=0), compute_uv=False)
+        if spread[1] < 0.02 * spread[0]:
+            continue
+        plane = LightPlane.fit(both)
+        off = np.array([np.median(np.abs(plane.distances(thin[k]))) for k in lit])
+        if best is None or np.median(off) < best[0]:
+            best = float(np.median(off)), off
+    if best is None:
+        return {}
+    usual, off = best
+    near = [k for k, away in zip(lit, off, strict=True) if away < 3 * usual]
+    plane = robust_plane(np.concatenate([thin[k] for k in near]))[0]
+    found = {}
+    for k in lit:
+        away = float(np.median(np.abs(plane.distances(thin[k]))))
+        reach = float(np.median(thin[k][:, 2]))
+        if away > max(ODD_SHARE * reach, ODD_RATIO * usual):
+            found[k] = (
+                f"its stripe lies {1e3 * away:.1f} mm from the plane of the other frames' stripes, which agree to "
+                f"{1e3 * usual:.1f} mm: is it another line of light, or a reflection?"
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class PlaneKnown:
+    """How well a plane is known: where it was seen (m) and its normal (rad)."""
+
+    place: float
+    tilt: float
+
+    @classmethod
+    def of(
+        cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array, moved: Sequence[LightPlane] = ()
+    ) -> PlaneKnown:
+        """`others` (n) lack one frame each; `moved` are as `planes_of_cameras` gives them.
+
+        `cloud` (m, 3) in m is where the plane was seen.
+        """
+        count = max(len(others), 1)
+        thin = cloud[:: max(1, len(cloud) // 500)]
+
+        def away(planes: Sequence[LightPlane], whole: LightPlane) -> tuple[Array, Array]:
+            shifts = np.array([p.distances(thin) * _sign(p, whole) - whole.distances(thin) for p in planes])
+            return shifts, np.array([p.n * _sign(p, whole) - whole.n for p in planes])
+
+        place, tilt, share = 0.0, 0.0, (count - 1) / count
+        if others:
+            shift, turn = away(others, plane)
+            place = share * np.mean(np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
+            tilt = share * np.sum((turn - turn.mean(axis=0)) ** 2)
+        if len(moved) > 1:
+            shift, turn = away(moved[1:], moved[0])
+            place += np.mean(np.sum(shift**2, axis=0))
+            tilt += np.sum(turn**2)
+        return cls(float(np.sqrt(place)), float(np.sqrt(tilt)))
+
+
+def _sign(plane: LightPlane, like: LightPlane) -> float:
+    return float(np.sign(plane.n @ like.n))
+
+
+def planes_of_cameras(
+    pictures: Intrinsics,
+    views: Sequence[BoardView],
+    profiles: Sequence[StripeProfile | None],
+    rows: Sequence[NDArray[np.intp]],
+) -> list[LightPlane]:
+    """The plane with the camera off by one deviation along each direction of its covariance, one after the other."""
+    made = [_plane_with(pictures.camera, views, profiles, rows)]
+    for column in covariance_root(pictures.covariance).T:
+        if np.any(np.abs(column) > 0):
+            camera = pictures.camera.with_parameters(pictures.camera.parameters + column)
+            made.append(_plane_with(camera, views, profiles, rows))
+    return made
+
+
+def _plane_with(
+    camera: CameraModel,
+    views: Sequence[BoardView],
+    profiles: Sequence[StripeProfile | None],
+    rows: Sequence[NDArray[np.intp]],
+) -> LightPlane:
+    clouds = []
+    for view, profile, chosen in zip(views, profiles, rows, strict=True):
+        if profile is not None and len(chosen):
+            pose = board_pose(view, camera).camera_from_board
+            clouds.append(on_plane(camera, pose, stripe_pixels(profile, chosen[:: max(1, len(chosen) // 100)])))
+    return robust_plane(np.concatenate(clouds))[0]
+
+
+def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
+    """The plane of all clouds but one, for each cloud that has points."""
+    lit = [k for k, cloud in enumerate(clouds) if len(cloud)]
+    if len(lit) < LEAST_STRIPES:
+        return []
+    return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
+
+
+def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
+    """The RMS (m) of a plane's points (n, 3) against their span, beside the stripe's own σ (m)."""
+    size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+    return Check(
+        "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
+        f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
+        "points are not those of one plane; are there two lines, or something else that shines?",
+    )  # fmt: skip
+
+
+def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown) -> list[Check]:
+    """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters."""
+    reach = float(np.median(cloud[:, 2]))
+    made = [plane_fit_check(rms, own, cloud)]
+    if frames < LEAST_CHECKED:
+        made.append(
+            Check(
+                "light_plane", "frames that are missing", LEAST_CHECKED - frames, 0.5, np.inf, "",
+                f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
+            )
+        )  # fmt: skip
+    words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
+    made.append(
+        Check(
+            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, 0.5, 4.0,
+            "% of the distance", f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
+        )
+    )  # fmt: skip
+    made.append(Check("light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, "deg", f"{words}"))
+    return made

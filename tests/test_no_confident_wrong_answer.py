@@ -1,0 +1,179 @@
+"""Promises of a calibration from recordings that are spoilt: right within what is stated, or refused by name."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.result import empty_result
+from cell.calibration.recorded.solution import camera_of, solve_frames
+from cell.geometry.camera import CameraModel
+from tests.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
+
+Z = 3.5
+PLACE = 0.40
+"""Where on the optical axis the light plane is looked at, m."""
+
+
+def solved(frames: list[RecordedFrame], given: CameraModel | None = None) -> dict[str, Any]:
+    result = empty_result(frames[0].view.spec)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        solve_frames(frames, camera_of(frames, given), result, given=given)
+    return result
+
+
+def posed(frames: list[RecordedFrame], change: Callable[[pin.SE3], pin.SE3]) -> list[RecordedFrame]:
+    for frame in frames:
+        frame.base_from_flange = change(frame.base_from_flange)
+    return frames
+
+
+def right(result: dict[str, Any]) -> bool:
+    """All that is not refused lies within what is stated about it."""
+    camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
+    if camera is not None:
+        truth = {"fx": MATRIX[0, 0], "fy": MATRIX[1, 1], "cx": MATRIX[0, 2], "cy": MATRIX[1, 2]}
+        if any(abs(camera[name] - value) > Z * camera["sigma_px"][name] for name, value in truth.items()):
+            return False
+    if hand is not None:
+        off = np.array(hand["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation
+        turn = np.degrees(pin.log3(np.array(hand["rotation"]) @ FLANGE_FROM_CAMERA.rotation.T))
+        if np.any(np.abs(off) > Z * np.array(hand["sigma_mm"])) or np.any(
+            np.abs(turn) > Z * np.array(hand["sigma_deg"])
+        ):
+            return False
+    if plane is not None:
+        at = np.array([(DISTANCE - NORMAL[2] * PLACE) / NORMAL[0], 0.0, PLACE])
+        off_mm = abs(1e3 * at @ np.array(plane["normal"]) - plane["distance_mm"])
+        tilt = np.degrees(np.arccos(min(1.0, abs(np.array(plane["normal"]) @ NORMAL))))
+        if off_mm > Z * plane["sigma_place_mm"] or tilt > Z * plane["sigma_normal_deg"]:
+            return False
+    return True
+
+
+def test_a_clean_recording_is_solved_without_a_doubt():
+    result = solved(scene())
+    assert right(result)
+    assert not result["refused"]
+    assert result["hand_eye"]["setup"] == "eye_in_hand"
+    assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0
+    assert [c["name"] for c in result["checks"] if c["verdict"] != "ok"] == []
+
+
+@pytest.mark.parametrize("arm_mm", [1.0, 5.0])
+def test_an_arm_that_scatters_does_not_bend_the_camera(arm_mm):
+    frames = scene(seed=1, count=10, arm_mm=arm_mm, arm_mrad=2 * arm_mm, laser=False)
+    result = solved(frames)
+    assert right(result)
+    assert 0.5 * arm_mm < result["noise"]["arm_translation_mm"] < 2 * arm_mm
+    pictures = result["intrinsics_from_pictures"]
+    assert abs(result["intrinsics"]["fx"] - pictures["fx"]) <= 3 * pictures["sigma_px"]["fx"]
+    if arm_mm > 2:
+        assert any("arm's scatter" in note for note in result["notes"])
+
+
+def test_two_exchanged_poses_are_named_and_the_rest_is_right():
+    frames = scene(seed=2)
+    a, b = frames[2], frames[5]
+    a.base_from_flange, b.base_from_flange = b.base_from_flange, a.base_from_flange
+    result = solved(frames)
+    assert [f.name for f in frames if f.reason is not None] == [a.name, b.name]
+    assert right(result) and result["hand_eye"] is not None
+
+
+def test_a_board_of_odd_counts_that_flips_is_turned_back():
+    frames = scene(seed=3, laser=False, board="chessboard:9x7:15mm")
+    for frame in frames[1:6:2]:
+        frame.view = replace(frame.view, ids=62 - frame.view.ids)
+    result = solved(frames)
+    assert right(result) and result["hand_eye"] is not None
+    assert all(frame.reason is None for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: pin.SE3(p.rotation, 1e3 * p.translation), "in mm, not in m"),
+        (lambda p: pin.SE3(p.rotation.T, p.translation), "do not belong together"),
+    ],
+)
+def test_poses_in_another_convention_are_refused_by_name(change, words):
+    result = solved(posed(scene(laser=False), change))
+    assert result["hand_eye"] is None
+    assert words in result["refused"]["hand_eye"]
+    assert right(result)
+
+
+def test_inverse_poses_are_a_camera_that_stands_still_and_that_is_said():
+    result = solved(posed(scene(laser=False), lambda p: p.inverse()))
+    assert result["hand_eye"]["setup"] == "eye_to_hand"
+    assert any("inverse" in note for note in result["notes"])
+
+
+def test_a_board_of_another_size_is_said_and_counts():
+    result = solved(posed(scene(), lambda p: pin.SE3(p.rotation, 1.03 * p.translation)))
+    assert right(result)
+    assert any("measure its pitch" in note for note in result["notes"])
+
+
+@pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), (0.002, False)])
+def test_a_bent_board_is_seen_and_counts(bend, laser):
+    result = solved(scene(seed=4, bend=bend, laser=laser))
+    assert right(result)
+    found = next(c for c in result["checks"] if c["name"] == "bend of the board")
+    diagonal = np.hypot(6 * 18, 5 * 18)
+    assert found["value"] / 100 * diagonal == pytest.approx(1e3 * bend, rel=0.15)
+
+
+def test_stripes_of_a_second_line_are_left_out_by_name():
+    frames = scene(seed=5, count=10, second=(1, 4, 7))
+    result = solved(frames)
+    assert right(result)
+    named = [note for note in result["notes"] if "another line of light" in note]
+    assert [note[:13] for note in named] == [frames[k].name for k in (1, 4, 7) if frames[k].profile is not None]
+
+
+@pytest.mark.parametrize("axes", [0, 1])
+def test_motions_that_tell_no_hand_eye_are_refused(axes):
+    result = solved(scene(axes=axes))
+    assert result["hand_eye"] is None
+    assert "one axis" in result["refused"]["hand_eye"]
+    assert right(result)
+
+
+def test_three_frames_are_not_enough_to_check_anything():
+    result = solved(scene(count=3))
+    assert "needs 4 or more" in result["refused"]["hand_eye"]
+    assert right(result)
+
+
+def test_a_given_camera_is_not_touched():
+    given = CameraModel(*SIZE, MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2], tuple(LENS))
+    result = solved(scene(seed=6, laser=False), given)
+    assert result["intrinsics"]["fx"] == MATRIX[0, 0]
+    assert np.linalg.norm(np.array(result["hand_eye"]["translation_mm"]) / 1e3 - FLANGE_FROM_CAMERA.translation) < 5e-4
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {},
+        {"arm_mm": 1.0, "arm_mrad": 2.0},
+        {"arm_mm": 5.0, "arm_mrad": 10.0},
+        {"count": 5},
+        {"bend": 0.0005},
+        {"second": (1, 4)},
+    ],
+)
+def test_over_many_scenes_nothing_is_further_off_than_stated(seed, spoilt):
+    assert right(solved(scene(seed=100 + seed, **spoilt)))

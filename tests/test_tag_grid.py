@@ -1,0 +1,50 @@
+"""Promises on grids of AprilTags: corners to hundredths of a pixel, and a refusal that names the dictionary seen."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from cell.vision import parse_board
+from cell.vision.board.board import find_board
+from cell.vision.pictures import PictureRefused
+
+TAG, GAP = 80, 24
+TURN = np.array([[0.9, 0.1, 30], [-0.05, 0.8, 60], [1e-4, 2e-4, 1]])
+
+
+def photograph(squares: bool) -> np.ndarray:
+    """Six columns and five rows of tags, numbered from the last row up, warped by OpenCV at four times the size."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pitch = TAG + GAP
+    sheet = np.full((5 * pitch + GAP + 120, 6 * pitch + GAP + 120), 255, np.uint8)
+    for row, column in np.ndindex(5, 6):
+        x, y = 60 + GAP + column * pitch, 60 + GAP + row * pitch
+        sheet[y : y + TAG, x : x + TAG] = cv2.aruco.generateImageMarker(dictionary, (4 - row) * 6 + column, TAG)
+    for row, column in np.ndindex(6, 7) if squares else ():
+        sheet[60 + row * pitch : 60 + row * pitch + GAP, 60 + column * pitch : 60 + column * pitch + GAP] = 0
+    large = np.diag([4.0, 4.0, 1.0])
+    large[:2, 2] = 1.5
+    fine = cv2.resize(sheet, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+    into = large @ TURN @ np.linalg.inv(large)
+    wide = cv2.warpPerspective(fine, into, (2560, 1920), flags=cv2.INTER_LINEAR, borderValue=128)
+    small = cv2.resize(cv2.GaussianBlur(wide, (0, 0), 3.2), (640, 480), interpolation=cv2.INTER_AREA)
+    noise = np.random.default_rng(1).normal(0, 2, small.shape)
+    return np.clip(small * 0.7 + 20 + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("squares", [True, False])
+def test_corners_lie_where_they_were_drawn(squares):
+    view = find_board(photograph(squares), parse_board("aprilgrid:6x5:26mm:20mm"))
+    assert view.complete
+    drawn = view.object_points[:, :2] / 0.026 * (TAG + GAP) + 60 + GAP - 0.5
+    off = view.pixels - cv2.perspectiveTransform(drawn[None], TURN)[0]
+    assert np.abs(off.mean(axis=0)).max() < 0.01
+    assert off.std() < 0.04
+    assert 0.7 < np.sqrt(np.mean((off / view.sigma[:, None]) ** 2)) < 1.6
+
+
+def test_tags_of_another_dictionary_are_named():
+    with pytest.raises(PictureRefused, match="DICT_APRILTAG_36h11"):
+        find_board(photograph(True), parse_board("aprilgrid:6x5:26mm:20mm:DICT_APRILTAG_25h9"))
