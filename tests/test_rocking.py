@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from cell.geometry.poses import difference
-from cell.inversion import NominalSurface, Prior, Tolerance, invert_pose
+from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.inversion.rocking import LARGEST_RAD, Rocking, find_rocking, rocking_covariance, rocking_motions
 from cell.job import load_job
 from cell.reconstruction.cloud import Cloud
+from cell.steps.invert_pose import Lines
+from cell.steps.invert_pose import invert_pose as step
+from cell.steps.photograph import BoardFix
+from cell.steps.reconstruct import Reconstruction
 from drivers.errors import RefusedError
 
 JOB, MESH = load_job("pot")
@@ -85,7 +92,7 @@ def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
 
 
 def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
-    covariance = rocking_covariance(Rocking(4.0, 1e-4), VEHICLE, SURFACE.translation)
+    covariance = rocking_covariance(Rocking(4.0, 1e-4, 3.75e-3), VEHICLE, SURFACE.translation)
     beside = float(np.linalg.norm((SURFACE.translation - VEHICLE.translation)[:2]))
     assert covariance[3, 3] == pytest.approx(0.5 * (1e-4 / beside) ** 2)
     assert covariance[2, 2] == pytest.approx(0.5 * 1e-4**2)
@@ -93,4 +100,46 @@ def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
 
 def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
     with pytest.raises(RefusedError, match=r"rocks.*Wait until it is quiet"):
-        rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD), VEHICLE, SURFACE.translation)
+        rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD, 5e-3), VEHICLE, SURFACE.translation)
+
+
+def test_a_refused_scan_stays_refused_and_both_readings_are_told() -> None:
+    with pytest.raises(RefusedError, match=r"off the nominal.*or the vehicle rocks at .* Hz.*waves of [\d.]+ mm"):
+        inverted(worn(300e-6, 8e-3, seed=1))
+
+
+def test_lands_and_ridges_are_not_taken_for_rocking() -> None:
+    for seed, length in enumerate((6e-3, 9.5e-3)):
+        cloud = worn(350e-6, length, sharp=True, seed=seed)
+        assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
+        with pytest.raises(RefusedError, match=r"^(?!.*rocks)"):
+            inverted(cloud)
+
+
+def test_where_it_is_accepted_the_note_names_the_waves_that_look_the_same() -> None:
+    (note,) = inverted(scanned(0.0, 3e-5, 4.0)).notes
+    pace = 0.93 * np.ptp(NOMINAL.extent, axis=0)[0] / (LINES - 1) * RATE
+    told = re.search(r"rocks, or the surface has waves of ([\d.]+) mm", note)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(1e3 * pace / 4.0, rel=0.05)
+
+
+def worn(height: float, length: float, *, sharp: bool = False, seed: int = 0) -> Cloud:
+    """A scan from a firm vehicle of a surface with waves, or lands with edges, that follow each other along it."""
+    cloud = scanned(0.0, 0.0, 4.0, seed)
+    wave = np.sin(2 * np.pi * ((cloud.points - SURFACE.translation) @ SURFACE.rotation[:, 0]) / length + seed)
+    up = height * ((wave > 0.3) if sharp else wave)
+    return replace(cloud, points=cloud.points + up[:, :, None] * SURFACE.rotation[:, 2])
+
+
+def inverted(cloud: Cloud) -> PlacePose:
+    """By the job's step, with a board that is where it is."""
+    base_from_board = SURFACE * JOB.surface.place_from_surface.se3().inverse() * JOB.place_from_board
+    covariance = np.diag([1e-3**2] * 3 + [5e-3**2] * 3)
+    fix = BoardFix(base_from_board, covariance, 0.1, 0.0, ())
+
+    def still(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return np.zeros((len(lines), 3, 1))
+
+    scan = Reconstruction(cloud, (), still, still)
+    return step(scan, fix, JOB, NOMINAL, np.zeros((6, 6)), Lines(TIMES, VEHICLE))

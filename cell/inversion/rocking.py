@@ -25,6 +25,8 @@ EVIDENCE = 40.0
 """Drop of the lines' squares, in units of what is left of them, that chance does not bring in so many frequencies."""
 LEAST_M = 8e-6
 """Less than this, up and down, is not worth a word: a screw's error looks the same."""
+LARGEST_OVERTONES = 0.05
+"""Twice and three times the frequency against itself: rocking has 0.006 at most, ridges and steps 0.14 and more."""
 GATE_M = 0.5e-3
 EXPECTED_RAD = 1e-3
 """One standard deviation of each angle before the scan has told: as good as unknown."""
@@ -34,14 +36,21 @@ LARGEST_RAD = 0.4e-3
 
 @dataclass(frozen=True)
 class Rocking:
-    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down."""
+    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down.
+
+    Waves of the length `wave`, m, on the surface itself would look the same.
+    """
 
     hz: float
     height: float
+    wave: float
 
 
 def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, times: Array) -> Rocking | None:
-    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any."""
+    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any.
+
+    None as well where the lines go up and down with overtones: a vehicle on its springs has none, ridges have.
+    """
     scan = Scan.of(cloud)
     rows = correspondences(base_from_surface, scan, nominal, GATE_M)
     of = scan.lines[rows.index]
@@ -65,7 +74,11 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
         evidence = (float(mean @ mean) - left) / (left / (len(t) - 6))
         if evidence > best:
             best, hz, height = evidence, float(candidate), float(np.hypot(*solution))
-    return Rocking(hz, height) if best > EVIDENCE and height > LEAST_M else None
+    if best < EVIDENCE or height < LEAST_M or _overtones(t, mean, hz, apart) > LARGEST_OVERTONES:
+        return None
+    points = np.column_stack([np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)])
+    speed = np.linalg.norm(np.median(np.diff(points[good] / count[good, None], axis=0), axis=0)) / apart
+    return Rocking(hz, height, float(speed) / hz)
 
 
 def rocking_motions(
@@ -112,11 +125,41 @@ def rocking_covariance(rocking: Rocking, base_from_vehicle: pin.SE3, at: Array) 
 
 
 def words(rocking: Rocking) -> str:
-    """For people."""
+    """For people, where the scan fits without it as well."""
     return (
-        f"the vehicle rocks: at {rocking.hz:.1f} Hz the surface seems to go up and down by {1e3 * rocking.height:.3f} "
-        "mm; the pose allows for it, and the stated uncertainty has what it does while the part is put down"
+        f"the vehicle rocks, or {_instead(rocking)}: at {rocking.hz:.1f} Hz the surface seems to go up and down by "
+        f"{1e3 * rocking.height:.3f} mm; the pose allows for rocking, and the stated uncertainty has what it does "
+        "while the part is put down"
     )
+
+
+def also(rocking: Rocking) -> str:
+    """For people, beside the reason why a scan was refused. It fits rocking as well: too little to accept anything."""
+    return (
+        f"(or the vehicle rocks at {rocking.hz:.1f} Hz, by ±{1e3 * rocking.height:.3f} mm at the surface: wait until "
+        f"it is quiet and run the job again; if that says the same, {_instead(rocking)})"
+    )
+
+
+def _instead(rocking: Rocking) -> str:
+    return f"the surface has waves of {1e3 * rocking.wave:.1f} mm"
+
+
+def _overtones(t: Array, mean: Array, hz: float, apart: float) -> float:
+    """How large the waves of 2 and 3 times `hz` are that `mean` (n,) has at `t` (n,), against that of `hz` itself."""
+    known = [hz]
+    for overtone in (2 * hz, 3 * hz):
+        # Between lines so far apart it may look like another frequency.
+        seen = abs(overtone - round(overtone * apart) / apart)
+        if min(abs(seen - other) for other in (0.0, *known)) > 2 / np.ptp(t):
+            known.append(seen)
+    waves = np.column_stack([_waves(t, one) for one in known])
+    solution = np.linalg.lstsq(waves, mean, rcond=None)[0]
+    left = float(np.sum((mean - waves @ solution) ** 2)) / (len(t) - 6)
+    sizes = np.sum(solution.reshape(-1, 2) ** 2, axis=1)
+    # What noise alone makes of them is not theirs.
+    noise = (len(known) - 1) * 4 * left / len(t)
+    return float(np.sqrt(max(0.0, sizes[1:].sum() - noise) / sizes[0]))
 
 
 def _waves(t: Array, hz: float) -> Array:

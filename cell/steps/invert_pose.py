@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
-from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
+from cell.inversion.rocking import Rocking, also, find_rocking, rocking_covariance, rocking_motions, words
 from cell.job import Job
 from cell.reconstruction.cloud import Indices
 from cell.reconstruction.seams import Motions
@@ -67,19 +67,21 @@ def invert_pose(
             sweeps=sweeps,
         )
 
-    found: PlacePose | RefusedError
+    def rocks(pose: object) -> Rocking | None:
+        if taken is None or not isinstance(pose, pin.SE3):
+            return None
+        return find_rocking(scan.cloud, nominal, pose, taken.times)
+
     try:
         found = registered(scan.by_poses, kinematic)
-        pose = found.base_from_surface
     except RefusedError as refused:
-        # A vehicle that rocks bends the surface, and may be all that is wrong.
-        found, pose = refused, refused.seen.get("pose")
-    rocking = None
-    if taken is not None and isinstance(pose, pin.SE3):
-        rocking = find_rocking(scan.cloud, nominal, pose, taken.times)
+        # Never accepted for it: a worn surface looks like this too, and its pose would be wrong.
+        if (rocking := rocks(refused.seen.get("pose"))) is None:
+            raise
+        told = type(refused)(f"{refused} {also(rocking)}", *refused.numbers)
+        raise told.showing(seen=refused.seen) from refused
+    rocking = rocks(found.base_from_surface)
     if rocking is None or taken is None:
-        if isinstance(found, RefusedError):
-            raise found
         return found
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 
