@@ -13,7 +13,7 @@ from cell.geometry.poses import difference
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.inversion.rocking import LARGEST_RAD, Rocking, find_rocking, rocking_covariance, rocking_motions
 from cell.job import load_job
-from cell.reconstruction.cloud import Cloud
+from cell.reconstruction.cloud import Cloud, merge
 from cell.steps.invert_pose import Lines
 from cell.steps.invert_pose import invert_pose as step
 from cell.steps.photograph import BoardFix
@@ -28,8 +28,8 @@ RATE, LINES, NOISE = 30.0, 128, 8e-6
 TIMES = np.arange(LINES) / RATE
 
 
-def scanned(roll: float, pitch: float, hz: float, seed: int = 0) -> Cloud:
-    """Lines across the pot, each displaced as the base was turned when it was taken, with noise along the normals."""
+def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarray = TIMES) -> Cloud:
+    """Lines across the pot, taken at `times`, each displaced as the base was turned then, with noise on top."""
     rng = np.random.default_rng(seed)
     low, high = NOMINAL.extent
     along = np.linspace(0.93 * low[0], 0.93 * high[0], LINES)
@@ -42,7 +42,7 @@ def scanned(roll: float, pitch: float, hz: float, seed: int = 0) -> Cloud:
         start[:, 2] -= feet.heights / np.maximum(feet.normals[:, 2], 0.2)
     points = (start + np.array([0, 0, 1.0]) * NOISE * rng.standard_normal((len(start), 1))) @ SURFACE.rotation.T
     points = (points + SURFACE.translation).reshape(LINES, 90, 3)
-    wave = np.sin(2 * np.pi * hz * TIMES + 0.7)
+    wave = np.sin(2 * np.pi * hz * times + 0.7)
     for k in range(LINES):
         turn = pin.exp3(wave[k] * np.array([roll, pitch, 0.0]))
         points[k] = (points[k] - VEHICLE.translation) @ turn.T + VEHICLE.translation
@@ -89,6 +89,37 @@ def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
     for seed in range(4):
         cloud = scanned(0.0, 0.0, 4.0, seed)
         assert find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES) is None
+
+
+@pytest.mark.parametrize("slower", [1, 2, 4])
+def test_a_sweep_repeated_more_slowly_shows_the_same_frequency(slower: int) -> None:
+    times = 512.0 + slower * TIMES
+    found = find_rocking(scanned(0.0, 1e-4, 2.6, times=times), NOMINAL, SURFACE, times)
+    assert found is not None
+    assert found.hz == pytest.approx(2.6, abs=0.1)
+
+
+@pytest.mark.parametrize("pause", [0.0, 5.13, -LINES / RATE])
+def test_several_sweeps_have_a_phase_each(pause: float) -> None:
+    later = TIMES + LINES / RATE + pause
+    # With -LINES / RATE the clock begins anew.
+    clouds = [scanned(0.0, 1e-4, 4.0, 0), scanned(0.0, 1e-4, 4.0, 1, later + 0.125)]
+    found = find_rocking(merge(clouds), NOMINAL, SURFACE, np.concatenate([TIMES, later]))
+    assert found is not None
+    assert found.hz == pytest.approx(4.0, abs=0.1)
+
+
+def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
+    clouds = [scanned(0.0, 0.0, 4.0, seed) for seed in range(3)]
+    clouds = [
+        replace(c, points=c.points + up * np.array([0, 0, 1])) for c, up in zip(clouds, (0, 6e-5, 0), strict=True)
+    ]
+    times = np.concatenate([TIMES + 5.0 * k for k in range(3)])
+    assert find_rocking(merge(clouds), NOMINAL, SURFACE, times) is None
+
+
+def test_times_that_tell_no_lines_apart_tell_of_no_rocking() -> None:
+    assert find_rocking(scanned(0.0, 1e-4, 4.0), NOMINAL, SURFACE, np.zeros(LINES)) is None
 
 
 def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:

@@ -19,7 +19,7 @@ from cell.steps.reconstruct import Reconstruction
 from cell.steps.step import JobStep
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
-from drivers.errors import RefusedError
+from drivers.errors import NotObservable, RefusedError
 from drivers.interfaces import Vector
 from statemachine.policy import Step
 from statemachine.runner import StepContext
@@ -27,7 +27,10 @@ from statemachine.runner import StepContext
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """When each line of the cloud was taken, (lines,) in s from any moment, and what the arm's base stands on."""
+    """When each line of the cloud was taken, (lines,) in s, and what the arm's base stands on.
+
+    The clock may begin anew with each sweep: nothing is carried over from one to the next.
+    """
 
     times: Vector
     base_from_vehicle: pin.SE3
@@ -94,11 +97,17 @@ def invert_pose(
 
 
 def _at(here: Workplace, context: StepContext) -> PlacePose:
-    # Frames come evenly, lost ones are counted: an id tells the time.
-    ids = np.concatenate([swath.frame_ids for swath in context.made(SweepRecord).swaths])
-    taken = Lines(ids / here.job.scan.frame_rate, here.config.arm.vehicle_from_base.se3().inverse())
-    scan, fix = context.made(Reconstruction), context.made(BoardFix)
-    found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+    sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
+    times = np.concatenate([swath.times for swath in sweep.swaths])
+    taken = Lines(times, here.config.arm.vehicle_from_base.se3().inverse())
+    try:
+        found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+    except NotObservable as refused:
+        if not sweep.notes:
+            raise
+        # What is known too little may be where the laser points, which no more scanning mends.
+        told = NotObservable(f"{refused}. Before: {'; '.join(sweep.notes)}", *refused.numbers)
+        raise told.showing(seen=refused.seen) from refused
     for note in found.notes:
         context.note(text=note)
     return found

@@ -12,7 +12,8 @@ from cell.calibration.collect.stripe_on_board import points_on_board
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.blocks import State, ViewData
 from cell.calibration.solve.joint import STRIPE_POINTS
-from cell.calibration.solve.results import Reference, ScanCalibration, TargetCalibration
+from cell.calibration.solve.reference import Reference
+from cell.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.calibration.solve.starts import stripe_means
 from cell.calibration.verify.decision import Verdict, verdict
 from cell.calibration.verify.evidence import Look, dots_of, evidence
