@@ -86,7 +86,7 @@ def pictures(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def seen(pictures) -> dict[str, RecordedFrame]:
-    frames = read_frames(list_folder(pictures), BOARD)
+    frames, _ = read_frames(list_folder(pictures), BOARD)
     assert all(f.reason is None for f in frames), [f.text for f in frames]
     return {f.name: f for f in frames}
 
@@ -349,7 +349,7 @@ def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
         across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
         dark += 180 * np.exp(-0.5 * (across / 2.0) ** 2)
         cv2.imwrite(str(tmp_path / "laser" / f"{int(path.stem[-2:])}.png"), np.clip(dark, 0, 255).astype(np.uint8))
-    frames = read_frames(list_folder(tmp_path), BOARD)
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
     assert [(f.name, f.stripe_from) for f in frames if f.reason is None] == [
         ("board_03.png", "laser/3.png"),
         ("board_04.png", "laser/4.png"),
