@@ -19,7 +19,7 @@ from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
 from cell.geometry.camera import CameraModel
-from cell.vision import parse_board
+from cell.vision import Laser, parse_board
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -357,3 +357,47 @@ def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
     rows = frames[0].profile.rows
     assert np.abs(frames[0].profile.centres[rows] - (300 + 0.1 * rows)).max() < 0.2
     assert [f.reason.value for f in frames if f.reason is not None] == ["laser_picture"] * 2
+
+
+def lit(image: np.ndarray, red: float) -> np.ndarray:
+    """A picture (h, w) with a red laser line on it, in colour, blue first; on white it is as bright as the paper."""
+    across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+    stripe = np.exp(-0.5 * (across / 2.0) ** 2)
+    colour = np.repeat(image[:, :, None].astype(float), 3, axis=2)
+    colour[:, :, 2] += red * stripe
+    colour[:, :, :2] -= 0.35 * red * stripe[:, :, None]
+    return np.clip(np.rint(colour + np.random.default_rng(5).normal(0, 1, colour.shape)), 0, 255).astype(np.uint8)
+
+
+def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(tmp_path, pictures):
+    for path in sorted(pictures.iterdir())[:3]:
+        cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
+    frames, channel = read_frames(list_folder(tmp_path), BOARD)
+    assert channel.chosen is not Laser.GREY
+    assert sum(channel.votes.values()) == 3
+    for frame in frames:
+        assert frame.profile is not None, frame.stripe_text
+        rows = frame.profile.rows
+        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3
+    in_grey, _ = read_frames(list_folder(tmp_path), BOARD, laser=Laser.GREY)
+    for frame in in_grey:
+        if frame.profile is not None:
+            rows = frame.profile.rows
+            assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 2.0
+
+
+def test_the_picture_without_the_laser_is_taken_off(tmp_path, pictures):
+    for path in sorted(pictures.iterdir())[:2]:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8
+        cv2.imwrite(str(tmp_path / f"{path.stem[-2:]}_off.png"), image)
+        cv2.imwrite(str(tmp_path / f"{path.stem[-2:]}_on.png"), lit(image, 40).max(axis=2))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
+    used = [f for f in frames if f.reason is None]
+    assert [(f.name, f.stripe_from, f.stripe_off) for f in used] == [
+        ("03_off.png", "03_on.png", "03_off.png"),
+        ("04_off.png", "04_on.png", "04_off.png"),
+    ]
+    for frame in used:
+        rows = frame.profile.rows
+        assert len(rows) > 200
+        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3

@@ -31,7 +31,7 @@ LEAST_SMOOTH_SHARE = 0.05
 # to so many px but for a lens, in so many of its rows.
 AROUND = 5.0
 STRAIGHT_PX, LEAST_STRAIGHT = 3.0, 0.6
-MOST_SECOND = 0.5
+MOST_MARKED = 0.5
 CALMER = 0.5
 """A picture without the laser is taken off where it leaves no more than this share of what varies on the board."""
 NEXT = "Take colour pictures, or a second one of each view with the laser off (NAME_on, NAME_off), or name the --laser"
@@ -146,17 +146,23 @@ def _on_board(
 
 
 def _without_marked(profile: StripeProfile, on_board: NDArray[np.bool_], smooth: int) -> ReadStripe:
-    """The profile without points that a second line or a reflection may have moved; None where they leave no line."""
+    """The profile without points that a second line or a reflection may have moved; None where no line is left.
+
+    A mark of most points tells nothing of single ones: faint light all along a stripe is its halo, and they stay.
+    """
     marks = profile.marks
     second, faint = ((marks & np.uint8(mark)) > 0 for mark in (Mark.SECOND_LINE, Mark.REFLECTION))
+    rest = on_board & ~second
+    if (faint & rest).sum() > MOST_MARKED * rest.sum():
+        faint = np.zeros_like(faint)
     keep = ~(second | faint)
-    left_out = {"second_line": int((second & on_board).sum()), "reflection": int((faint & ~second & on_board).sum())}
-    whole, rest = int(on_board.sum()), int((on_board & keep).sum())
-    if left_out["second_line"] > MOST_SECOND * whole or rest < LEAST_SMOOTH_ROWS:
+    left_out = {"second_line": int((second & on_board).sum()), "reflection": int((faint & rest).sum())}
+    whole, left = int(on_board.sum()), int((on_board & keep).sum())
+    if left_out["second_line"] > MOST_MARKED * whole or left < LEAST_SMOOTH_ROWS:
         text = (
             f"of the {whole} points of a line on the board {left_out['second_line']} have a second line beside them "
-            f"(allowed {MOST_SECOND:.0%}) and {left_out['reflection']} a reflection; {rest} have neither (needed "
-            f"{LEAST_SMOOTH_ROWS}): which line is the laser's is not sure. {NEXT}"
+            f"(allowed {MOST_MARKED:.0%}), {left} have neither that nor a reflection (needed {LEAST_SMOOTH_ROWS}): "
+            f"which line is the laser's is not sure. {NEXT}"
         )
         return ReadStripe(None, text, left_out, points=smooth)
     return ReadStripe(replace(profile, centres=np.where(keep, profile.centres, np.nan)), "", left_out, points=smooth)
