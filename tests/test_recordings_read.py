@@ -304,7 +304,7 @@ def test_one_pose_more_than_pictures_is_not_guessed(recording, seen):
     frames, understood, unread = understand(recording, seen)
     assert "9 poses for 8 pictures" in dict(unread)["poses.txt"]
     assert all(f.base_from_flange is None for f in frames)
-    assert "no flange poses" in understood.refused
+    assert "no flange poses" in understood.notes[0]
 
 
 def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
