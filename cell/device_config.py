@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, ValidationInfo, field_validator, model_validator
 
 from cell.toml_file import Table
 from cell.units import number, quantity, whole
@@ -127,11 +127,13 @@ class ArmConfig(DeviceConfig):
     kinematic_sigma: Annotated[float, quantity("mm", 0, 10)]
     kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
 
-    @model_validator(mode="after")
-    def _carries(self) -> Self:
-        if self.payload > (most := MOST_PAYLOAD[self.model]):
-            raise ValueError(f"payload {self.payload:g} kg: a {self.model} carries up to {most:g} kg")
-        return self
+    @field_validator("payload")
+    @classmethod
+    def _carries(cls, payload: float, others: ValidationInfo) -> float:
+        model = others.data.get("model")
+        if model is not None and payload > (most := MOST_PAYLOAD[model]):
+            raise ValueError(f"{payload:g} kg is outside of 0 to {most:g} kg, what a {model} carries")
+        return payload
 
     @model_validator(mode="after")
     def _on_the_vehicle(self) -> Self:

@@ -232,9 +232,9 @@ def test_two_fields_that_both_agree_are_asked_for(recording, seen):
     ]
     (recording / "both.json").write_text(json.dumps(both))
     frames, understood, _ = understand(recording, seen)
-    assert "--pose-field" in understood.notes[0]
+    assert "--pose-field" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
-    (name,) = [w.rstrip(";,") for w in understood.notes[0].split() if w.startswith("both.json") and "flange" in w]
+    (name,) = [w.rstrip(";,") for w in understood.refused.split() if w.startswith("both.json") and "flange" in w]
     frames, understood, _ = understand(recording, seen, pose_field=name)
     assert np.abs(frames[0].base_from_flange.homogeneous - POSES[0]).max() < 1e-6
     with pytest.raises(ConfigError, match="no such poses"):
@@ -244,13 +244,13 @@ def test_two_fields_that_both_agree_are_asked_for(recording, seen):
 def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
     tuples(recording)
     _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
-    assert "no reading of the poses agrees" in understood.notes[0]
+    assert "no reading of the poses agrees" in understood.refused
 
 
 def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
     one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], 1.25 * p[:3, 3]], p[3:]]).ravel()))
     frames, understood, _ = understand(recording, seen)
-    assert "25.0" in understood.notes[0]
+    assert "25.0" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
 
 
@@ -258,7 +258,7 @@ def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):
     for k, pose in enumerate(POSES[::-1]):
         (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
     _, understood, _ = understand(recording, seen)
-    assert "are they the poses of these pictures" in understood.notes[0]
+    assert "are they the poses of these pictures" in understood.refused
 
 
 def test_times_match_poses_to_pictures(tmp_path, pictures, seen):

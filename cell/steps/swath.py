@@ -105,14 +105,17 @@ class Swath:
 
 
 def rehearse(geometry: ScanGeometry) -> None:
-    """Take one drawn profile and let it go: what is loaded or compiled on first use is so before anything moves.
+    """Take two drawn profiles and let them go: what is loaded or compiled on first use is so before anything moves.
 
-    Done under way it takes longer than the gaps that frames and the arm's states may have.
+    Done under way it takes longer than the gaps that frames and the arm's states may have. One picture is an ordinary
+    one, the other has a stripe with a flat top, which is read carefully.
     """
     rows, columns = np.mgrid[: geometry.camera.height, : geometry.camera.width]
-    centres = 0.5 * geometry.camera.width + 4 * np.sin(rows / 40)
-    image = 12 + 140 * np.exp(-0.5 * ((columns - centres) / 2) ** 2)
-    ProfileBuilder(geometry, 1).see(StripeStream().extract(image.astype(np.uint8)))
+    away = columns - 0.5 * geometry.camera.width - 4 * np.sin(rows / 40)
+    grain = np.random.default_rng(0).normal(0.0, 2.0, away.shape)
+    builder = ProfileBuilder(geometry, 2)
+    for stripe in (np.exp(-0.5 * (away / 2) ** 2), 1 / (1 + np.exp(2 * (np.abs(away) - 6)))):
+        builder.see(StripeStream().extract(np.clip(12.5 + 140 * stripe + grain, 0, 255).astype(np.uint8)))
 
 
 @dataclass(eq=False)

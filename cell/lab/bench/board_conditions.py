@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
 from cell.lab.bench.board_render import Lens, Placed, paint, true_pixels
-from cell.vision.board.spec import BoardSpec, Kind
+from cell.vision.board.spec import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
 
 LENSES = (
     Lens(1280, 1024, 1668, 1664, 641.3, 507.6, (-0.1, 0.15, 1e-3, -8e-4, 0.0)),
@@ -88,6 +88,9 @@ def draw_spec(kind: Kind, rng: np.random.Generator, more: int = 0) -> BoardSpec:
         dictionary = str(rng.choice(["DICT_5X5_100", "DICT_4X4_50", "DICT_6X6_250"]))
         cols, rows = int(rng.integers(6, 10)), int(rng.integers(5, 8))
         return BoardSpec(kind, cols + more, rows + more, PITCH, 0.7 * PITCH, dictionary)
+    if kind == "aprilgrid":
+        cols, rows = int(rng.integers(5, 8)), int(rng.integers(4, 7))
+        return BoardSpec(kind, cols + more, rows + more, PITCH, PITCH * MARKER_SHARE[kind], DEFAULT_DICTIONARY[kind])
     cols, rows = int(rng.integers(7, 12)), int(rng.integers(5, 9))
     if kind == "chessboard" and (cols + rows) % 2 == 0 and rng.random() < 0.7:
         rows += 1

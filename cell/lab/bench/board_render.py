@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from cell.compiled import compiled
 from cell.geometry.camera import Array
-from cell.vision.board.spec import BoardSpec
+from cell.vision.board.spec import MARKED, BoardSpec
 
-KIND = {"marked_dots": 0, "asymmetric_dots": 1, "dots": 2, "chessboard": 3, "charuco": 4}
+KIND = {"marked_dots": 0, "asymmetric_dots": 1, "dots": 2, "chessboard": 3, "charuco": 4, "aprilgrid": 5}
 SUB = 8
 
 
@@ -115,13 +115,28 @@ def _rays(lens: Lens) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=64)
 def _markers(spec: BoardSpec) -> NDArray[np.uint8]:
-    """Cells (n, m, m) of a ChArUco board's markers with their black rim, 1 for white."""
-    if spec.kind != "charuco":
+    """Cells (n, m, m) of the markers of a ChArUco board or of a grid of tags with their black rim, 1 for white."""
+    if spec.kind not in MARKED:
         return np.zeros((1, 1, 1), dtype=np.uint8)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     cells = dictionary.markerSize + 2
-    count = spec.cols * spec.rows // 2
+    count = spec.cols * spec.rows // (2 if spec.kind == "charuco" else 1)
     return np.array([cv2.aruco.generateImageMarker(dictionary, k, cells) // 255 for k in range(count)], dtype=np.uint8)
+
+
+@compiled
+def _tags(
+    x: float, y: float, cols: int, rows: int, side: float, markers: NDArray[np.uint8]
+) -> bool:  # pragma: no cover
+    """True where a grid of tags is white: tags numbered from the last row up, black squares where the gaps meet."""
+    i, j = int(np.floor(x)), int(np.floor(y))
+    a, b = x - i, y - j
+    if a >= side and b >= side:
+        return not (-1 <= i < cols and -1 <= j < rows)
+    if a >= side or b >= side or i < 0 or j < 0 or i >= cols or j >= rows:
+        return True
+    cells = markers.shape[1]
+    return bool(markers[(rows - 1 - j) * cols + i, int(b / side * cells), int(a / side * cells)])
 
 
 @compiled
@@ -133,6 +148,8 @@ def _shade(
     if x < size[3] or x > size[4] or y < size[5] or y > size[6]:
         return -1.0
     kind, cols, rows = shape[0], shape[1], shape[2]
+    if kind == 5:
+        return float(white if _tags(x / pitch, y / pitch, cols, rows, marker / pitch, markers) else black)
     if kind >= 3:
         i, j = int(np.floor(x / pitch)) + 1, int(np.floor(y / pitch)) + 1
         across = cols if kind == 4 else cols + 1

@@ -177,7 +177,9 @@ def _compare(record: JobRecord, nominal: NominalSurface, cloud: Cloud, lines: In
     good, true = _true_points(record, nominal, cloud, lines, rows)
     lines, rows = lines[good], rows[good]
     pixels = np.column_stack([cloud.centres[lines, rows], rows.astype(np.float64)])
-    found, _ = record.calibration.scan.geometry().solve(pixels, cloud.rail[lines])
+    # As it was measured, with the laser where its witness showed it before the sweep.
+    geometry = record.results["laser_sweep"].swaths[0].builder.geometry
+    found, _ = geometry.solve(pixels, cloud.rail[lines])
     return _Compared(found, true, lines, rows)
 
 

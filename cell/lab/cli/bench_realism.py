@@ -66,7 +66,7 @@ def _table(console: Any, result: Mapping[str, Any]) -> None:
 
     table = Table(title=f"the workshop's effects, job {result['job']}, {len(result['seeds'])} worlds each (simulated)")
     table.add_column("effect")
-    for name in ("size", "inside", "named", "refused", "outside", "pose %", "part %", "arm base mm", "placed mm"):
+    for name in ("size", "in", "named", "refused", "out", "pose %", "part %", "placed mm"):
         table.add_column(name, justify="right")
     for name, entry in result["effects"].items():
         table.add_row(
@@ -74,14 +74,14 @@ def _table(console: Any, result: Mapping[str, Any]) -> None:
             _size(entry["size"]),
             *(str(entry[key]) for key in ("inside", "named", "refused", "outside")),
             *("" if entry[key] is None else f"{100 * entry[key]:.0f}" for key in ("pose_inside", "part_inside")),
-            *("" if entry[key] is None else f"{entry[key]:.3f}" for key in ("arm_base_mm", "placement_mm")),
+            *("" if entry[key] is None else f"{entry[key]:.3f}" for key in ("placement_mm",)),
         )
     console.print(table)
     for name, entry in result["effects"].items():
         for text in (*entry["reasons"], *entry["flags"]):
             console.print(f"{name}: {text}", markup=False, soft_wrap=True)
     console.print(
-        "inside: pose and part within the stated 95 % ellipsoids; named: refused by the effect's name. The "
+        "in: pose and part within the stated 95 % ellipsoids; named: refused by the effect's name. The "
         "part is judged in the surface's plane: contact decides over the rest.",
         soft_wrap=True,
     )

@@ -37,6 +37,8 @@ MOST_WANDER = 8.0
 SURE = 3.5
 """Least amplitude of a stripe in its standard deviations."""
 LEAST_SCORE = 0.35
+WIDEST = 36.0
+"""σ in px of the widest stripe that is one; what is wider is light and shade on the scenery."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ def read_carefully(
     if like is None:
         noise = surrounded(plane, rows, at, 4 * scale / k, noise)
         shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
+        if shape.width * k > WIDEST:
+            return _nothing(lines)
         learned = Learned(mix, shape.width * k, k, shape, spread, noise, along)
     else:
         learned = like

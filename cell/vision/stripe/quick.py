@@ -104,8 +104,8 @@ def read_quickly(
     believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
     profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
-    if like is not None and (like.learned is not None or like.speckle is not None):
-        return profile, Verdict.ORDINARY if like.learned is None else Verdict.NOT_ORDINARY
+    if like is not None and like.speckle is not None:
+        return profile, Verdict.ORDINARY
     if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
         return profile, Verdict.ORDINARY
     ordinary = (
