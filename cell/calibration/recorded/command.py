@@ -64,12 +64,20 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     frames, channel = read_frames(listing, spec, links, options.laser)
     result = empty_result(spec)
     result["laser"] = channel_dict(channel)
-    result["notes"] += [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
+    result["notes"] += _doubtful_lines(frames)
     result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
     _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
+
+
+def _doubtful_lines(frames: list[RecordedFrame]) -> list[str]:
+    """Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all."""
+    texts = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
+    if len(texts) < 2 or any(f.profile is not None for f in frames):
+        return texts
+    return [f"no picture shows a stripe for certain, {len(texts)} show a line that may be one; {texts[0]}"]
 
 
 def _from_frames(

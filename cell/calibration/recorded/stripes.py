@@ -21,6 +21,8 @@ from cell.vision.pictures import PictureRefused
 from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
 from cell.vision.stripe.planes import Picture, read_colours
 
+Shot = NDArray[np.uint8] | NDArray[np.uint16]
+
 LOOKED_AT = 8
 """Pictures, spread over a recording, that say in what the laser stands out."""
 # A laser stripe is brighter than the board's white, and runs on from row to row.
@@ -75,14 +77,18 @@ class Channel:
 
 
 def choose_channel(sources: Sequence[Source], laser: Laser) -> Channel:
-    """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at."""
+    """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
+
+    Where none of them shows it, the others are read in grey.
+    """
     if laser is not Laser.AUTO or not sources:
         return Channel(laser, laser)
     some = [sources[k] for k in np.unique(np.linspace(0, len(sources) - 1, LOOKED_AT).astype(int))]
     reads = {source.path: read_on_board(source, Channel(laser, laser)) for source in some}
     votes = Counter(_mix(read.profile) for read in reads.values() if read.profile is not None)
     if not votes:
-        return Channel(laser, laser, len(some), {}, reads)
+        # Most such recordings are of the board alone; to look for a line in every mix of colours takes seconds each.
+        return Channel(laser, Laser.GREY, len(some), {}, reads)
     chosen = votes.most_common(1)[0][0]
     again = {path: read for path, read in reads.items() if read.profile is not None and _mix(read.profile) == chosen}
     return Channel(laser, Laser(chosen), len(some), dict(votes.most_common()), again)
@@ -174,7 +180,7 @@ def _white(plane: NDArray[np.float32], view: BoardView) -> float:
     return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
 
 
-def _calming(image: NDArray[np.generic], path: Path, sheet: NDArray[np.bool_]) -> NDArray[np.generic] | None:
+def _calming(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> Shot | None:
     """The picture without the laser, if it is of the same exposure: if the board vanishes when it is taken off."""
     try:
         off = read_colours(path)
