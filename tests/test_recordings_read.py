@@ -340,6 +340,21 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
     assert all(len(reason) > 5 for _, reason in unread)
 
 
+def test_a_damaged_file_beside_the_poses_is_named_and_the_others_are_read(recording, seen):
+    tuples(recording)
+    (recording / "old.npz").write_bytes(b"PK\x03\x04junk")
+    (recording / "old.npy").write_bytes(b"")
+    (recording / "camera.json").write_text('{"rows": null, "cols": 4, "data": [1, 2]}')
+    (recording / "deep.json").write_text("[" * 5000)
+    frames, understood, unread = understand(recording, seen)
+    assert understood.notes == []
+    assert all(f.base_from_flange is not None for f in frames)
+    reasons = dict(unread)
+    assert reasons.keys() == {"old.npz", "old.npy", "camera.json", "deep.json"}
+    assert "zip" in reasons["old.npz"]
+    assert "no pose" in reasons["camera.json"]
+
+
 def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
     (tmp_path / "laser").mkdir()
     for path in sorted(pictures.iterdir())[:2]:

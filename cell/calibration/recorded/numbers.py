@@ -169,10 +169,9 @@ def _by_names(data: dict[Any, Any]) -> tuple[Array | None, str]:
     """A pose of a map whose keys say what is what."""
     low = {re.sub(r"[^a-z0-9]", "", str(k).lower()): v for k, v in data.items()}
     if {"rows", "cols", "data"} <= set(low):
-        array = _array(low["data"])
-        rows, cols = (int(low[k]) for k in ("rows", "cols"))
-        if array is not None and array.size == rows * cols:
-            return _one(array.reshape(rows, cols)), ""
+        array, shape = _array(low["data"]), (low["rows"], low["cols"])
+        if array is not None and all(isinstance(n, int) for n in shape) and array.size == shape[0] * shape[1]:
+            return _one(array.reshape(shape)), ""
         return None, ""
     position = _part(low, ("position", "translation", "t", "trans", "tvec", "pos", "xyz"))
     turn = _part(low, ("orientation", "rotation", "quaternion", "quat", "q", "r", "rot", "rvec", "rpy"))
