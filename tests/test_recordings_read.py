@@ -19,7 +19,8 @@ from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
 from cell.geometry.camera import CameraModel
-from cell.vision import Laser, parse_board
+from cell.vision import Laser, parse_board, read_colours
+from cell.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -269,11 +270,26 @@ def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
         names[name] = seen[path.name]
         rows.append(row([1690000000 + 2 * k + 0.2, *pose[:3, 3], *quaternion(pose)]))
         rows.append(row([1690000000 + 2 * k + 1.2, *(pose[:3, 3] + 0.1), *quaternion(pose)]))
-    (tmp_path / "trajectory.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
-    frames, understood, _ = understand(tmp_path, names)
-    assert understood.about["matched_by"] == "time"
-    for frame, pose in zip(frames, POSES, strict=True):
-        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+    for unknown in ("", "time,x,y,z,qx,qy,qz,qw\nn/a," + row([0.1] * 7, ",") + "\n"):
+        separator = "," if unknown else " "
+        text = "\n".join(r.replace(" ", separator) for r in rows)
+        (tmp_path / "trajectory.txt").write_text((unknown or "# timestamp tx ty tz qx qy qz qw\n") + text)
+        frames, understood, _ = understand(tmp_path, names)
+        assert understood.about["matched_by"] == "time"
+        for frame, pose in zip(frames, POSES, strict=True):
+            assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def test_a_picture_whose_file_says_that_it_was_held_turned_is_read_as_the_sensor_has_it(tmp_path, pictures):
+    path = tmp_path / "turned.jpg"
+    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(path), image)
+    as_it_is, data = read_picture(path), path.read_bytes()
+    for orientation in (3, 6):
+        tag = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
+        path.write_bytes(data[:2] + b"\xff\xe1" + (len(tag) + 2).to_bytes(2, "big") + tag + data[2:])
+        assert np.array_equal(read_picture(path), as_it_is)
+        assert np.array_equal(read_colours(path), as_it_is)
 
 
 def test_what_is_wrong_is_named_with_its_file(recording, seen):
