@@ -356,6 +356,43 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
     assert all(len(reason) > 5 for _, reason in unread)
 
 
+def in_little_light(image: np.ndarray, light: float, seed: int) -> np.ndarray:
+    """The picture by `light` as much light, with noise and a stripe."""
+    across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+    noise = np.random.default_rng(seed).normal(0, 1, image.shape)
+    return np.clip(light * image + 180 * np.exp(-0.5 * (across / 2.0) ** 2) + noise + 3, 0, 255).astype(np.uint8)
+
+
+def test_three_pictures_of_one_place_are_one_frame(tmp_path, pictures):
+    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "03_board.png"), image)
+    cv2.imwrite(str(tmp_path / "03_laser_off.png"), (0.3 * image + 3).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "03_laser_on.png"), in_little_light(image, 0.3, 1))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
+    (used,) = [f for f in frames if f.reason is None]
+    assert (used.name, used.stripe_from, used.stripe_off) == ("03_board.png", "03_laser_on.png", "03_laser_off.png")
+    assert {f.reason.value for f in frames if f is not used} == {"laser_picture"}
+
+
+def test_a_copy_under_another_number_counts_once_and_with_another_pose_it_is_refused(recording):
+    (recording / "frame11.png").symlink_to(recording / "frame03.png")
+    image = cv2.imread(str(recording / "frame04.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(recording / "frame12.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    (recording / "frame13.png").symlink_to(recording / "frame05.png")
+    rows = [row(p.ravel()) for p in [*POSES, POSES[0], POSES[1], POSES[7]]]
+    (recording / "poses.txt").write_text("\n".join(rows))
+    listing = list_folder(recording)
+    series, links, _ = read_series(listing)
+    frames, _ = read_frames(listing, BOARD, links)
+    attach_poses(frames, match_series(series, listing, links)[0], CAMERA, Options())
+    assert [f.reason for f in frames[: len(POSES)]] == [None] * len(POSES)
+    same, again, other = frames[len(POSES) :]
+    assert (same.reason.value, same.text) == ("duplicate", "the same file as frame03.png")
+    assert (again.reason.value, again.text) == ("duplicate", "it shows what frame04.png shows")
+    assert other.reason.value == "no_pose"
+    assert "frame05.png" in other.text
+
+
 def test_a_damaged_file_beside_the_poses_is_named_and_the_others_are_read(recording, seen):
     tuples(recording)
     (recording / "old.npz").write_bytes(b"PK\x03\x04junk")

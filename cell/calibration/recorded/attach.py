@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from cell.calibration.recorded.conventions import why_not
 from cell.calibration.recorded.decide import Decision, decide, scale_problem, scaled
@@ -20,6 +21,8 @@ from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES = 3
 FARTHEST_M = 20.0
+# Poses of an arm that stands still, read twice, are no further apart.
+SAME_M, SAME_RAD = 0.5e-3, 2e-3
 
 
 @dataclass
@@ -64,6 +67,7 @@ def attach_poses(
         return Understood(about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
     for one in series:
         _tell_apart(one, frames, len(series) == 1)
+        _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
     boards = {}
@@ -131,7 +135,35 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             continue
         if not refused:
             frame.base_from_flange = metres
+    _compare_copies(frames)
     return understood
+
+
+def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
+    """Give a frame without a pose that of another picture of its place."""
+    index = {id(frame): k for k, frame in enumerate(frames)}
+    for k, frame in enumerate(frames):
+        if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
+            one.of.setdefault(index[id(frame.shows)], one.of[k])
+
+
+def _compare_copies(frames: Sequence[RecordedFrame]) -> None:
+    """Refuse pictures that show what another shows, and have another pose; a stripe that is theirs is not used."""
+    for frame in frames:
+        first, own = frame.shows, frame.base_from_flange
+        if first is None or own is None or first.base_from_flange is None:
+            continue
+        apart = first.base_from_flange.actInv(own)
+        way, turn = float(np.linalg.norm(apart.translation)), float(np.linalg.norm(pin.log3(apart.rotation)))
+        if way < SAME_M and turn < SAME_RAD:
+            continue
+        text = (
+            f"its pose ({frame.pose_from}) is {1e3 * way:.1f} mm and {np.degrees(turn):.2f}° from that of {first.name}"
+        )
+        if first.stripe_from == frame.name:
+            first.profile, first.stripe_from, first.stripe_off = None, "", ""
+            first.stripe_text = f"{frame.name} was not taken at the same place: {text}"
+        frame.refuse(Reason.NO_POSE, f"{frame.text}, but {text} ({first.pose_from}): which one is right?")
 
 
 def _tell_apart(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:
