@@ -189,6 +189,30 @@ def numpy_stack_by_columns(folder: Path) -> None:
     np.save(folder / "poses.npy", np.array([p.T for p in POSES]))
 
 
+def as_the_arms_script_has_them(folder: Path) -> None:
+    (folder / "poses.script.txt").write_text(
+        "\n".join(f"p[{row([*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()], ', ')}]" for p in POSES)
+    )
+
+
+def titles_above_matrices(folder: Path) -> None:
+    blocks = [f"Pose {k + 3}:\n" + "\n".join(map(row, p)) for k, p in enumerate(POSES)]
+    (folder / "poses.txt").write_text("\n\n".join(blocks))
+
+
+def times_before_rotation_vectors(folder: Path) -> None:
+    rows = [
+        row([1.7e9 + 3.7 * k, *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for k, p in enumerate(POSES)
+    ]
+    (folder / "poses.txt").write_text("\n".join(rows))
+
+
+def remarks_in_some_rows(folder: Path) -> None:
+    rows = [row([k + 3, *p[:3, 3], *quaternion(p)], ",") for k, p in enumerate(POSES)]
+    said = [r + (",bad light" if k == 2 else ",") for k, r in enumerate(rows)]
+    (folder / "robot.csv").write_text("image,x,y,z,qx,qy,qz,qw,comment\n" + "\n".join(reversed(said)))
+
+
 SPELLINGS = {
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
     rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
@@ -201,6 +225,10 @@ SPELLINGS = {
     opencv_yaml: ("matrix-3x4", "m", "name"),
     matrices_one_below_the_other: ("matrix-4x4", "m", "order"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
+    as_the_arms_script_has_them: ("xyz+rotvec-rad", "m", "order"),
+    titles_above_matrices: ("matrix-4x4", "m", "name"),
+    times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
+    remarks_in_some_rows: ("xyz+quaternion-xyzw", "m", "number"),
 }
 
 

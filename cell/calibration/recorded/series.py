@@ -12,7 +12,8 @@ import pinocchio as pin
 from cell.calibration.recorded.conventions import Reading
 from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
-from cell.calibration.recorded.numbers import Content, Record, read_content
+from cell.calibration.recorded.numbers import read_content
+from cell.calibration.recorded.records import Content, Record
 from drivers.errors import ConfigError
 
 LEAST = 2
