@@ -384,6 +384,17 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
     assert all(len(reason) > 5 for _, reason in unread)
 
 
+def test_numbers_that_are_off_by_one_are_found_out_and_said(recording, seen):
+    one_file_each(recording, lambda p: row(p.ravel()))
+    for k in range(len(POSES)):
+        (recording / f"pose{k + 3:02d}.txt").rename(recording / f"pose{k + 2:02d}.txt")
+    frames, understood, _ = understand(recording, seen)
+    assert understood.about["matched_by"] == "order"
+    assert "taken in order" in understood.notes[0]
+    for frame, pose in zip(frames, POSES, strict=True):
+        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
 def in_little_light(image: np.ndarray, light: float, seed: int) -> np.ndarray:
     """The picture by `light` as much light, with noise and a stripe."""
     across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]

@@ -12,6 +12,7 @@ import pinocchio as pin
 from cell.calibration.recorded.conventions import why_not
 from cell.calibration.recorded.decide import Decision, decide, scale_problem, scaled
 from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.listing import natural
 from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
@@ -70,9 +71,10 @@ def attach_poses(
         _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
+    in_order = [other for one in series if (other := _in_order(one, frames)) is not None]
     boards = {}
     for k, frame in enumerate(frames):
-        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
             continue
         try:
             boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
@@ -88,7 +90,7 @@ def attach_poses(
         )
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
-        decision = decide(series, boards, pitch, options.poses, options.setup)
+        decision = decide(series, boards, pitch, options.poses, options.setup, in_order)
     except RefusedError as error:
         return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
     return _apply(decision, frames, pitch, options)
@@ -112,6 +114,12 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             "shift_mm": 1e3 * best.shift,
         },
     )
+    if decision.by_name is not None:
+        decision.by_name.series.alone = []
+        understood.notes.append(
+            f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
+            f"leaves {best.left}; by name they leave {decision.by_name.left}"
+        )
     problem, refused = scale_problem(best, pitch)
     if problem and refused:
         understood.refused = f"no hand-eye: {problem}"
@@ -123,7 +131,7 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
         frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
         pose = poses.get(k)
         if pose is None:
-            if frame.reason is None:
+            if frame.reason in (None, Reason.DUPLICATE):
                 why = why_not(record.numbers, record.named, best.reading.name)
                 frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
             continue
@@ -145,6 +153,17 @@ def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
     for k, frame in enumerate(frames):
         if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
             one.of.setdefault(index[id(frame.shows)], one.of[k])
+
+
+def _in_order(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
+    """The same poses given to the pictures in order, where there are as many and their names say otherwise."""
+    places = [k for k, f in enumerate(frames) if f.shows is None]
+    if one.by not in ("name", "number") or len(places) != len(one.records):
+        return None
+    single = len({r.path for r in one.records}) == len(one.records)
+    records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
+    of = dict(zip(places, records, strict=True))
+    return None if all(one.of.get(k) is r for k, r in of.items()) else Series(one.name, records, of, "order")
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

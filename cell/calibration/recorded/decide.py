@@ -68,10 +68,14 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """The reading taken, the next best one that means something else, and what to say about both."""
+    """The reading taken, the next best one that means something else, and what to say about both.
+
+    `by_name`: what the poses leave that have the pictures' names, where they were taken in order instead.
+    """
 
     best: Fit
     rival: Fit | None
+    by_name: Fit | None = None
 
     @property
     def evidence(self) -> str:
@@ -88,26 +92,24 @@ def decide(
     pitch: float,
     wanted: str | None = None,
     setup: str | None = None,
+    in_order: Sequence[Series] = (),
 ) -> Decision:
     """The reading of the series that agrees with the boards that frames (by index) saw, in each order they allow.
 
-    `pitch` of the board in m, as it was named.
+    `pitch` of the board in m, as it was named. `in_order` are the same poses, given to the pictures in order and not by
+    their names: they are taken where they agree, and clearly better.
 
     Raises RefusedError when none does, or when two do that mean different things; its text names the option to give.
     """
-    fits: list[Fit] = []
-    problems: list[str] = []
-    for one in series:
-        for reading in readings_of(one.count, one.named, wanted):
-            try:
-                fits += _fits(one, reading, boards, setup)
-            except RefusedError as error:
-                problems.append(str(error))
+    fits, problems = _all_fits(series, boards, wanted, setup)
+    ordered, _ = _all_fits(in_order, boards, wanted, setup)
+    by_name = None
+    if ordered and fits and ordered[0].score < AGREES and CLEAR * ordered[0].score < fits[0].score:
+        by_name, fits = fits[0], ordered
     if not fits:
         records = [r for one in series for r in one.records]
         reasons = problems or [why_not(records[0].numbers, records[0].named, wanted)]
         raise RefusedError(f"the poses of {series[0].name} cannot be read: {reasons[0]}")
-    fits.sort(key=lambda f: f.score)
     best = fits[0]
     if not best.score < AGREES:
         sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
@@ -121,7 +123,22 @@ def decide(
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
     if rival is not None and rival.score < CLEAR * best.score:
         raise RefusedError(_question(best, rival))
-    return Decision(best, rival)
+    return Decision(best, rival, by_name)
+
+
+def _all_fits(
+    series: Sequence[Series], boards: dict[int, list[pin.SE3]], wanted: str | None, setup: str | None
+) -> tuple[list[Fit], list[str]]:
+    """All readings of the series, the best first, and why some are none."""
+    fits: list[Fit] = []
+    problems: list[str] = []
+    for one in series:
+        for reading in readings_of(one.count, one.named, wanted):
+            try:
+                fits += _fits(one, reading, boards, setup)
+            except RefusedError as error:
+                problems.append(str(error))
+    return sorted(fits, key=lambda f: f.score), problems
 
 
 def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:

@@ -88,7 +88,12 @@ def read_frames(
                 frame.shows = first
                 frame.refuse(Reason.DUPLICATE, f"the same file as {first.name}")
     _refuse_other_sizes(frames)
-    return frames, _read_stripes(frames, find_places(frames, links), laser)
+    channel = _read_stripes(frames, find_places(frames, links), laser)
+    for frame in frames:
+        # The same file as a copy shows what that copies.
+        while frame.shows is not None and frame.shows.shows is not None:
+            frame.shows = frame.shows.shows
+    return frames, channel
 
 
 def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
