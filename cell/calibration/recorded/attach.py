@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from cell.calibration.recorded.agreement import scaled
 from cell.calibration.recorded.conventions import why_not
-from cell.calibration.recorded.decide import Decision, decide, scale_problem, scaled
+from cell.calibration.recorded.decide import Decision, decide, scale_problem
 from cell.calibration.recorded.folder import RecordedFrame
 from cell.calibration.recorded.listing import natural
 from cell.calibration.recorded.series import Series
