@@ -416,6 +416,20 @@ def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(d
     devices.arm.move_linear(down, 0.05, 0.5).wait(30.0)
 
 
+def test_a_vehicle_that_could_not_be_enabled_still_stands_before_the_station(
+    world: VirtualCell, devices: Devices
+) -> None:
+    tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
+    table = block("table", BASE, tip.translation - [0.3, 0.3, 0.2], tip.translation + np.array([0.3, 0.3, -0.03]))
+    devices.interlocks.stand_before([table])
+    world.world.vehicle.fault("vehicle.emergency_stop", world.clock.now())
+    with pytest.raises(DeviceFault, match="emergency stop"):
+        devices.vehicle.enable()
+    assert devices.interlocks.situation.station == (table,)
+    down = shifted(devices, 0.0, 0.0, -0.05)
+    refused("way_clear", lambda: devices.arm.move_linear(down, 0.05, 0.5), "claw and table")
+
+
 def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
     arm, interlocks = devices.arm, devices.interlocks
     post = from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.2))

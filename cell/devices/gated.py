@@ -154,9 +154,9 @@ class GatedVehicle(Gated[Vehicle]):
         """See `Vehicle.enable`."""
 
         def begin() -> None:
-            # It may drive away from now on.
-            self.gate.interlocks.stand_before(())
+            # Only now may it drive away: one that could not be enabled still stands where it stood.
             self.bare.enable()
+            self.gate.interlocks.stand_before(())
 
         self.gate.begin(Command("vehicle", "enable"), begin, self.bare.brake)
 
