@@ -26,6 +26,7 @@ from drivers.interfaces import (
     Vector,
     Vehicle,
     VehicleState,
+    why_untold,
 )
 from drivers.link_table import LinkTable
 
@@ -36,6 +37,11 @@ class GatedArm(Gated[Arm]):
     def link_table(self) -> LinkTable | None:
         """See `Arm.link_table`."""
         return self.bare.link_table()
+
+    @property
+    def untold(self) -> str:
+        """See `SaysWhyUntold.untold`."""
+        return why_untold(self.bare)
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""
