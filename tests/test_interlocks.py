@@ -29,6 +29,7 @@ from cell.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser
+from sim_backends.models.arm import Power
 from sim_backends.models.arm_kinematics import Kinematics
 
 CONFIG = load_config(None)
@@ -590,3 +591,19 @@ def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
     ):
         refused("same_kinematics", begin, "mm and", "mrad away", "port 30001")
     assert np.array_equal(devices.arm.state().joints, before.joints)
+
+
+def test_an_arm_without_power_is_refused_by_its_driver_which_says_how_it_goes_on(
+    world: VirtualCell, devices: Devices
+) -> None:
+    arm = world.world.arm
+    table = arm.params.dh.copy()
+    table[1, 0] += 1e-3
+    arm.kinematics = arm.drive.kinematics = Kinematics(table)
+    arm.power = Power.OFF
+    assert not devices.arm.state().controlled
+    with pytest.raises(DeviceFault, match="power is off") as caught:
+        devices.arm.move_joints(HOME, 0.5, 1.0)
+    assert caught.value.code == "arm.not_powered"
+    arm.power = Power.RUNNING
+    refused("same_kinematics", lambda: devices.arm.move_joints(HOME, 0.5, 1.0))
