@@ -76,7 +76,7 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
 
 
 def methods(interface: type) -> list[str]:
-    """The methods that an interface asks for, by name. To look for a property may ask the device, so they are left out."""
+    """The methods that an interface asks for, by name; no properties, because to look for one may ask the device."""
     return [name for name in dir(interface) if not name.startswith("_") and callable(getattr(interface, name))]
 
 

@@ -1,8 +1,8 @@
 """What the controller tells of its own kinematics: the factory's Denavit–Hartenberg table, on the primary interface.
 
 Read once for each connection of the driver, over sockets of its own that send nothing. An arm that does not tell is no
-error here: the user's own model of it is compared with the flange that it reports, whatever that model rests on. Source:
-docs/protocols.md, section 1.
+error here: the user's own model of it is compared with the flange that it reports, whatever that model rests on.
+Source: docs/protocols.md, section 1.
 """
 
 from __future__ import annotations
