@@ -68,7 +68,7 @@ def test_a_clean_recording_is_solved_without_a_doubt():
     assert [c["name"] for c in result["checks"] if c["verdict"] != "ok"] == []
 
 
-@pytest.mark.parametrize("arm_mm", [1.0, 5.0])
+@pytest.mark.parametrize("arm_mm", [pytest.param(1.0, marks=pytest.mark.campaign), 5.0])
 def test_an_arm_that_scatters_does_not_bend_the_camera(arm_mm):
     frames = scene(seed=1, count=10, arm_mm=arm_mm, arm_mrad=2 * arm_mm, laser=False)
     result = solved(frames)
@@ -124,7 +124,7 @@ def test_a_board_of_another_size_is_said_and_counts():
     assert any("measure its pitch" in note for note in result["notes"])
 
 
-@pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), (0.002, False)])
+@pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), pytest.param(0.002, False, marks=pytest.mark.campaign)])
 def test_a_bent_board_is_seen_and_counts(bend, laser):
     result = solved(scene(seed=4, bend=bend, laser=laser))
     assert right(result)
