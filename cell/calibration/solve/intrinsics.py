@@ -142,14 +142,13 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     return _intrinsics(best, views, tried), _intrinsics(plain, views, tried)
 
 
-def fit_camera(views: Sequence[BoardView], model: LensModel) -> Intrinsics:
-    """The camera with a given lens model. Raises RefusedError."""
-    start, _ = zhang(views, lens=model.k1)
-    return _intrinsics(_fitted(model, start, _data(views, start)), views, {})
-
-
 def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
-    """A camera that is known, with the views' residuals in it; its own deviation is not known here."""
+    """A camera that is known, with the views' residuals in it; its own deviation is not known here.
+
+    Raises RefusedError without views.
+    """
+    if not views:
+        raise RefusedError("no picture shows the board, and a given camera needs one to be used: see why, by picture")
     rms = np.array([board_pose(view, camera).rms_px for view in views])
     return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=LensModel("given"))
 
