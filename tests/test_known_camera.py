@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from cell.calibration.recorded.known_camera import read_camera
 from cell.calibration.recorded.solution import camera_of
 from cell.geometry.camera import CameraModel
 from drivers.errors import ConfigError, RefusedError
+from tests.recorded_scenes import LENS, MATRIX, SIZE, scene
+from tests.test_no_confident_wrong_answer import right, solved
 
 SENSIBLE = CameraModel(1280, 960, 1400, 1400, 650, 470)
 
@@ -63,3 +66,25 @@ def test_a_matrix_that_is_no_camera_is_refused(tmp_path, matrix, words):
 def test_a_given_camera_without_pictures_is_refused():
     with pytest.raises(RefusedError, match="no picture shows the board"):
         camera_of([], SENSIBLE)
+
+
+def given(fx: float = 1.0, cx: float = 0.0) -> CameraModel:
+    return CameraModel(*SIZE, fx * MATRIX[0, 0], fx * MATRIX[1, 1], MATRIX[0, 2] + cx, MATRIX[1, 2], tuple(LENS))
+
+
+@pytest.mark.parametrize("wrong", [given(fx=1.03), given(cx=25.0)])
+def test_the_file_of_another_camera_is_refused_with_all_that_rests_on_it(wrong):
+    result = solved(scene(laser=False), wrong)
+    assert "given camera against that of the pictures" in result["refused"]["intrinsics"]
+    assert result["hand_eye"] is None
+    assert all(result[name] is None for name in result if name.startswith("intrinsics"))
+    assert result["refused_values"]["intrinsics_from_pictures"]["fx"] == wrong.fx
+
+
+@pytest.mark.parametrize("off", [1.0, 1.003, 0.99])
+def test_what_a_given_camera_is_off_by_is_stated_or_refused(off):
+    result = solved(scene(seed=7, count=6, laser=False), given(fx=off))
+    assert right(result)
+    if off == 1.0:
+        assert not result["refused"]
+        assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0

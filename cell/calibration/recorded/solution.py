@@ -17,6 +17,7 @@ from cell.calibration.recorded.stops import by_stop, counted, merged
 from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.checks import Check, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
+from cell.calibration.solve.given_camera import against_pictures
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
 from cell.calibration.solve.plane_checks import (
     PlaneKnown,
@@ -36,6 +37,7 @@ from drivers.errors import RefusedError
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
+OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
 OBLIQUE = math.radians(75.0)
 
 
@@ -114,15 +116,19 @@ def solve_frames(
         posed = [f for f in posed if f.reason is None]
     rest = used(frames)
     result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
-    result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
-    result["intrinsics_without_distortion"] = intrinsics_dict(plain)
     stops = [merged(stop) for stop in by_stop(rest)]
     if len(stops) < len(rest):
         notes.append(
             f"{counted(len(rest), len(stops))}: pictures of one stop share its error and count as one frame, their mean"
         )
     views = _views(stops)
-    checks = camera_checks(chosen, views, given=given is not None)
+    beside: list[Check] = []
+    if given is not None:
+        chosen, beside = against_pictures(chosen, views)
+        plain = chosen
+    result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
+    result["intrinsics_without_distortion"] = intrinsics_dict(plain)
+    checks = beside + camera_checks(chosen, views, given=given is not None)
     if posed:
         if len(rest) > len(posed):
             notes.append(
@@ -156,6 +162,9 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
         for part in ("hand_eye", "light_plane"):
             if result[part] is not None and part not in failed:
                 failed[part] = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
+        for name in OTHER_CAMERAS:
+            result["refused_values"][name] = result[name]
+            result[name] = None
     for part, text in failed.items():
         result["refused"][part] = text
         result["refused_values"][part] = result[part]

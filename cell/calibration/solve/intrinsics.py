@@ -36,7 +36,7 @@ CENTRED_LENS = 0.002
 
 @dataclass(frozen=True)
 class LensModel:
-    """Which of k1, k2, p1 and p2, k3 are free, and whether fx and fy are one."""
+    """Which of k1, k2, p1 and p2, k3 are free, and whether fx and fy are one; what is not free is 0, or as `given`."""
 
     name: str
     k1: bool = False
@@ -44,6 +44,7 @@ class LensModel:
     tangential: bool = False
     k3: bool = False
     one_focal: bool = False
+    given: bool = False
 
     @property
     def free(self) -> list[bool]:
@@ -56,11 +57,12 @@ class LensModel:
         return replace(priors, lens=(k1, k2, CENTRED_LENS, CENTRED_LENS, k3), one_focal=self.one_focal)
 
     def held(self, camera: CameraModel) -> CameraModel:
-        """The camera with the terms that are not free at 0."""
-        return camera.with_parameters(np.where(self.free, camera.parameters, 0.0))
+        """The camera with the terms that are not free at 0, or as they were given."""
+        return camera if self.given else camera.with_parameters(np.where(self.free, camera.parameters, 0.0))
 
 
 PLAIN = LensModel("no distortion")
+GIVEN = LensModel("given", given=True)
 RADIAL = (LensModel("k1", k1=True), LensModel("k1, k2", k1=True, k2=True))
 FURTHER = (
     ("k3", {"k1": True, "k2": True, "k3": True}),
@@ -150,7 +152,12 @@ def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
     if not views:
         raise RefusedError("no picture shows the board, and a given camera needs one to be used: see why, by picture")
     rms = np.array([board_pose(view, camera).rms_px for view in views])
-    return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=LensModel("given"))
+    return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=GIVEN)
+
+
+def beside_given(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
+    """Focal lengths and principal point that the views give by themselves, with the lens of a camera that is known."""
+    return _intrinsics(_fitted(GIVEN, camera, _data(views, camera)), views, {})
 
 
 def _clearly_better(more: _Fit, less: _Fit) -> bool:
