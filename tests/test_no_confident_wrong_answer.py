@@ -155,6 +155,16 @@ def test_three_frames_are_not_enough_to_check_anything():
     assert right(result)
 
 
+def test_a_picture_of_another_camera_is_named():
+    frames = scene(seed=1, count=10, laser=False)
+    frames[1].view = scene(seed=51, count=10, laser=False, focal=1.05)[1].view
+    frames[1].base_from_flange = None
+    result = solved(frames)
+    assert right(result)
+    doubt = next(c for c in result["checks"] if c["name"] == "what one picture does to the camera")
+    assert doubt["verdict"] == "doubt" and f"without {frames[1].name}" in doubt["text"]
+
+
 def test_good_frames_of_a_small_set_are_not_blamed():
     for seed in range(5):
         frames = scene(seed, count=4, arm_mm=1.0, arm_mrad=2.0, laser=False)

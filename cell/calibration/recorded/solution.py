@@ -128,7 +128,7 @@ def solve_frames(
         plain = chosen
     result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
     result["intrinsics_without_distortion"] = intrinsics_dict(plain)
-    checks = beside + camera_checks(chosen, views, given=given is not None)
+    checks = beside + camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
     if posed:
         if len(rest) > len(posed):
             notes.append(

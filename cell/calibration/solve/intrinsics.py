@@ -76,7 +76,9 @@ class Intrinsics:
 
     `sigma` (9,) is the larger of what the residuals say and of the scatter between calibrations that lack one view.
     `formal` (9,) the former alone. `tried` has the RMS of left-out views of each lens model that was tried.
-    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations.
+    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations. `pull` (n,) is how
+    far each view moves focal lengths and principal point, over what the residuals allow (Cook's distance); empty with
+    too few views.
     """
 
     camera: CameraModel
@@ -89,6 +91,7 @@ class Intrinsics:
     model: LensModel = PLAIN
     tried: dict[str, float] = field(default_factory=dict)
     bend: Bend | None = None
+    pull: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def point_rms_px(self) -> float:
@@ -199,8 +202,15 @@ def _intrinsics(
             covariance = covariance + np.outer(moved, moved)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Intrinsics(
-        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend
+        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend,
+        np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
     )  # fmt: skip
+
+
+def _pull(camera: CameraModel, left: LeftOut, covariance: Array) -> Array:
+    """Cook's distance (n,) of each view in focal lengths and principal point."""
+    apart = np.array([other.camera.parameters[:4] - camera.parameters[:4] for other in left.states])
+    return np.asarray(np.einsum("ni,ij,nj->n", apart, np.linalg.pinv(covariance[:4, :4]), apart) / 4)
 
 
 def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
