@@ -19,7 +19,7 @@ from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
 from cell.geometry.camera import CameraModel
-from cell.vision import parse_board
+from cell.vision import Laser, parse_board
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -86,7 +86,7 @@ def pictures(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def seen(pictures) -> dict[str, RecordedFrame]:
-    frames = read_frames(list_folder(pictures), BOARD)
+    frames, _ = read_frames(list_folder(pictures), BOARD)
     assert all(f.reason is None for f in frames), [f.text for f in frames]
     return {f.name: f for f in frames}
 
@@ -232,9 +232,9 @@ def test_two_fields_that_both_agree_are_asked_for(recording, seen):
     ]
     (recording / "both.json").write_text(json.dumps(both))
     frames, understood, _ = understand(recording, seen)
-    assert "--pose-field" in understood.notes[0]
+    assert "--pose-field" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
-    (name,) = [w.rstrip(";,") for w in understood.notes[0].split() if w.startswith("both.json") and "flange" in w]
+    (name,) = [w.rstrip(";,") for w in understood.refused.split() if w.startswith("both.json") and "flange" in w]
     frames, understood, _ = understand(recording, seen, pose_field=name)
     assert np.abs(frames[0].base_from_flange.homogeneous - POSES[0]).max() < 1e-6
     with pytest.raises(ConfigError, match="no such poses"):
@@ -244,13 +244,13 @@ def test_two_fields_that_both_agree_are_asked_for(recording, seen):
 def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
     tuples(recording)
     _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
-    assert "no reading of the poses agrees" in understood.notes[0]
+    assert "no reading of the poses agrees" in understood.refused
 
 
 def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
     one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], 1.25 * p[:3, 3]], p[3:]]).ravel()))
     frames, understood, _ = understand(recording, seen)
-    assert "25.0" in understood.notes[0]
+    assert "25.0" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
 
 
@@ -258,7 +258,7 @@ def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):
     for k, pose in enumerate(POSES[::-1]):
         (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
     _, understood, _ = understand(recording, seen)
-    assert "are they the poses of these pictures" in understood.notes[0]
+    assert "are they the poses of these pictures" in understood.refused
 
 
 def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
@@ -349,7 +349,7 @@ def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
         across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
         dark += 180 * np.exp(-0.5 * (across / 2.0) ** 2)
         cv2.imwrite(str(tmp_path / "laser" / f"{int(path.stem[-2:])}.png"), np.clip(dark, 0, 255).astype(np.uint8))
-    frames = read_frames(list_folder(tmp_path), BOARD)
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
     assert [(f.name, f.stripe_from) for f in frames if f.reason is None] == [
         ("board_03.png", "laser/3.png"),
         ("board_04.png", "laser/4.png"),
@@ -357,3 +357,47 @@ def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):
     rows = frames[0].profile.rows
     assert np.abs(frames[0].profile.centres[rows] - (300 + 0.1 * rows)).max() < 0.2
     assert [f.reason.value for f in frames if f.reason is not None] == ["laser_picture"] * 2
+
+
+def lit(image: np.ndarray, red: float) -> np.ndarray:
+    """A picture (h, w) with a red laser line on it, in colour, blue first; on white it is as bright as the paper."""
+    across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+    stripe = np.exp(-0.5 * (across / 2.0) ** 2)
+    colour = np.repeat(image[:, :, None].astype(float), 3, axis=2)
+    colour[:, :, 2] += red * stripe
+    colour[:, :, :2] -= 0.35 * red * stripe[:, :, None]
+    return np.clip(np.rint(colour + np.random.default_rng(5).normal(0, 1, colour.shape)), 0, 255).astype(np.uint8)
+
+
+def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(tmp_path, pictures):
+    for path in sorted(pictures.iterdir())[:3]:
+        cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
+    frames, channel = read_frames(list_folder(tmp_path), BOARD)
+    assert channel.chosen is not Laser.GREY
+    assert sum(channel.votes.values()) == 3
+    for frame in frames:
+        assert frame.profile is not None, frame.stripe_text
+        rows = frame.profile.rows
+        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3
+    in_grey, _ = read_frames(list_folder(tmp_path), BOARD, laser=Laser.GREY)
+    for frame in in_grey:
+        if frame.profile is not None:
+            rows = frame.profile.rows
+            assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 2.0
+
+
+def test_the_picture_without_the_laser_is_taken_off(tmp_path, pictures):
+    for path in sorted(pictures.iterdir())[:2]:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8
+        cv2.imwrite(str(tmp_path / f"{path.stem[-2:]}_off.png"), image)
+        cv2.imwrite(str(tmp_path / f"{path.stem[-2:]}_on.png"), lit(image, 40).max(axis=2))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
+    used = [f for f in frames if f.reason is None]
+    assert [(f.name, f.stripe_from, f.stripe_off) for f in used] == [
+        ("03_off.png", "03_on.png", "03_off.png"),
+        ("04_off.png", "04_on.png", "04_off.png"),
+    ]
+    for frame in used:
+        rows = frame.profile.rows
+        assert len(rows) > 200
+        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from cell.lab.bench.stripe_profiles import measure, within_limits
 from cell.lab.bench.stripe_workshop import Scene, draw
-from cell.vision import Laser, Mark, read_colours, read_stripe
+from cell.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
 from cell.vision.stripe.extract import extract
 from cell.vision.stripe.planes import as_picture, range_of
 from cell.vision.stripe.stream import StripeStream
@@ -158,3 +158,33 @@ def test_an_unknown_laser_and_channels_are_named():
         extract(np.zeros((64, 64), np.uint8), laser="violet")
     with pytest.raises(ValueError, match="2 channels"):
         extract(np.zeros((64, 64, 2), np.uint8))
+
+
+def test_a_faint_line_beside_another_is_refused_until_the_laser_stands_out():
+    """A grey picture in which a fold of paper is as clear as the laser; in colour, or without the fold, it is sure."""
+    row, column = np.mgrid[:240, :320]
+    noise = np.random.default_rng(3).normal(0, 3, (240, 320, 3))
+    laser = 10 * np.exp(-0.5 * ((column - 100 - 0.1 * row) / 2) ** 2)
+    fold = 10 * np.exp(-0.5 * ((column - 220 + 0.1 * row) / 2) ** 2)
+    colour = 60 + noise + fold[:, :, None] + laser[:, :, None] * (3.0, 0.0, 0.0)
+    colour = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+    grey = np.clip(np.rint(60 + noise[:, :, 0] + fold + laser), 0, 255).astype(np.uint8)
+    with pytest.raises(PictureRefused, match=r"which line is the laser's is not sure.*laser off"):
+        read_stripe(grey)
+    off = np.clip(np.rint(60 + noise[:, :, 1] + fold), 0, 255).astype(np.uint8)
+    for seen in (read_stripe(colour), read_stripe(grey, off)):
+        assert seen is not None
+        assert np.nanmedian(np.abs(seen.centres - 100 - 0.1 * np.arange(240))) < 0.5
+
+
+def test_colours_are_turned_as_the_picture_says(tmp_path):
+    """A camera that stands on its side says so in the EXIF; a board is looked for in the turned picture."""
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[:, :10, 2] = 200
+    _, data = cv2.imencode(".jpg", image)
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    turned = data.tobytes()[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data.tobytes()[2:]
+    (tmp_path / "side.jpg").write_bytes(turned)
+    seen = read_colours(tmp_path / "side.jpg")
+    assert seen.shape == (60, 40, 3) == (*read_picture(tmp_path / "side.jpg").shape, 3)
+    assert seen[5, 20, 0] > 150 > 50 > seen[40, 20, 0]

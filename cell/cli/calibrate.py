@@ -21,6 +21,7 @@ from cell.cli.options import (
 
 if TYPE_CHECKING:
     from cell.calibration.recorded.attach import Options
+    from cell.vision import Laser
 
 
 def register(app: typer.Typer) -> None:
@@ -69,6 +70,13 @@ def calibrate(
             "the arm has no say in it.",
         ),
     ] = None,
+    laser: Annotated[
+        str | None,
+        typer.Option(
+            "--laser",
+            help="The laser's colour: red, green, blue, grey; or auto: the pictures tell, which is the default.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
@@ -80,7 +88,7 @@ def calibrate(
     from drivers.errors import ConfigError
 
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
-    given["--camera"] = camera
+    given |= {"--camera": camera, "--laser": laser}
     if source is None:
         for name, value in given.items():
             if value:
@@ -90,7 +98,7 @@ def calibrate(
         from cell.calibration.recorded.known_camera import read_camera
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
-        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures")
+        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures", _laser(laser))
         _from_folder(source, board, options, json)
         return
     from cell.calibration.archive import read_archive
@@ -120,6 +128,16 @@ def _setup(text: str | None) -> str | None:
     if text not in (None, "eye-in-hand", "eye-to-hand"):
         raise ConfigError(f"--setup {text}: allowed are eye-in-hand and eye-to-hand")
     return None if text is None else text.replace("-", "_")
+
+
+def _laser(text: str | None) -> Laser:
+    from cell.vision import Laser
+    from drivers.errors import ConfigError
+
+    allowed = ("red", "green", "blue", "grey", "auto")
+    if text not in (None, *allowed):
+        raise ConfigError(f"--laser {text}: allowed are {', '.join(allowed)}")
+    return Laser(text or "auto")
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool) -> None:

@@ -54,6 +54,19 @@ def print_recorded(result: Mapping[str, Any]) -> None:
 
 
 def _print_understood(console: Console, result: Mapping[str, Any]) -> None:
+    laser = result["laser"]
+    if laser is not None and any(frame["stripe"] or frame["stripe_text"] for frame in result["frames"]):
+        text = f"laser: read in {laser['channel']}"
+        if laser["asked"] == "auto":
+            votes = ", ".join(f"{name} in {count}" for name, count in laser["votes"].items()) or "in none"
+            text += f"; of {laser['looked']} pictures looked at it stands out best: {votes}"
+        console.print(text, markup=False, soft_wrap=True)
+    names = {"second_line": "a second line", "reflection": "a reflection"}
+    for key, name in names.items():
+        counts = {f["name"]: f["stripe_left_out"].get(key, 0) for f in result["frames"]}
+        if any(counts.values()):
+            parts = ", ".join(f"{count} in {frame}" for frame, count in counts.items() if count)
+            console.print(f"points not used for {name} beside them: {parts}", markup=False, soft_wrap=True)
     poses = result["poses"]
     if poses is not None and poses.get("reading") is not None:
         chosen = "as given" if "poses" in poses["given"] else "chosen by the pictures"

@@ -15,6 +15,7 @@ from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
 from cell.vision.pictures import PictureRefused, Reason
+from cell.vision.stripe.planes import Laser
 from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES = 3
@@ -27,7 +28,7 @@ class Options:
 
     `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
     eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
-    `hold_camera` the arm has no say in it.
+    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read.
     """
 
     poses: str | None = None
@@ -36,6 +37,7 @@ class Options:
     plan: bool = False
     camera: CameraModel | None = None
     hold_camera: bool = False
+    laser: Laser = Laser.AUTO
 
 
 @dataclass

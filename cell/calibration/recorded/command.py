@@ -15,7 +15,7 @@ from cell.calibration.recorded.conventions import check_reading
 from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.pairs import calibrate_pairs
-from cell.calibration.recorded.result import empty_result, frame_dict
+from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, match_series, read_series
 from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
 from cell.calibration.solve.intrinsics import Intrinsics
@@ -30,6 +30,9 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
 
     - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `pose_from`, `stripe`,
       `stripe_from`;
+    - `laser`: `asked`, the `channel` in which the stripe was read, and `votes`: of the pictures `looked` at, how many
+      show it best in which mix of colours; of a frame `stripe_off`, the picture without the laser, `stripe_text`, why
+      its line is not taken, and `stripe_left_out`, points with a `second_line` or a `reflection`, which are not used;
     - `poses`: how the flange poses were read: `source`, `reading`, `unit`, `setup`, `matched_by`, `evidence`;
     - `unread`: `name` and `reason` of each file that was not understood;
     - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
@@ -58,13 +61,23 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
         return calibrate_pairs(pairs)
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
-    frames = read_frames(listing, spec, links)
+    frames, channel = read_frames(listing, spec, links, options.laser)
     result = empty_result(spec)
+    result["laser"] = channel_dict(channel)
+    result["notes"] += _doubtful_lines(frames)
     result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
     _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
+
+
+def _doubtful_lines(frames: list[RecordedFrame]) -> list[str]:
+    """Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all."""
+    texts = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
+    if len(texts) < 2 or any(f.profile is not None for f in frames):
+        return texts
+    return [f"no picture shows a stripe for certain, {len(texts)} show a line that may be one; {texts[0]}"]
 
 
 def _from_frames(

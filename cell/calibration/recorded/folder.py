@@ -1,6 +1,7 @@
 """Recorded frames: pictures with the board and the stripe in each, the flange pose, and why one is not used.
 
 The stripe may be in the picture of the board or in a second one, taken at the same place with the laser on.
+How it is read is the business of `stripes.py`.
 """
 
 from __future__ import annotations
@@ -10,33 +11,24 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from cell.calibration.recorded.listing import PICTURES, Listing
 from cell.calibration.recorded.matching import frame_key
+from cell.calibration.recorded.stripes import Channel, ReadStripe, Source, choose_channel, read_on_board
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_matrix
 from cell.vision.board.board import find_board
 from cell.vision.board.spec import BoardSpec
 from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason, read_picture
-from cell.vision.stripe.extract import StripeProfile, extract
+from cell.vision.pictures import PictureRefused, Reason, read_picture
+from cell.vision.stripe.extract import Laser, StripeProfile
 from drivers.errors import ConfigError
 
-# A laser stripe is brighter than the board's white, and runs on from row to row.
-LASER_OVER_WHITE = 1.2
-LEAST_SMOOTH_ROWS = 30
-LEAST_SMOOTH_SHARE = 0.05
-# What is flat with the board reaches about so many pitches beyond its outermost points. There the stripe is straight,
-# to so many px but for a lens, in so many of its rows.
-AROUND = 5.0
-STRAIGHT_PX, LEAST_STRAIGHT = 3.0, 0.6
 # Two pictures show the board at one place when its points differ by no more than this.
 SAME_PLACE_PX = 2.0
 LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
@@ -46,7 +38,9 @@ LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
 class RecordedFrame:
     """One picture of a folder: what is seen in it, its pose, or `reason` and `text` why it is not used.
 
-    `name` is below the folder; `pose_from` the file of the pose, `stripe_from` that of a second picture with the laser.
+    `name` is below the folder; `pose_from` the file of the pose, `stripe_from` that of a second picture with the laser,
+    `stripe_off` that of the picture without it that was taken off. `stripe_text` says why a line is not believed;
+    `stripe_left_out` how many points on the board are marked, by the mark.
     """
 
     path: Path
@@ -58,14 +52,19 @@ class RecordedFrame:
     text: str = ""
     pose_from: str = ""
     stripe_from: str = ""
+    stripe_off: str = ""
+    stripe_text: str = ""
+    stripe_left_out: dict[str, int] = field(default_factory=dict)
 
     def refuse(self, reason: Reason, text: str) -> None:
         """Set the frame aside."""
         self.reason, self.text = reason, text
 
 
-def read_frames(listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = ()) -> list[RecordedFrame]:
-    """Every picture of a listing, with board and stripe, or refused with a reason.
+def read_frames(
+    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (), laser: Laser = Laser.AUTO
+) -> tuple[list[RecordedFrame], Channel]:
+    """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
     `links` are pictures that a table names together. Raises ConfigError when there are no pictures.
     """
@@ -75,7 +74,7 @@ def read_frames(listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str
     seen: dict[str, str] = {}
     for frame in frames:
         try:
-            frame.view, frame.profile = _look(frame.path, spec)
+            frame.view = find_board(read_picture(frame.path), spec)
         except PictureRefused as refused:
             frame.refuse(refused.reason, str(refused))
         if frame.reason not in (Reason.UNREADABLE, Reason.CUT):
@@ -84,14 +83,7 @@ def read_frames(listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str
                 frame.refuse(Reason.DUPLICATE, f"the same file as {seen[digest]}")
             seen.setdefault(digest, frame.name)
     _refuse_other_sizes(frames)
-    _join_pairs(frames, links)
-    return frames
-
-
-def _look(path: Path, spec: BoardSpec) -> tuple[BoardView, StripeProfile | None]:
-    image = read_picture(path)
-    view = find_board(image, spec)
-    return view, find_stripe(image, view)
+    return frames, _read_stripes(frames, _pairs(frames, links), laser)
 
 
 def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
@@ -109,29 +101,52 @@ def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
             )
 
 
-def _join_pairs(frames: list[RecordedFrame], links: Sequence[dict[str, str]]) -> None:
-    """Take the stripe of a board's picture from its second picture, and set second pictures of one frame aside."""
+def _pairs(frames: list[RecordedFrame], links: Sequence[dict[str, str]]) -> list[tuple[RecordedFrame, RecordedFrame]]:
+    """Pictures of one place: that of the board, and a second one that may show the laser."""
     by_key: dict[str, list[RecordedFrame]] = {}
     for frame in frames:
         if frame.reason is not Reason.DUPLICATE:
             by_key.setdefault(frame_key(frame.name), []).append(frame)
-    pairs = [group for key, group in by_key.items() if key and len(group) == 2] + _linked(frames, links)
-    for group in pairs:
+    pairs = []
+    for group in [group for key, group in by_key.items() if key and len(group) == 2] + _linked(frames, links):
         board, second = _roles(group)
-        if board.view is None or board.reason is not None:
+        usable = board.view is not None and board.reason is None
+        unreadable = second.reason in (Reason.UNREADABLE, Reason.CUT)
+        if not usable or unreadable or _apart(board.view, second.view) > SAME_PLACE_PX:
             continue
-        profile, named = second.profile, LASER_WORDS.search(second.name.lower()) is not None
-        if second.view is not None:
-            if _apart(board.view, second.view) > SAME_PLACE_PX:
-                continue
-            if second.profile is None or not named:
-                second.refuse(Reason.DUPLICATE, f"it shows what {board.name} shows")
-                continue
-        else:
-            profile = _stripe_of(second.path, board.view)
-        if profile is not None and (named or board.profile is None):
-            board.profile, board.stripe_from = profile, second.name
+        pairs.append((board, second))
+    return pairs
+
+
+def _read_stripes(
+    frames: list[RecordedFrame], pairs: Sequence[tuple[RecordedFrame, RecordedFrame]], laser: Laser
+) -> Channel:
+    """Read the stripe of each board in its own picture or in its second one, and set the second ones aside."""
+    sources = [Source(second.path, board.view, board.path) for board, second in pairs if board.view is not None]
+    paired = {id(frame) for pair in pairs for frame in pair}
+    own = [f for f in frames if f.view is not None and f.reason is None]
+    channel = choose_channel(
+        sources + [Source(f.path, f.view) for f in own if id(f) not in paired and f.view is not None], laser
+    )
+    for (board, second), source in zip(pairs, sources, strict=True):
+        named = LASER_WORDS.search(second.name.lower()) is not None
+        read = read_on_board(source, channel)
+        mine = None if named or board.view is None else read_on_board(Source(board.path, board.view), channel)
+        alike = second.view is not None
+        if read.profile is not None and (named or (not alike and (mine is None or mine.profile is None))):
+            _take(board, read)
+            board.stripe_from, board.stripe_off = second.name, board.name if read.off else ""
             second.refuse(Reason.LASER_PICTURE, f"the laser's picture of {board.name}")
+        elif alike:
+            second.refuse(Reason.DUPLICATE, f"it shows what {board.name} shows")
+    for frame in own:
+        if frame.reason is None and frame.profile is None and frame.view is not None:
+            _take(frame, read_on_board(Source(frame.path, frame.view), channel))
+    return channel
+
+
+def _take(frame: RecordedFrame, read: ReadStripe) -> None:
+    frame.profile, frame.stripe_text, frame.stripe_left_out = read.profile, read.text, read.left_out
 
 
 def _linked(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[list[RecordedFrame]]:
@@ -159,8 +174,10 @@ def _roles(group: Sequence[RecordedFrame]) -> tuple[RecordedFrame, RecordedFrame
     return first, second
 
 
-def _apart(a: BoardView, b: BoardView) -> float:
-    """Median distance in px of the same points of two views; infinite for other sizes."""
+def _apart(a: BoardView | None, b: BoardView | None) -> float:
+    """Median distance in px of the same points of two views; infinite for other sizes, 0 where one is not seen."""
+    if a is None or b is None:
+        return 0.0
     if a.size != b.size:
         return float("inf")
     best = float("inf")
@@ -169,61 +186,6 @@ def _apart(a: BoardView, b: BoardView) -> float:
         if len(here):
             best = min(best, float(np.median(np.linalg.norm(a.pixels[here] - turned.pixels[there], axis=1))))
     return best
-
-
-def _stripe_of(path: Path, view: BoardView) -> StripeProfile | None:
-    try:
-        image = read_picture(path)
-    except PictureRefused:
-        return None
-    return find_stripe(image, view) if (image.shape[1], image.shape[0]) == view.size else None
-
-
-def find_stripe(image: Image, view: BoardView) -> StripeProfile | None:
-    """The laser stripe on the board of a picture, along rows or columns; None when no laser is on the board."""
-    low, high = np.clip(view.pixels.min(axis=0), 0, None).astype(int), view.pixels.max(axis=0).astype(int) + 1
-    white = float(np.percentile(image[low[1] : high[1], low[0] : high[0]], 75))
-    board = _sheet(image, view)
-    best: tuple[int, StripeProfile] | None = None
-    for axis in ("rows", "columns"):
-        profile = extract(image, axis="rows" if axis == "rows" else "columns")
-        if len(profile.rows) < LEAST_SMOOTH_ROWS:
-            continue
-        # Where, on the board, three neighbouring rows have centres on a line, within a pixel.
-        at = np.round(profile.pixels()).astype(int)
-        lit = board[at[:, 1], at[:, 0]] > 0
-        on_board = np.zeros(len(profile.centres), dtype=np.bool_)
-        on_board[profile.rows[lit]] = True
-        follows = np.zeros(len(on_board), dtype=np.bool_)
-        follows[1:-1] = (np.abs(np.diff(profile.centres, 2)) < 1.0) & on_board[1:-1]
-        smooth = _straight(profile.centres, follows)
-        level = float(np.median(image[at[lit, 1], at[lit, 0]])) if lit.any() else 0.0
-        enough = smooth > max(LEAST_SMOOTH_ROWS, LEAST_SMOOTH_SHARE * len(profile.centres))
-        if enough and level > min(LASER_OVER_WHITE * white + 5, 250) and (best is None or smooth > best[0]):
-            best = smooth, profile
-    return None if best is None else best[1]
-
-
-def _straight(centres: Array, follows: NDArray[np.bool_]) -> int:
-    """How many of the rows (n,) that follow their neighbours lie on one line; 0 where that is not most of them."""
-    rows = np.flatnonzero(follows)
-    if len(rows) < LEAST_SMOOTH_ROWS:
-        return 0
-    points = np.column_stack([rows, centres[rows]]).astype(np.float32)
-    dx, dy, x, y = cv2.fitLine(points, cv2.DIST_WELSCH, 0, 0.01, 0.01).ravel()
-    near = int((np.abs((points[:, 0] - x) * dy - (points[:, 1] - y) * dx) < STRAIGHT_PX).sum())
-    return near if near > LEAST_STRAIGHT * len(rows) else 0
-
-
-def _sheet(image: Image, view: BoardView) -> Image:
-    """Mask (h, w) of the board with what is around its points: outer squares and margin."""
-    flat = view.object_points[:, :2] / view.spec.pitch
-    homography, _ = cv2.findHomography(flat, view.pixels)
-    mask = np.zeros(image.shape, np.uint8)
-    (x0, y0), (x1, y1) = flat.min(axis=0) - AROUND, flat.max(axis=0) + AROUND
-    corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], dtype=np.float64)
-    cv2.fillConvexPoly(mask, np.round(cv2.perspectiveTransform(corners, homography)[0]).astype(np.int32), 1)
-    return mask
 
 
 def read_pose_pairs(folder: Path) -> list[tuple[pin.SE3, pin.SE3]]:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.stripes import Channel
 from cell.calibration.solve.flatness import Flatness
 from cell.calibration.solve.hand_eye import HandEye
 from cell.calibration.solve.intrinsics import Intrinsics
@@ -32,6 +33,7 @@ def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
     return {
         "board": None if spec is None else spec.name,
         "frames": [],
+        "laser": None,
         "poses": None,
         "unread": [],
         "frames_rms": {},
@@ -56,7 +58,20 @@ def frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
         "pose_from": frame.pose_from or None,
         "stripe": frame.profile is not None,
         "stripe_from": frame.stripe_from or None,
+        "stripe_off": frame.stripe_off or None,
+        "stripe_text": frame.stripe_text,
+        "stripe_left_out": frame.stripe_left_out,
         "order_assumed": frame.view is not None and frame.view.order_assumed,
+    }
+
+
+def channel_dict(channel: Channel) -> dict[str, Any]:
+    """In what the laser was read, and what spoke for it."""
+    return {
+        "asked": str(channel.asked),
+        "channel": str(channel.chosen),
+        "looked": channel.looked,
+        "votes": channel.votes,
     }
 
 

@@ -29,6 +29,11 @@ class Laser(StrEnum):
     GREEN = "green"
     BLUE = "blue"
     GREY = "grey"
+    RED_OVER_OTHERS = "red over green and blue"
+    GREEN_OVER_OTHERS = "green over red and blue"
+    BLUE_OVER_OTHERS = "blue over red and green"
+    GREEN_OVER_RED = "green over red"
+    RED_OVER_GREEN = "red over green"
 
 
 MIXES: dict[str, tuple[float, float, float]] = {
@@ -82,7 +87,8 @@ def read_colours(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
 
     Raises `PictureRefused` for a file that is no picture.
     """
-    image: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    # Unlike IMREAD_UNCHANGED these turn a picture as its EXIF says, as whoever looks for a board in it does.
+    image: Any = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise PictureRefused(Reason.UNREADABLE, f"{path.name} is no picture of 8 or 16 bits; give a PNG, JPEG or TIFF")
     if image.ndim == 2:

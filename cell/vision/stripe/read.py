@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.vision.stripe.careful import LEAST_SCORE, choose_mix, coarse
+from cell.vision.stripe.careful import LEAST_SCORE, Look, choose_mix, coarse
 from cell.vision.stripe.extract import Axis, Laser, StripeProfile, StripeSettings, extract, subtracted
+from cell.vision.stripe.sureness import refuse_unsure
 
 LEAST_POINTS = 30
 
@@ -16,19 +17,21 @@ def read_stripe(
     """The stripe of `image` (h, w), (h, w, 3) or (h, w, 4), red first, along rows or columns, whichever it follows.
 
     `off` is a picture of the same view without the laser, `laser` the channel to read it in. None where no line of
-    LEAST_POINTS points is found. Raises what `extract` raises.
+    LEAST_POINTS points is found. Raises what `extract` raises, and PictureRefused where it is not sure which line is
+    the laser's.
     """
     settings, laser = settings or StripeSettings(), Laser(laser)
     picture, dark = subtracted(image, off, settings)
-    scores: dict[Axis, float] = {}
+    looks: dict[Axis, tuple[Look, str]] = {}
     for axis in ("rows", "columns"):
         part = picture if axis == "rows" else picture.turned()
         shade = None if dark is None else (dark if axis == "rows" else dark.turned())
         mix = choose_mix(part, shade, laser)
         value = part.plane(mix)[0] if shade is None else part.plane(mix)[0] - shade.plane(mix)[0]
-        scores["rows" if axis == "rows" else "columns"] = coarse(value).chain.score
-    best = max(scores, key=lambda axis: scores[axis])
-    if scores[best] < LEAST_SCORE:
+        looks["rows" if axis == "rows" else "columns"] = coarse(value), mix
+    best = max(looks, key=lambda axis: looks[axis][0].chain.score)
+    if looks[best][0].chain.score < LEAST_SCORE:
         return None
+    refuse_unsure(*looks[best])
     profile = extract(image, off, best, settings, laser=laser)
     return profile if len(profile.rows) >= LEAST_POINTS else None

@@ -1,0 +1,215 @@
+"""The laser stripe on the board of recorded pictures: in colour or grey, with a picture without the laser or not.
+
+One laser made all pictures of a recording: what it stands out in is chosen from all of them together. A line that may
+be the board's own pattern is not taken.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.geometry.camera import Array
+from cell.vision.board.view import BoardView
+from cell.vision.pictures import PictureRefused
+from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
+from cell.vision.stripe.planes import Picture, read_colours
+
+Shot = NDArray[np.uint8] | NDArray[np.uint16]
+
+LOOKED_AT = 8
+"""Pictures, spread over a recording, that say in what the laser stands out."""
+# A laser stripe is brighter than the board's white, and runs on from row to row.
+LASER_OVER_WHITE, OVER_DN = 1.2, 5.0
+LEAST_SMOOTH_ROWS = 30
+LEAST_SMOOTH_SHARE = 0.05
+# What is flat with the board reaches about so many pitches beyond its outermost points. There the stripe is straight,
+# to so many px but for a lens, in so many of its rows.
+AROUND = 5.0
+STRAIGHT_PX, LEAST_STRAIGHT = 3.0, 0.6
+MOST_MARKED = 0.5
+CALMER = 0.5
+"""A picture without the laser is taken off where it leaves no more than this share of what varies on the board."""
+NEXT = "Take colour pictures, or a second one of each view with the laser off (NAME_on, NAME_off), or name the --laser"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a stripe may be: a picture, the board `view` of its place, and the file of a picture without the laser."""
+
+    path: Path
+    view: BoardView
+    off: Path | None = None
+
+
+@dataclass(frozen=True)
+class ReadStripe:
+    """The stripe on a board, or None and, where there is a line, the `text` why it is not believed.
+
+    `left_out`: points on the board that a mark tells not to trust, by the mark; they are not in the profile. `off`:
+    a picture without the laser was taken off. `points` on the board run on from row to row.
+    """
+
+    profile: StripeProfile | None = None
+    text: str = ""
+    left_out: dict[str, int] = field(default_factory=dict)
+    off: bool = False
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Channel:
+    """In what the laser is read: what was `asked`, what was `chosen`, and how many of the pictures that were
+    `looked` at stood out in each mix of colours."""
+
+    asked: Laser
+    chosen: Laser
+    looked: int = 0
+    votes: dict[str, int] = field(default_factory=dict)
+    reads: dict[Path, ReadStripe] = field(default_factory=dict)
+    """What was read in it already, by the picture."""
+
+
+def choose_channel(sources: Sequence[Source], laser: Laser) -> Channel:
+    """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
+
+    Where none of them shows it, the others are read in grey.
+    """
+    if laser is not Laser.AUTO or not sources:
+        return Channel(laser, laser)
+    some = [sources[k] for k in np.unique(np.linspace(0, len(sources) - 1, LOOKED_AT).astype(int))]
+    reads = {source.path: read_on_board(source, Channel(laser, laser)) for source in some}
+    votes = Counter(_mix(read.profile) for read in reads.values() if read.profile is not None)
+    if not votes:
+        # Most such recordings are of the board alone; to look for a line in every mix of colours takes seconds each.
+        return Channel(laser, Laser.GREY, len(some), {}, reads)
+    chosen = votes.most_common(1)[0][0]
+    again = {path: read for path, read in reads.items() if read.profile is not None and _mix(read.profile) == chosen}
+    return Channel(laser, Laser(chosen), len(some), dict(votes.most_common()), again)
+
+
+def _mix(profile: StripeProfile) -> str:
+    return profile.learned.mix if profile.learned is not None else "grey"
+
+
+def read_on_board(source: Source, channel: Channel) -> ReadStripe:
+    """The stripe on the board of a picture, along rows or columns, whichever shows more of it."""
+    if source.path in channel.reads:
+        return channel.reads[source.path]
+    try:
+        image = read_colours(source.path)
+    except PictureRefused:
+        return ReadStripe()
+    if (image.shape[1], image.shape[0]) != source.view.size:
+        return ReadStripe()
+    sheet = _sheet(source.view)
+    off = None if source.off is None else _calming(image, source.off, sheet)
+    found = []
+    for axis in ("rows", "columns"):
+        try:
+            profile = extract(image, off, "rows" if axis == "rows" else "columns", laser=channel.chosen)
+        except PictureRefused as refused:
+            return ReadStripe(text=str(refused))
+        found.append(_on_board(profile, *subtracted(image, off, StripeSettings()), source.view, sheet))
+    sure = [f for f in found if f.profile is not None] or found
+    return replace(max(sure, key=lambda f: f.points), off=off is not None)
+
+
+def _on_board(
+    profile: StripeProfile, picture: Picture, off: Picture | None, view: BoardView, sheet: NDArray[np.bool_]
+) -> ReadStripe:
+    """A profile of which enough lies on the board in a line that is brighter than the board."""
+    if len(profile.rows) < LEAST_SMOOTH_ROWS:
+        return ReadStripe()
+    # Where, on the board, three neighbouring rows have centres on a line, within a pixel.
+    at = np.clip(np.round(profile.pixels()).astype(int), 0, np.array(view.size) - 1)
+    lit = sheet[at[:, 1], at[:, 0]]
+    on_board = np.zeros(len(profile.centres), dtype=np.bool_)
+    on_board[profile.rows[lit]] = True
+    follows = np.zeros(len(on_board), dtype=np.bool_)
+    follows[1:-1] = (np.abs(np.diff(profile.centres, 2)) < 1.0) & on_board[1:-1]
+    smooth = _straight(profile.centres, follows)
+    if smooth <= max(LEAST_SMOOTH_ROWS, LEAST_SMOOTH_SHARE * len(profile.centres)):
+        return ReadStripe(points=smooth)
+    mix = _mix(profile)
+    plane = picture.plane(mix)[0] if off is None else picture.plane(mix)[0] - off.plane(mix)[0]
+    level = float(np.median(plane[at[lit, 1], at[lit, 0]]))
+    white = _white(plane, view)
+    needed = min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, 250.0)
+    if level <= needed:
+        text = (
+            f"a line of {smooth} points lies on the board, but at {level:.0f} DN it is not clearly brighter than the "
+            f"board's white with {white:.0f} DN (in {mix}; needed is {needed:.0f}): it may be the board's own. {NEXT}"
+        )
+        return ReadStripe(None, text, points=smooth)
+    return _without_marked(profile, on_board, smooth)
+
+
+def _without_marked(profile: StripeProfile, on_board: NDArray[np.bool_], smooth: int) -> ReadStripe:
+    """The profile without points that a second line or a reflection may have moved; None where no line is left.
+
+    A mark of most points tells nothing of single ones: faint light all along a stripe is its halo, and they stay.
+    """
+    marks = profile.marks
+    second, faint = ((marks & np.uint8(mark)) > 0 for mark in (Mark.SECOND_LINE, Mark.REFLECTION))
+    rest = on_board & ~second
+    if (faint & rest).sum() > MOST_MARKED * rest.sum():
+        faint = np.zeros_like(faint)
+    keep = ~(second | faint)
+    left_out = {"second_line": int((second & on_board).sum()), "reflection": int((faint & rest).sum())}
+    whole, left = int(on_board.sum()), int((on_board & keep).sum())
+    if left_out["second_line"] > MOST_MARKED * whole or left < LEAST_SMOOTH_ROWS:
+        text = (
+            f"of the {whole} points of a line on the board {left_out['second_line']} have a second line beside them "
+            f"(allowed {MOST_MARKED:.0%}), {left} have neither that nor a reflection (needed {LEAST_SMOOTH_ROWS}): "
+            f"which line is the laser's is not sure. {NEXT}"
+        )
+        return ReadStripe(None, text, left_out, points=smooth)
+    return ReadStripe(replace(profile, centres=np.where(keep, profile.centres, np.nan)), "", left_out, points=smooth)
+
+
+def _white(plane: NDArray[np.float32], view: BoardView) -> float:
+    """What the board's white is in a plane, in DN."""
+    low, high = np.clip(view.pixels.min(axis=0), 0, None).astype(int), view.pixels.max(axis=0).astype(int) + 1
+    return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
+
+
+def _calming(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> Shot | None:
+    """The picture without the laser, if it is of the same exposure: if the board vanishes when it is taken off."""
+    try:
+        off = read_colours(path)
+    except PictureRefused:
+        return None
+    if off.shape[:2] != image.shape[:2] or off.dtype != image.dtype:
+        return None
+    lit, dark = (picture.mean(axis=2) if picture.ndim == 3 else picture.astype(float) for picture in (image, off))
+    before, after = (np.percentile(part[sheet], (10, 90)) for part in (lit, lit - dark))
+    return off if np.ptp(after) < CALMER * np.ptp(before) else None
+
+
+def _straight(centres: Array, follows: NDArray[np.bool_]) -> int:
+    """How many of the rows (n,) that follow their neighbours lie on one line; 0 where that is not most of them."""
+    rows = np.flatnonzero(follows)
+    if len(rows) < LEAST_SMOOTH_ROWS:
+        return 0
+    points = np.column_stack([rows, centres[rows]]).astype(np.float32)
+    dx, dy, x, y = cv2.fitLine(points, cv2.DIST_WELSCH, 0, 0.01, 0.01).ravel()
+    near = int((np.abs((points[:, 0] - x) * dy - (points[:, 1] - y) * dx) < STRAIGHT_PX).sum())
+    return near if near > LEAST_STRAIGHT * len(rows) else 0
+
+
+def _sheet(view: BoardView) -> NDArray[np.bool_]:
+    """Mask (h, w) of the board with what is around its points: outer squares and margin."""
+    flat = view.object_points[:, :2] / view.spec.pitch
+    homography, _ = cv2.findHomography(flat, view.pixels)
+    mask = np.zeros(view.size[::-1], np.uint8)
+    (x0, y0), (x1, y1) = flat.min(axis=0) - AROUND, flat.max(axis=0) + AROUND
+    corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], dtype=np.float64)
+    cv2.fillConvexPoly(mask, np.round(cv2.perspectiveTransform(corners, homography)[0]).astype(np.int32), 1)
+    return mask > 0
