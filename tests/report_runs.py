@@ -192,8 +192,9 @@ def with_few_lines(record: JobRecord, lines: int) -> JobRecord:
     sweep = record.results["laser_sweep"]
     short = tuple(
         replace(
-            swath, lines=swath.lines[:lines], frame_ids=swath.frame_ids[:lines], flanges=swath.flanges[:lines],
-            rail=swath.rail[:lines], line_spread=swath.line_spread[:lines],
+            swath, lines=swath.lines[:lines], frame_ids=swath.frame_ids[:lines], times=swath.times[:lines],
+            flanges=swath.flanges[:lines], rail=swath.rail[:lines],
+            line_spread=swath.line_spread[:lines],
         )
         for swath in sweep.swaths
     )  # fmt: skip

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from cell.geometry.poses import difference
-from cell.inversion import NominalSurface, Prior, Tolerance, invert_pose
+from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.inversion.rocking import LARGEST_RAD, Rocking, find_rocking, rocking_covariance, rocking_motions
 from cell.job import load_job
-from cell.reconstruction.cloud import Cloud
+from cell.reconstruction.cloud import Cloud, merge
+from cell.steps.invert_pose import Lines
+from cell.steps.invert_pose import invert_pose as step
+from cell.steps.photograph import BoardFix
+from cell.steps.reconstruct import Reconstruction
 from drivers.errors import RefusedError
 
 JOB, MESH = load_job("pot")
@@ -21,8 +28,8 @@ RATE, LINES, NOISE = 30.0, 128, 8e-6
 TIMES = np.arange(LINES) / RATE
 
 
-def scanned(roll: float, pitch: float, hz: float, seed: int = 0) -> Cloud:
-    """Lines across the pot, each displaced as the base was turned when it was taken, with noise along the normals."""
+def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarray = TIMES) -> Cloud:
+    """Lines across the pot, taken at `times`, each displaced as the base was turned then, with noise on top."""
     rng = np.random.default_rng(seed)
     low, high = NOMINAL.extent
     along = np.linspace(0.93 * low[0], 0.93 * high[0], LINES)
@@ -35,7 +42,7 @@ def scanned(roll: float, pitch: float, hz: float, seed: int = 0) -> Cloud:
         start[:, 2] -= feet.heights / np.maximum(feet.normals[:, 2], 0.2)
     points = (start + np.array([0, 0, 1.0]) * NOISE * rng.standard_normal((len(start), 1))) @ SURFACE.rotation.T
     points = (points + SURFACE.translation).reshape(LINES, 90, 3)
-    wave = np.sin(2 * np.pi * hz * TIMES + 0.7)
+    wave = np.sin(2 * np.pi * hz * times + 0.7)
     for k in range(LINES):
         turn = pin.exp3(wave[k] * np.array([roll, pitch, 0.0]))
         points[k] = (points[k] - VEHICLE.translation) @ turn.T + VEHICLE.translation
@@ -84,8 +91,39 @@ def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
         assert find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES) is None
 
 
+@pytest.mark.parametrize("slower", [1, 2, 4])
+def test_a_sweep_repeated_more_slowly_shows_the_same_frequency(slower: int) -> None:
+    times = 512.0 + slower * TIMES
+    found = find_rocking(scanned(0.0, 1e-4, 2.6, times=times), NOMINAL, SURFACE, times)
+    assert found is not None
+    assert found.hz == pytest.approx(2.6, abs=0.1)
+
+
+@pytest.mark.parametrize("pause", [0.0, 5.13, -LINES / RATE])
+def test_several_sweeps_have_a_phase_each(pause: float) -> None:
+    later = TIMES + LINES / RATE + pause
+    # With -LINES / RATE the clock begins anew.
+    clouds = [scanned(0.0, 1e-4, 4.0, 0), scanned(0.0, 1e-4, 4.0, 1, later + 0.125)]
+    found = find_rocking(merge(clouds), NOMINAL, SURFACE, np.concatenate([TIMES, later]))
+    assert found is not None
+    assert found.hz == pytest.approx(4.0, abs=0.1)
+
+
+def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
+    clouds = [scanned(0.0, 0.0, 4.0, seed) for seed in range(3)]
+    clouds = [
+        replace(c, points=c.points + up * np.array([0, 0, 1])) for c, up in zip(clouds, (0, 6e-5, 0), strict=True)
+    ]
+    times = np.concatenate([TIMES + 5.0 * k for k in range(3)])
+    assert find_rocking(merge(clouds), NOMINAL, SURFACE, times) is None
+
+
+def test_times_that_tell_no_lines_apart_tell_of_no_rocking() -> None:
+    assert find_rocking(scanned(0.0, 1e-4, 4.0), NOMINAL, SURFACE, np.zeros(LINES)) is None
+
+
 def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
-    covariance = rocking_covariance(Rocking(4.0, 1e-4), VEHICLE, SURFACE.translation)
+    covariance = rocking_covariance(Rocking(4.0, 1e-4, 3.75e-3), VEHICLE, SURFACE.translation)
     beside = float(np.linalg.norm((SURFACE.translation - VEHICLE.translation)[:2]))
     assert covariance[3, 3] == pytest.approx(0.5 * (1e-4 / beside) ** 2)
     assert covariance[2, 2] == pytest.approx(0.5 * 1e-4**2)
@@ -93,4 +131,46 @@ def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
 
 def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
     with pytest.raises(RefusedError, match=r"rocks.*Wait until it is quiet"):
-        rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD), VEHICLE, SURFACE.translation)
+        rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD, 5e-3), VEHICLE, SURFACE.translation)
+
+
+def test_a_refused_scan_stays_refused_and_both_readings_are_told() -> None:
+    with pytest.raises(RefusedError, match=r"off the nominal.*or the vehicle rocks at .* Hz.*waves of [\d.]+ mm"):
+        inverted(worn(300e-6, 8e-3, seed=1))
+
+
+def test_lands_and_ridges_are_not_taken_for_rocking() -> None:
+    for seed, length in enumerate((6e-3, 9.5e-3)):
+        cloud = worn(350e-6, length, sharp=True, seed=seed)
+        assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
+        with pytest.raises(RefusedError, match=r"^(?!.*rocks)"):
+            inverted(cloud)
+
+
+def test_where_it_is_accepted_the_note_names_the_waves_that_look_the_same() -> None:
+    (note,) = inverted(scanned(0.0, 3e-5, 4.0)).notes
+    pace = 0.93 * np.ptp(NOMINAL.extent, axis=0)[0] / (LINES - 1) * RATE
+    told = re.search(r"rocks, or the surface has waves of ([\d.]+) mm", note)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(1e3 * pace / 4.0, rel=0.05)
+
+
+def worn(height: float, length: float, *, sharp: bool = False, seed: int = 0) -> Cloud:
+    """A scan from a firm vehicle of a surface with waves, or lands with edges, that follow each other along it."""
+    cloud = scanned(0.0, 0.0, 4.0, seed)
+    wave = np.sin(2 * np.pi * ((cloud.points - SURFACE.translation) @ SURFACE.rotation[:, 0]) / length + seed)
+    up = height * ((wave > 0.3) if sharp else wave)
+    return replace(cloud, points=cloud.points + up[:, :, None] * SURFACE.rotation[:, 2])
+
+
+def inverted(cloud: Cloud) -> PlacePose:
+    """By the job's step, with a board that is where it is."""
+    base_from_board = SURFACE * JOB.surface.place_from_surface.se3().inverse() * JOB.place_from_board
+    covariance = np.diag([1e-3**2] * 3 + [5e-3**2] * 3)
+    fix = BoardFix(base_from_board, covariance, 0.1, 0.0, ())
+
+    def still(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return np.zeros((len(lines), 3, 1))
+
+    scan = Reconstruction(cloud, (), still, still)
+    return step(scan, fix, JOB, NOMINAL, np.zeros((6, 6)), Lines(TIMES, VEHICLE))

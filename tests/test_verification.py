@@ -16,6 +16,7 @@ from cell.calibration.solve.results import Quality, ScanCalibration, TargetCalib
 from cell.calibration.store import CellCalibration, nominal_camera, read_calibration, save_calibration
 from cell.calibration.verify.looks import verify
 from cell.calibration.verify.verdict import Verification
+from cell.calibration.witness import Pointing, turned
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix
@@ -276,3 +277,45 @@ def test_a_scan_calibration_reads_its_own_reference_back(calibrated):
     np.testing.assert_allclose(
         back.reference.base_from_board.homogeneous, scan.reference.base_from_board.homogeneous, atol=1e-12
     )
+
+
+JOB = load_job("pot")[0]
+EXIT = np.array([-0.035, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("angle", [0.45e-3, -0.45e-3])
+def test_a_laser_that_turned_as_its_witness_says_is_no_alarm(calibrated, angle):
+    cell, calibration = calibrated
+    before = cell.truth
+    # A plane and its reverse turn opposite ways.
+    side = np.sign(before.plane_normal @ calibration.scan.light_plane.n)
+    there = turned(LightPlane.of(side * before.plane_normal, side * before.plane_distance), EXIT, angle)
+    cell.truth = replace(before, plane_normal=there.n, plane_distance=there.distance)
+    try:
+        seen = look_again(cell, calibration)
+    finally:
+        cell.truth = before
+    verification = Verification.of(calibration, JOB, replace(seen, pointing=Pointing(angle, 1e-4), exit_point=EXIT))
+    assert verification.good, verification.reason
+    assert "The laser has turned" in verification.reason
+    assert verification.summary()["witness"]["board_mrad"] == pytest.approx(1e3 * angle, abs=0.15)
+
+
+@pytest.mark.parametrize("angle", [0.6e-3, -0.9e-3])
+def test_a_plate_of_the_witness_that_was_knocked_is_named(calibrated, angle):
+    cell, calibration = calibrated
+    seen = replace(look_again(cell, calibration), pointing=Pointing(angle, 1e-4), exit_point=EXIT)
+    verification = Verification.of(calibration, JOB, seen)
+    assert not verification.good
+    assert verification.reason.startswith("the plate on the claw")
+    assert verification.summary()["witness"]["plate_moved"]
+    # The place goes off by as much as the depth of what is swept, 130 mm away with the laser 35 mm beside.
+    assert verification.misled == pytest.approx(abs(angle) * 0.130**2 / 0.035, rel=0.4)
+
+
+def test_a_witness_that_shows_nothing_changes_nothing(calibrated):
+    cell, calibration = calibrated
+    seen = look_again(cell, calibration)
+    known = replace(seen, pointing=Pointing(0.04e-3, 1e-4), exit_point=EXIT)
+    without, beside = (Verification.of(calibration, JOB, one) for one in (seen, known))
+    assert beside.reason == without.reason

@@ -22,10 +22,12 @@ LEAST_ROWS = 40
 """Fewer rows of the plate in the picture are no witness."""
 NOTED_RAD = 0.1e-3
 """A turn that people are told of."""
-LARGEST_RAD = 3e-3
-"""No warmth turns a laser so far: something was knocked, and the rest of the calibration is not to be trusted."""
-STAYS_RAD = 15e-6
-"""One standard deviation of what plate, rail and camera make of a pointing that has not changed."""
+LARGEST_RAD = 0.7e-3
+"""What a laser of 50 µrad/K turns in 14 K; beyond it more likely something was knocked."""
+PLATE_M = 20e-6
+"""One standard deviation of how far off the plate, its mount on the claw and the rail are that nobody touched."""
+SAME_RAIL_M = 50e-6
+"""The carriage has to be where it was: the plate may be tilted, and the rail is not along the camera's rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,25 +63,55 @@ class Witness:
 
 @dataclass(frozen=True)
 class Pointing:
-    """How far the light plane has turned since the calibration, rad, and one standard deviation of it."""
+    """How far the light plane has turned since the calibration, rad, and one standard deviation of it.
+
+    Beyond `NOTED_RAD` the deviation in `stated` has the turn itself in it: it may as well be the plate that has moved.
+    """
 
     turn: float
     sigma: float
+
+    @property
+    def stated(self) -> Pointing:
+        """With the deviation that a job has to reckon with, which has nothing but the plate to go by."""
+        return Pointing(self.turn, float(np.hypot(self.sigma, self.turn if abs(self.turn) > NOTED_RAD else 0.0)))
 
     @property
     def words(self) -> str:
         """For people."""
         return (
             f"the laser points {1e3 * self.turn:+.3f} ± {1e3 * self.sigma:.3f} mrad from where it pointed at the "
-            "calibration (seen on its witness); the measurements allow for it"
+            "calibration, if the plate that shows it has not moved; the measurements allow for either, and "
+            "`cell calibrate verify` tells them apart"
         )
 
 
 def pointing(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
+    """What a job reckons with: `turn_seen`, refused with `RefusedError` where no warmth takes the line."""
+    found = turn_seen(before, now, camera, plane, exit_point)
+    if abs(found.turn) > LARGEST_RAD:
+        raise RefusedError(
+            f"the laser points {1e3 * found.turn:+.2f} mrad from where it pointed at the calibration, allowed are "
+            f"±{1e3 * LARGEST_RAD:g} mrad, or the plate on the claw that shows it has moved: look at the plate and at "
+            "the laser's and the camera's mounts, and run `cell calibrate verify`, which tells which it was",
+            Measured("the laser's pointing has moved by", 1e3 * found.turn, "mrad", most=1e3 * LARGEST_RAD),
+        )
+    return found.stated
+
+
+def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
     """The turn of `plane` between two looks at the witness, about `exit_point` (3,), m, camera frame.
 
-    Raises `RefusedError` when the line is not where it can have got to by warmth.
+    Its deviation has the picture's noise and a plate that is off by `PLATE_M`. Raises `RefusedError` when the two looks
+    cannot be compared.
     """
+    if abs(now.rail - before.rail) > SAME_RAIL_M:
+        raise RefusedError(
+            f"the laser's witness was looked at with the rail at {1e3 * now.rail:.2f} mm, at the calibration at "
+            f"{1e3 * before.rail:.2f} mm, allowed are ±{1e3 * SAME_RAIL_M:.2f} mm: set laser.witness to "
+            f'"{1e3 * before.rail:.2f} mm" again, or run `cell calibrate`',
+            Measured("the rail at the witness is off by", 1e3 * (now.rail - before.rail), "mm", most=1e3 * SAME_RAIL_M),
+        )
     both = np.flatnonzero(np.isfinite(before.columns) & np.isfinite(now.columns))
     if len(both) < LEAST_ROWS:
         raise RefusedError(
@@ -94,15 +126,9 @@ def pointing(before: Witness, now: Witness, camera: CameraModel, plane: LightPla
     points, _ = triangulate(camera, plane, at)
     step = 1e-4
     per_rad = float(np.median(_columns(camera, turned(plane, exit_point, step), points) - at[:, 0])) / step
-    turn = shift / per_rad
-    found = Pointing(turn, float(np.hypot(noise / abs(per_rad), STAYS_RAD)))
-    if abs(turn) > LARGEST_RAD:
-        raise RefusedError(
-            f"the laser points {1e3 * turn:+.2f} mrad from where it pointed at the calibration, allowed are "
-            f"±{1e3 * LARGEST_RAD:g} mrad: see whether laser or camera were knocked, then run `cell calibrate`",
-            Measured("the laser's pointing has moved by", 1e3 * turn, "mrad", most=1e3 * LARGEST_RAD),
-        )
-    return found
+    nearer = points * (1.0 - PLATE_M / points[:, 2:])
+    plate = float(np.median(_columns(camera, plane, nearer) - at[:, 0]))
+    return Pointing(shift / per_rad, float(np.hypot(noise, plate) / abs(per_rad)))
 
 
 def turned(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:

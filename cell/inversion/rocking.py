@@ -21,10 +21,14 @@ from drivers.errors import Measured, RefusedError
 
 SLOWEST_HZ, FASTEST_HZ, STEP_HZ = 1.5, 14.0, 0.05
 LEAST_LINES = 40
+FEWEST = 20
+"""Lines of one sweep of several that tell something."""
 EVIDENCE = 40.0
 """Drop of the lines' squares, in units of what is left of them, that chance does not bring in so many frequencies."""
 LEAST_M = 8e-6
 """Less than this, up and down, is not worth a word: a screw's error looks the same."""
+LARGEST_OVERTONES = 0.05
+"""Twice and three times the frequency against itself: rocking has 0.006 at most, ridges and steps 0.14 and more."""
 GATE_M = 0.5e-3
 EXPECTED_RAD = 1e-3
 """One standard deviation of each angle before the scan has told: as good as unknown."""
@@ -34,14 +38,21 @@ LARGEST_RAD = 0.4e-3
 
 @dataclass(frozen=True)
 class Rocking:
-    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down."""
+    """How the vehicle rocked: `hz`, and `height` in m by which the scanned surface seemed to go up and down.
+
+    Waves of the length `wave`, m, on the surface itself would look the same.
+    """
 
     hz: float
     height: float
+    wave: float
 
 
 def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, times: Array) -> Rocking | None:
-    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any."""
+    """The rocking that a scan's lines, taken at `times` (lines,) in s, show at the pose found; None without any.
+
+    None as well where the lines go up and down with overtones: a vehicle on its springs has none, ridges have.
+    """
     scan = Scan.of(cloud)
     rows = correspondences(base_from_surface, scan, nominal, GATE_M)
     of = scan.lines[rows.index]
@@ -50,22 +61,77 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     if np.count_nonzero(good) < LEAST_LINES:
         return None
     mean = np.bincount(of, rows.heights, minlength=cloud.shape[0])[good] / count[good]
-    t = times[good]
-    t = t - t.mean()
-    apart = float(np.median(np.diff(np.sort(t))))
-    # Slow changes are the surface's or the pose's own business.
-    trend = np.vander(t / np.ptp(t), 4)
-    mean = mean - trend @ np.linalg.lstsq(trend, mean, rcond=None)[0]
-    best, hz, height = 0.0, 0.0, 0.0
-    for candidate in np.arange(SLOWEST_HZ, min(FASTEST_HZ, 0.45 / apart), STEP_HZ):
-        waves = _waves(t, candidate)
-        waves = waves - trend @ np.linalg.lstsq(trend, waves, rcond=None)[0]
-        solution = np.linalg.lstsq(waves, mean, rcond=None)[0]
-        left = float(np.sum((mean - waves @ solution) ** 2))
-        evidence = (float(mean @ mean) - left) / (left / (len(t) - 6))
+    sums = [np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)]
+    places = np.column_stack(sums)[good] / count[good, None]
+    sweeps = cloud.sweeps[good] if len(cloud.sweeps) else np.zeros(len(mean), dtype=np.intp)
+    made = [_Sweep.of(times[good][here], mean[here], places[here]) for here in _each(sweeps)]
+    known = [sweep for sweep in made if sweep is not None]
+    if sum(len(sweep.times) for sweep in known) < LEAST_LINES:
+        return None
+    fastest = min(FASTEST_HZ, *(0.45 / sweep.apart for sweep in known))
+    best, hz = 0.0, 0.0
+    for candidate in np.arange(SLOWEST_HZ, fastest, STEP_HZ):
+        left = sum(sweep.left(candidate) for sweep in known)
+        free = sum(len(sweep.times) - 6 for sweep in known)
+        evidence = (sum(float(sweep.heights @ sweep.heights) for sweep in known) - left) / (left / free)
         if evidence > best:
-            best, hz, height = evidence, float(candidate), float(np.hypot(*solution))
-    return Rocking(hz, height) if best > EVIDENCE and height > LEAST_M else None
+            best, hz = evidence, float(candidate)
+    # Each sweep brings a phase of its own, and chance with it.
+    if best < EVIDENCE * len(known):
+        return None
+    height = max(float(np.hypot(*sweep.waves(hz)[1])) for sweep in known)
+    if height < LEAST_M or max(sweep.overtones(hz) for sweep in known) > LARGEST_OVERTONES:
+        return None
+    return Rocking(hz, height, float(np.median([sweep.speed for sweep in known])) / hz)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """One sweep's lines: `times` (n,) from its middle, mean `heights` (n,) less what changes slowly, which is `trend`'s
+    (n, 4); the median time from line to line and the speed over the surface."""
+
+    times: Array
+    heights: Array
+    trend: Array
+    apart: float
+    speed: float
+
+    @classmethod
+    def of(cls, times: Array, heights: Array, places: Array) -> _Sweep | None:
+        """None for one that is too short or whose times do not tell its lines apart."""
+        t = times - times.mean()
+        steps = np.diff(t)
+        if len(t) < FEWEST or not (apart := float(np.median(steps))) > 0 or np.any(steps <= 0):
+            return None
+        # Slow changes are the surface's or the pose's own business.
+        trend = np.vander(t / np.ptp(t), 4)
+        slow = trend @ np.linalg.lstsq(trend, heights, rcond=None)[0]
+        speed = float(np.linalg.norm(np.median(np.diff(places, axis=0), axis=0))) / apart
+        return cls(t, heights - slow, trend, apart, speed)
+
+    def waves(self, *hz: float) -> tuple[Array, Array]:
+        """Sines and cosines (n, 2 k) of k frequencies, less the trend, and the size (2 k,) of each in the heights."""
+        waves = np.concatenate([_waves(self.times, one) for one in hz], axis=1)
+        waves = waves - self.trend @ np.linalg.lstsq(self.trend, waves, rcond=None)[0]
+        return waves, np.asarray(np.linalg.lstsq(waves, self.heights, rcond=None)[0])
+
+    def left(self, *hz: float) -> float:
+        """Sum of the squares, m², without these frequencies."""
+        waves, sizes = self.waves(*hz)
+        return float(np.sum((self.heights - waves @ sizes) ** 2))
+
+    def overtones(self, hz: float) -> float:
+        """How large the waves of 2 and 3 times `hz` are against that of `hz` itself."""
+        known = [hz]
+        for overtone in (2 * hz, 3 * hz):
+            # Between lines so far apart it may look like another frequency.
+            seen = abs(overtone - round(overtone * self.apart) / self.apart)
+            if min(abs(seen - other) for other in (0.0, *known)) > 2 / np.ptp(self.times):
+                known.append(seen)
+        squares = np.sum(self.waves(*known)[1].reshape(-1, 2) ** 2, axis=1)
+        # What noise alone makes of them is not theirs.
+        noise = (len(known) - 1) * 4 * self.left(*known) / (len(self.times) - 6) / len(self.times)
+        return float(np.sqrt(max(0.0, squares[1:].sum() - noise) / squares[0]))
 
 
 def rocking_motions(
@@ -112,11 +178,29 @@ def rocking_covariance(rocking: Rocking, base_from_vehicle: pin.SE3, at: Array) 
 
 
 def words(rocking: Rocking) -> str:
-    """For people."""
+    """For people, where the scan fits without it as well."""
     return (
-        f"the vehicle rocks: at {rocking.hz:.1f} Hz the surface seems to go up and down by {1e3 * rocking.height:.3f} "
-        "mm; the pose allows for it, and the stated uncertainty has what it does while the part is put down"
+        f"the vehicle rocks, or {_instead(rocking)}: at {rocking.hz:.1f} Hz the surface seems to go up and down by "
+        f"{1e3 * rocking.height:.3f} mm; the pose allows for rocking, and the stated uncertainty has what it does "
+        "while the part is put down"
     )
+
+
+def also(rocking: Rocking) -> str:
+    """For people, beside the reason why a scan was refused. It fits rocking as well: too little to accept anything."""
+    return (
+        f"(or the vehicle rocks at {rocking.hz:.1f} Hz, by ±{1e3 * rocking.height:.3f} mm at the surface: wait until "
+        f"it is quiet and run the job again; if that says the same, {_instead(rocking)})"
+    )
+
+
+def _instead(rocking: Rocking) -> str:
+    return f"the surface has waves of {1e3 * rocking.wave:.1f} mm"
+
+
+def _each(sweeps: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """The places (n,) of each sweep's lines."""
+    return [np.flatnonzero(sweeps == k) for k in np.unique(sweeps)]
 
 
 def _waves(t: Array, hz: float) -> Array:

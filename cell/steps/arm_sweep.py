@@ -110,6 +110,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         builder=collector.builder,
         lines=lines,
         frame_ids=np.array(collector.frame_ids)[lines],
+        times=times[lines],
         flanges=flanges,
         rail=np.full(len(lines), rail),
         line_spread=np.tile(own, (len(lines), 1)),

@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
-from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
+from cell.inversion.rocking import Rocking, also, find_rocking, rocking_covariance, rocking_motions, words
 from cell.job import Job
 from cell.reconstruction.cloud import Indices
 from cell.reconstruction.seams import Motions
@@ -19,7 +19,7 @@ from cell.steps.reconstruct import Reconstruction
 from cell.steps.step import JobStep
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
-from drivers.errors import RefusedError
+from drivers.errors import NotObservable, RefusedError
 from drivers.interfaces import Vector
 from statemachine.policy import Step
 from statemachine.runner import StepContext
@@ -27,7 +27,10 @@ from statemachine.runner import StepContext
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """When each line of the cloud was taken, (lines,) in s from any moment, and what the arm's base stands on."""
+    """When each line of the cloud was taken, (lines,) in s, and what the arm's base stands on.
+
+    The clock may begin anew with each sweep: nothing is carried over from one to the next.
+    """
 
     times: Vector
     base_from_vehicle: pin.SE3
@@ -67,19 +70,21 @@ def invert_pose(
             sweeps=sweeps,
         )
 
-    found: PlacePose | RefusedError
+    def rocks(pose: object) -> Rocking | None:
+        if taken is None or not isinstance(pose, pin.SE3):
+            return None
+        return find_rocking(scan.cloud, nominal, pose, taken.times)
+
     try:
         found = registered(scan.by_poses, kinematic)
-        pose = found.base_from_surface
     except RefusedError as refused:
-        # A vehicle that rocks bends the surface, and may be all that is wrong.
-        found, pose = refused, refused.seen.get("pose")
-    rocking = None
-    if taken is not None and isinstance(pose, pin.SE3):
-        rocking = find_rocking(scan.cloud, nominal, pose, taken.times)
+        # Never accepted for it: a worn surface looks like this too, and its pose would be wrong.
+        if (rocking := rocks(refused.seen.get("pose"))) is None:
+            raise
+        told = type(refused)(f"{refused} {also(rocking)}", *refused.numbers)
+        raise told.showing(seen=refused.seen) from refused
+    rocking = rocks(found.base_from_surface)
     if rocking is None or taken is None:
-        if isinstance(found, RefusedError):
-            raise found
         return found
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 
@@ -92,11 +97,17 @@ def invert_pose(
 
 
 def _at(here: Workplace, context: StepContext) -> PlacePose:
-    # Frames come evenly, lost ones are counted: an id tells the time.
-    ids = np.concatenate([swath.frame_ids for swath in context.made(SweepRecord).swaths])
-    taken = Lines(ids / here.job.scan.frame_rate, here.config.arm.vehicle_from_base.se3().inverse())
-    scan, fix = context.made(Reconstruction), context.made(BoardFix)
-    found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+    sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
+    times = np.concatenate([swath.times for swath in sweep.swaths])
+    taken = Lines(times, here.config.arm.vehicle_from_base.se3().inverse())
+    try:
+        found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+    except NotObservable as refused:
+        if not sweep.notes:
+            raise
+        # What is known too little may be where the laser points, which no more scanning mends.
+        told = NotObservable(f"{refused}. Before: {'; '.join(sweep.notes)}", *refused.numbers)
+        raise told.showing(seen=refused.seen) from refused
     for note in found.notes:
         context.note(text=note)
     return found

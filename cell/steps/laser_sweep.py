@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from cell.calibration.collect.witness import look_at_witness
+from cell.calibration.collect.witness import require_witness
 from cell.calibration.witness import Pointing
 from cell.calibration.witness import pointing as pointing_since
 from cell.devices.devices import Devices
@@ -148,12 +148,7 @@ def _pointing(here: Workplace, context: StepContext) -> Pointing | None:
     if head.witness is None:
         return None
     context.progress(0.0, "looking where the laser points")
-    seen = look_at_witness(here.config, here.devices, here.frames.keep)
-    if seen is None:
-        raise RefusedError(
-            "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
-            "in its place and clean, and that the laser is lit; if so, run `cell calibrate`"
-        )
+    seen = require_witness(here.config, here.devices, here.frames.keep)
     return pointing_since(head.witness, seen, head.camera, head.light_plane, here.config.laser.exit_point)
 
 

@@ -77,6 +77,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
         builder=collector.builder,
         lines=lines,
         frame_ids=np.array(collector.frame_ids)[lines],
+        times=times[lines],
         flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
         rail=np.array([sweep.position_at(time) for time in times[lines]]),
         line_spread=np.tile(spread, (len(lines), 1)),

@@ -28,11 +28,11 @@ from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame, Vector
 
 FILE = "sweep.npz"
-FORMAT = 2
+FORMAT = 3
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
-_ARRAYS = ("frame_ids", "flanges", "rail", "line_spread", "covariance")
+_ARRAYS = ("frame_ids", "times", "flanges", "rail", "line_spread", "covariance")
 
 
 def frame_path(folder: Path, frame_id: int) -> Path:

@@ -76,8 +76,9 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
 @dataclass(frozen=True, eq=False)
 class Swath:
     """What one sweep brought. For each of its n lines: the profile's number in `builder`, the frame's id in
-    `frame_ids`, base_from_flange in `flanges` (n, 4, 4) and the rail's position in `rail` (n,) at the middle of the
-    exposure, and `line_spread` (n, 3), m in base axes, one standard deviation of the line's own place along the sweep.
+    `frame_ids`, the `times` (n,) in s at the middle of its exposure on the cell's clock; base_from_flange in `flanges`
+    (n, 4, 4) and the rail's position in `rail` (n,) at that time, and `line_spread` (n, 3), m in base axes, one
+    standard deviation of the line's own place along the sweep.
 
     `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts the frames that the gaps of the frame
     ids tell of, and those left out because nothing tells where the arm was; `residual` in m is how far the readings
@@ -87,6 +88,7 @@ class Swath:
     builder: ProfileBuilder
     lines: NDArray[np.intp]
     frame_ids: NDArray[np.intp]
+    times: Vector
     flanges: Vector
     rail: Vector
     line_spread: Vector

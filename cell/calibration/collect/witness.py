@@ -11,6 +11,7 @@ from cell.calibration.witness import LEAST_ROWS, Witness
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.vision import extract
+from drivers.errors import RefusedError
 from drivers.interfaces import Frame
 
 PICTURES = 4
@@ -37,6 +38,21 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     mean = np.where(seen, columns.mean(axis=0), np.nan)
     found = Witness(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
     return _on_the_plate(found)
+
+
+def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness:
+    """The witness now, for a calibration that has seen it; `RefusedError` when there is none to see."""
+    if config.laser.witness is None:
+        raise RefusedError(
+            "the calibration saw the laser's witness, but the configuration has no laser.witness now: put it back, or "
+            "run `cell calibrate` to work without one"
+        )
+    if (seen := look_at_witness(config, devices, keep)) is None:
+        raise RefusedError(
+            "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
+            "in its place and clean, and that the laser is lit; if so, run `cell calibrate`"
+        )
+    return seen
 
 
 def _on_the_plate(seen: Witness) -> Witness | None:

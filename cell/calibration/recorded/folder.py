@@ -170,6 +170,11 @@ def read_pose_pairs(folder: Path) -> list[tuple[pin.SE3, pin.SE3]]:
             continue
         if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
             continue
+        for k, pair in enumerate(pairs):
+            if not np.isfinite(pair).all():
+                raise ConfigError(
+                    f"{path}: pair {k} holds a value that is no finite number; correct or remove the pair"
+                )
         try:
             return [(from_matrix(a), from_matrix(b)) for a, b in pairs]
         except ValueError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -12,10 +12,14 @@ from cell.calibration.collect.stripe_on_board import points_on_board
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.blocks import State, ViewData
 from cell.calibration.solve.joint import STRIPE_POINTS
+from cell.calibration.solve.reference import Reference
 from cell.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.calibration.solve.starts import stripe_means
 from cell.calibration.verify.decision import Verdict, verdict
 from cell.calibration.verify.evidence import Look, dots_of, evidence
+from cell.calibration.verify.pointing import WitnessCheck
+from cell.calibration.witness import Pointing
+from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
 from cell.vision.board.board import board_pose
 from drivers.errors import CalibrationStale, RefusedError
@@ -37,12 +41,15 @@ class CheckObservations:
 
     `photographs` holds, for each approach of the arm, the photographs of the fine board at the ends of the rail's way
     (no stripe); `sweep` the profiles of the sweep over it in the last approach (no views); `target` one view of the
-    large board for each approach.
+    large board for each approach. `pointing` is the laser's by its witness, where there is one, about `exit_point`
+    (3,), m, in the scan camera's frame.
     """
 
     photographs: list[list[ScanObservation]]
     sweep: list[ScanObservation]
     target: list[TargetObservation]
+    pointing: Pointing | None = None
+    exit_point: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservations) -> Verdict:
@@ -57,9 +64,7 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
             "`cell calibrate` once"
         )
     states = {
-        "scan": State(
-            scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
-        ),
+        "scan": _state(scan, scan.reference),
         "target": State(
             target.camera, None, np.zeros(3), target.flange_from_camera, target.reference.base_from_board
         ),
@@ -69,6 +74,21 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
         "target": evidence(states["target"], target.reference, target_looks(seen.target)),
     }
     return verdict(evidences, states)
+
+
+def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessCheck | None:
+    """What the board says to the laser's pointing by its witness; None without one. Raises what `verify` raises."""
+    if seen.pointing is None or scan.reference is None:
+        return None
+    state = _state(scan, scan.reference)
+    weighed = evidence(state, scan.reference, scan_looks(state, seen))
+    return WitnessCheck.of(seen.pointing, seen.exit_point, state, weighed)
+
+
+def _state(scan: ScanCalibration, reference: Reference) -> State:
+    return State(
+        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, reference.base_from_board
+    )  # fmt: skip
 
 
 def scan_looks(state: State, seen: CheckObservations) -> list[Look]:

@@ -16,7 +16,8 @@ from cell.calibration.solve.results import PARAMETERS
 from cell.calibration.store import CellCalibration
 from cell.calibration.verify.decision import WORST_FIT, Suspect, Verdict
 from cell.calibration.verify.detectability import DETECTED, Detectable
-from cell.calibration.verify.looks import CheckObservations, verify
+from cell.calibration.verify.looks import CheckObservations, check_witness, verify
+from cell.calibration.verify.pointing import WitnessCheck
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
 from cell.job import Job
@@ -38,6 +39,8 @@ class Verification:
 
     `effects` are what the suspects' changes do there, `at_most` what they do in `SURE` of cases, both in the order of
     `verdict.suspects`. `unseen` is what a change does that just fails to show, in the order of `verdict.detectable`.
+    `witness` is what the board says to the laser's witness, None without one, and `misled` what a job is off by that
+    believes the witness. A turn of the laser that both see is no change of the calibration, for jobs allow for it.
     """
 
     verdict: Verdict
@@ -46,11 +49,17 @@ class Verification:
     unseen: list[float]
     tolerance: float
     date: str
+    witness: WitnessCheck | None = None
+    misled: float = 0.0
 
     @classmethod
     def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Verification:
         """Compare what was seen with the calibration, and reckon the effect for a job."""
-        verdict, effect = verify(calibration.scan, calibration.target, seen), at_place(calibration, job)
+        scan, effect = calibration.scan, at_place(calibration, job)
+        witness = check_witness(scan, seen)
+        if witness is not None and witness.corrects:
+            scan = scan.pointed(witness.plate, seen.exit_point)
+        verdict = verify(scan, calibration.target, seen)
 
         def at_most(suspect: Suspect) -> float:
             drawn = np.random.default_rng(0).normal(size=(_DRAWS, suspect.spread.shape[1])) @ suspect.spread.T
@@ -64,6 +73,8 @@ class Verification:
             unseen,
             job.place.tolerance,
             calibration.date,
+            witness,
+            0.0 if witness is None else effect("scan", witness.wrong),
         )
 
     def __str__(self) -> str:
@@ -91,7 +102,12 @@ class Verification:
     @property
     def good(self) -> bool:
         """True when nothing speaks for a change, or for one that does too little to the place to matter."""
-        return not self.matters and not self.verdict.badly_fitting
+        return not self.matters and not self.verdict.badly_fitting and not self.plate_moved
+
+    @property
+    def plate_moved(self) -> bool:
+        """Whether the laser's witness, which jobs believe, was knocked."""
+        return self.witness is not None and self.witness.plate_moved
 
     @property
     def word(self) -> str:
@@ -103,6 +119,19 @@ class Verification:
     @property
     def reason(self) -> str:
         """The decision in words, in mm at the place, and the next step."""
+        if self.witness is None or not (self.plate_moved or self.witness.corrects):
+            return self._decision
+        if self.witness.corrects:
+            return f"{self._decision}. The laser has turned, {self.witness.words}: jobs allow for it"
+        return (
+            "the plate on the claw that shows where the laser points (laser.witness) has moved, not the laser: "
+            f"it has turned {self.witness.words}, and jobs that believe the plate put the place "
+            f"{1e3 * self.misled:.2f} mm off. Fasten the plate, then run `cell calibrate`. Apart from it, "
+            f"{self._decision}"
+        )
+
+    @property
+    def _decision(self) -> str:
         v, allowed = self.verdict, f"{1e3 * self.tolerance:.2f} mm"
         if v.changed and (self.matters or not v.badly_fitting):
             named = " or ".join(
@@ -134,7 +163,7 @@ class Verification:
                 f"{DETECTED:.0%} of checks like this one (allowed at the place are {allowed})"
             )
         hiding = [
-            f"{d.change.part}, {d.change.kind} ({_size(d)}, {1e3 * effect:.2f} mm at the place)"
+            f"{d.change.part}, {d.change.kind} ({_size(d)}, {_way(effect)} at the place)"
             for d, effect in zip(v.detectable, self.unseen, strict=True)
             if effect >= SHARE * self.tolerance
         ]
@@ -156,6 +185,7 @@ class Verification:
                 "error_at_most_mm": round(1e3 * max(self.at_most), 4) if v.changed else None,
                 "shows_from_mm": round(1e3 * self.hidden, 4) if np.isfinite(self.hidden) else None,
             },
+            "witness": None if self.witness is None else self.witness.as_dict(),
             "log_odds": round(v.statistic, 3),
             "log_odds_allowed": round(v.threshold, 3),
             "residuals_over_calibration": {kind: round(value, 3) for kind, value in v.fit.items()},
@@ -218,6 +248,10 @@ _UNITS = {"m": "mm", "rad": "deg"}
 def _shown(size: float, unit: str) -> float:
     """A size in m as mm, one in rad as degrees."""
     return 1e3 * size if unit == "m" else float(np.degrees(size))
+
+
+def _way(effect: float) -> str:
+    return f"{1e3 * effect:.2f} mm" if np.isfinite(effect) else "any amount"
 
 
 def _size(d: Detectable) -> str:

@@ -15,8 +15,10 @@ import pinocchio as pin
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
+from cell.calibration.collect.witness import require_witness
 from cell.calibration.store import CellCalibration
 from cell.calibration.verify.looks import CheckObservations
+from cell.calibration.witness import turn_seen
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
@@ -49,7 +51,7 @@ def collect_verification(
 ) -> CheckObservations:
     """Take all pictures; each goes to `keep`.
 
-    Raises `RefusedError` when a board is not seen, `CalibrationStale` without a reference.
+    Raises `RefusedError` when a board or the laser's witness is not seen, `CalibrationStale` without a reference.
     """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
@@ -60,6 +62,11 @@ def collect_verification(
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
     mover.to_joints(HOME)
+    pointing = None
+    if calibration.scan.witness is not None:
+        progress(0.0, "looking where the laser points")
+        head, now = calibration.scan, require_witness(config, devices, keep)
+        pointing = turn_seen(calibration.scan.witness, now, head.camera, head.light_plane, config.laser.exit_point)
     photographs: list[list[ScanObservation]] = []
     sweep: list[ScanObservation] = []
     for k in range(SCAN_APPROACHES):
@@ -91,7 +98,7 @@ def collect_verification(
         move_to_view(devices, mover, target_view, k)
         seen = _found(devices.target_camera, large, "large", keep, f"large-{k + 1}")
         target.append(TargetObservation(seen, from_ur(devices.arm.state().flange), f"large {k + 1}"))
-    return CheckObservations(photographs, sweep, target)
+    return CheckObservations(photographs, sweep, target, pointing, config.laser.exit_point)
 
 
 def _photographs(
