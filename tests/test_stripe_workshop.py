@@ -178,7 +178,7 @@ def test_a_faint_line_beside_another_is_refused_until_the_laser_stands_out():
 
 
 def test_colours_are_read_in_the_sensors_frame_whatever_the_picture_says(tmp_path):
-    """A camera that stands on its side says so in the EXIF; its lens does not turn with it, nor does the board's search."""
+    """A camera that stands on its side says so in the EXIF; its lens does not turn with it, nor does the search."""
     image = np.zeros((40, 60, 3), np.uint8)
     image[:, :10, 2] = 200
     _, data = cv2.imencode(".jpg", image)
