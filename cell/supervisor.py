@@ -48,6 +48,7 @@ from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
+from drivers.interfaces import why_untold
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
@@ -463,13 +464,14 @@ class Cell:
     # --- calibration ---
 
     def calibration(self) -> CellCalibration:
-        """The stored calibration of this very cell as configured; raises `CalibrationStale` that says what differs."""
+        """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
         return find_calibration(
             self.calibrations_folder,
             serial_numbers(self.devices),
             self.config.calibration_hash(),
             self.config.calibration.max_age,
             arm_table(self.config, self.devices),
+            why_untold(self.devices.arm),
         )
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:

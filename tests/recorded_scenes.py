@@ -43,8 +43,12 @@ def scene(
     second: tuple[int, ...] = (),
     laser: bool = True,
     board: str = BOARD.name,
+    focal: float = 1.0,
 ) -> list[RecordedFrame]:
-    """Frames with poses. `bend` in m at the board's edge; turns about `axes` axes; `second`: frames of another line."""
+    """Frames with poses. `bend` in m at the board's edge; turns about `axes` axes; `second`: frames of another line.
+
+    `focal`: the boards are seen with so many times the focal length.
+    """
     rng = np.random.default_rng(seed)
     spec = parse_board(board)
     points = spec.points()
@@ -59,7 +63,7 @@ def scene(
         at = np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.035, 0.035), 0.4 + rng.uniform(-0.06, 0.06)])
         camera_from_board = pin.SE3(turn, at - turn @ middle)
         frame = RecordedFrame(Path(f"frame{k:04d}.png"), f"frame{k:04d}.png")
-        frame.view = _view(spec, real, camera_from_board, rng)
+        frame.view = _view(spec, real, camera_from_board, rng, focal)
         exact = BASE_FROM_BOARD * (FLANGE_FROM_CAMERA * camera_from_board).inverse()
         off = cv2.Rodrigues(rng.normal(0, 1e-3 * arm_mrad, 3))[0]
         frame.base_from_flange = pin.SE3(off @ exact.rotation, exact.translation + rng.normal(0, 1e-3 * arm_mm, 3))
@@ -73,9 +77,11 @@ def _turn(axis: int, angle: float) -> np.ndarray:
     return cv2.Rodrigues(angle * np.eye(3)[axis])[0]
 
 
-def _view(spec, real: np.ndarray, camera_from_board: pin.SE3, rng: np.random.Generator) -> BoardView:
+def _view(spec, real: np.ndarray, camera_from_board: pin.SE3, rng: np.random.Generator, focal: float) -> BoardView:
     turn = cv2.Rodrigues(camera_from_board.rotation)[0]
-    pixels = cv2.projectPoints(real, turn, camera_from_board.translation, MATRIX, LENS)[0].reshape(-1, 2)
+    matrix = MATRIX * np.array([[focal], [focal], [1.0]])
+    matrix[:2, 2] = MATRIX[:2, 2]
+    pixels = cv2.projectPoints(real, turn, camera_from_board.translation, matrix, LENS)[0].reshape(-1, 2)
     pixels += rng.normal(0, DOTS_PX, pixels.shape)
     seen = np.flatnonzero(((pixels > EDGE) & (pixels < np.array(SIZE) - EDGE)).all(axis=1))
     return BoardView(spec, SIZE, seen, pixels[seen], np.full(len(seen), DOTS_PX), spec.symmetric)

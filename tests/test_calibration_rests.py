@@ -72,9 +72,10 @@ def solved(observations: list[ScanObservation]) -> Joint:
     return solve_joint(observations, solve_staged(observations, nominal), PRIORS, held_out=False)
 
 
-def test_moves_of_the_rail_at_rest_make_it_surer_as_stated():
+@pytest.mark.parametrize("seeds", [(3,), pytest.param((4, 5, 6), marks=pytest.mark.campaign)])
+def test_moves_of_the_rail_at_rest_make_it_surer_as_stated(seeds):
     deviations, scores = [], []
-    for seed in (3, 4):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         world = draw_head(rng)
         plain = observe(world, NOISE, rng)

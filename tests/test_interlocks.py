@@ -29,6 +29,7 @@ from cell.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser
+from sim_backends.models.arm import Power
 from sim_backends.models.arm_kinematics import Kinematics
 
 CONFIG = load_config(None)
@@ -416,6 +417,20 @@ def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(d
     devices.arm.move_linear(down, 0.05, 0.5).wait(30.0)
 
 
+def test_a_vehicle_that_could_not_be_enabled_still_stands_before_the_station(
+    world: VirtualCell, devices: Devices
+) -> None:
+    tip = from_ur(devices.arm.state().flange) * from_parts((0.0, 0.0, 0.145))
+    table = block("table", BASE, tip.translation - [0.3, 0.3, 0.2], tip.translation + np.array([0.3, 0.3, -0.03]))
+    devices.interlocks.stand_before([table])
+    world.world.vehicle.fault("vehicle.emergency_stop", world.clock.now())
+    with pytest.raises(DeviceFault, match="emergency stop"):
+        devices.vehicle.enable()
+    assert devices.interlocks.situation.station == (table,)
+    down = shifted(devices, 0.0, 0.0, -0.05)
+    refused("way_clear", lambda: devices.arm.move_linear(down, 0.05, 0.5), "claw and table")
+
+
 def test_the_part_counts_only_while_the_claw_holds_it(devices: Devices) -> None:
     arm, interlocks = devices.arm, devices.interlocks
     post = from_ur(arm.state().flange) * from_parts((0.0, 0.0, 0.2))
@@ -576,3 +591,19 @@ def test_an_arm_that_was_calibrated_anew_under_the_cell_does_not_move(
     ):
         refused("same_kinematics", begin, "mm and", "mrad away", "port 30001")
     assert np.array_equal(devices.arm.state().joints, before.joints)
+
+
+def test_an_arm_without_power_is_refused_by_its_driver_which_says_how_it_goes_on(
+    world: VirtualCell, devices: Devices
+) -> None:
+    arm = world.world.arm
+    table = arm.params.dh.copy()
+    table[1, 0] += 1e-3
+    arm.kinematics = arm.drive.kinematics = Kinematics(table)
+    arm.power = Power.OFF
+    assert not devices.arm.state().controlled
+    with pytest.raises(DeviceFault, match="power is off") as caught:
+        devices.arm.move_joints(HOME, 0.5, 1.0)
+    assert caught.value.code == "arm.not_powered"
+    arm.power = Power.RUNNING
+    refused("same_kinematics", lambda: devices.arm.move_joints(HOME, 0.5, 1.0))

@@ -200,3 +200,45 @@ def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_pat
     assert {"kind": "rail", "make": "acme", "source": "acme-rail 1.2", "state": "ok"} in rows
     assert {"kind": "rail", "make": "tmcl", "source": "built in", "state": "ok"} in rows
     assert [row["state"].partition(":")[0] for row in rows if row["source"] == "lost 0.0.1"] == ["refused", "refused"]
+
+
+ARM = """
+from typing import Annotated, Literal
+from cell.device_config import ArmConfig
+from cell.devices.built_in import UrArmConfig
+from cell.devices.make import Make
+from drivers.interfaces import LinkStatistics
+
+
+class OldArmConfig(UrArmConfig):
+    driver: Literal["old"] = "old"
+
+
+class OldArm:
+    closed = 0
+
+    def __init__(self, name):
+        self.name, self.statistics = name, LinkStatistics()
+
+    def close(self):
+        OldArm.closed += 1
+
+    def _same(self, *given, **named):
+        raise AssertionError("nothing is asked of it")
+
+    identity = ping = stop = state = record = latch_clock = move_joints = move_linear = follow = _same
+    zero_force = set_payload = set_digital_output = digital_input = recover = _same
+
+
+MAKE = Make("arm", "old", OldArmConfig, lambda name, config, around: OldArm(name))
+"""
+"""An arm that was written before arms told their kinematics."""
+
+
+def test_an_arm_that_lacks_a_method_is_named_with_it_and_closed(site: Path, tmp_path: Path) -> None:
+    install(site, "old-arm", "0.9", "arm.old = old_arm:MAKE", old_arm=ARM)
+    path = tmp_path / "old.toml"
+    path.write_text(default_toml().replace('driver = "ur"', 'driver = "old"'))
+    with pytest.raises(ConfigError, match=r'the arm "old" has no link_table, which every arm must have'):
+        connect_one(load_config(path), "arm", Clock())
+    assert sys.modules["old_arm"].OldArm.closed == 1

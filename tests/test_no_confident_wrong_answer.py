@@ -13,7 +13,7 @@ import pytest
 
 from cell.calibration.recorded.folder import RecordedFrame
 from cell.calibration.recorded.result import empty_result
-from cell.calibration.recorded.solution import camera_of, solve_frames
+from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
 from cell.geometry.camera import CameraModel
 from tests.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
 
@@ -68,7 +68,7 @@ def test_a_clean_recording_is_solved_without_a_doubt():
     assert [c["name"] for c in result["checks"] if c["verdict"] != "ok"] == []
 
 
-@pytest.mark.parametrize("arm_mm", [1.0, 5.0])
+@pytest.mark.parametrize("arm_mm", [pytest.param(1.0, marks=pytest.mark.campaign), 5.0])
 def test_an_arm_that_scatters_does_not_bend_the_camera(arm_mm):
     frames = scene(seed=1, count=10, arm_mm=arm_mm, arm_mrad=2 * arm_mm, laser=False)
     result = solved(frames)
@@ -124,7 +124,7 @@ def test_a_board_of_another_size_is_said_and_counts():
     assert any("measure its pitch" in note for note in result["notes"])
 
 
-@pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), (0.002, False)])
+@pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), pytest.param(0.002, False, marks=pytest.mark.campaign)])
 def test_a_bent_board_is_seen_and_counts(bend, laser):
     result = solved(scene(seed=4, bend=bend, laser=laser))
     assert right(result)
@@ -153,6 +153,23 @@ def test_three_frames_are_not_enough_to_check_anything():
     result = solved(scene(count=3))
     assert "needs 4 or more" in result["refused"]["hand_eye"]
     assert right(result)
+
+
+def test_a_picture_of_another_camera_is_named():
+    frames = scene(seed=1, count=10, laser=False)
+    frames[1].view = scene(seed=51, count=10, laser=False, focal=1.05)[1].view
+    frames[1].base_from_flange = None
+    result = solved(frames)
+    assert right(result)
+    doubt = next(c for c in result["checks"] if c["name"] == "what one picture does to the camera")
+    assert doubt["verdict"] == "doubt" and f"without {frames[1].name}" in doubt["text"]
+
+
+def test_good_frames_of_a_small_set_are_not_blamed():
+    for seed in range(5):
+        frames = scene(seed, count=4, arm_mm=1.0, arm_mrad=2.0, laser=False)
+        truth = CameraModel(*SIZE, MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2], tuple(LENS))
+        assert agreeing(frames, truth) == frames
 
 
 def test_a_given_camera_is_not_touched():

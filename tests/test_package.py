@@ -42,8 +42,8 @@ def test_an_unknown_name_is_no_attribute() -> None:
 def test_the_command_line_tells_its_release_and_completes(
     option: str, shown: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cell.cli import main
-
+    # Else typer looks among the processes above this one for a shell, and a test need not have one there.
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     monkeypatch.setattr(sys, "argv", ["cell", option, *(["bash"] if "completion" in option else [])])
     with pytest.raises(SystemExit) as end:
         main()

@@ -19,7 +19,8 @@ from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
 from cell.geometry.camera import CameraModel
-from cell.vision import Laser, parse_board
+from cell.vision import Laser, parse_board, read_colours
+from cell.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -188,6 +189,30 @@ def numpy_stack_by_columns(folder: Path) -> None:
     np.save(folder / "poses.npy", np.array([p.T for p in POSES]))
 
 
+def as_the_arms_script_has_them(folder: Path) -> None:
+    (folder / "poses.script.txt").write_text(
+        "\n".join(f"p[{row([*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()], ', ')}]" for p in POSES)
+    )
+
+
+def titles_above_matrices(folder: Path) -> None:
+    blocks = [f"Pose {k + 3}:\n" + "\n".join(map(row, p)) for k, p in enumerate(POSES)]
+    (folder / "poses.txt").write_text("\n\n".join(blocks))
+
+
+def times_before_rotation_vectors(folder: Path) -> None:
+    rows = [
+        row([1.7e9 + 3.7 * k, *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for k, p in enumerate(POSES)
+    ]
+    (folder / "poses.txt").write_text("\n".join(rows))
+
+
+def remarks_in_some_rows(folder: Path) -> None:
+    rows = [row([k + 3, *p[:3, 3], *quaternion(p)], ",") for k, p in enumerate(POSES)]
+    said = [r + (",bad light" if k == 2 else ",") for k, r in enumerate(rows)]
+    (folder / "robot.csv").write_text("image,x,y,z,qx,qy,qz,qw,comment\n" + "\n".join(reversed(said)))
+
+
 SPELLINGS = {
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
     rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
@@ -200,6 +225,10 @@ SPELLINGS = {
     opencv_yaml: ("matrix-3x4", "m", "name"),
     matrices_one_below_the_other: ("matrix-4x4", "m", "order"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
+    as_the_arms_script_has_them: ("xyz+rotvec-rad", "m", "order"),
+    titles_above_matrices: ("matrix-4x4", "m", "name"),
+    times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
+    remarks_in_some_rows: ("xyz+quaternion-xyzw", "m", "number"),
 }
 
 
@@ -269,11 +298,26 @@ def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
         names[name] = seen[path.name]
         rows.append(row([1690000000 + 2 * k + 0.2, *pose[:3, 3], *quaternion(pose)]))
         rows.append(row([1690000000 + 2 * k + 1.2, *(pose[:3, 3] + 0.1), *quaternion(pose)]))
-    (tmp_path / "trajectory.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
-    frames, understood, _ = understand(tmp_path, names)
-    assert understood.about["matched_by"] == "time"
-    for frame, pose in zip(frames, POSES, strict=True):
-        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+    for unknown in ("", "time,x,y,z,qx,qy,qz,qw\nn/a," + row([0.1] * 7, ",") + "\n"):
+        separator = "," if unknown else " "
+        text = "\n".join(r.replace(" ", separator) for r in rows)
+        (tmp_path / "trajectory.txt").write_text((unknown or "# timestamp tx ty tz qx qy qz qw\n") + text)
+        frames, understood, _ = understand(tmp_path, names)
+        assert understood.about["matched_by"] == "time"
+        for frame, pose in zip(frames, POSES, strict=True):
+            assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def test_a_picture_whose_file_says_that_it_was_held_turned_is_read_as_the_sensor_has_it(tmp_path, pictures):
+    path = tmp_path / "turned.jpg"
+    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(path), image)
+    as_it_is, data = read_picture(path), path.read_bytes()
+    for orientation in (3, 6):
+        tag = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
+        path.write_bytes(data[:2] + b"\xff\xe1" + (len(tag) + 2).to_bytes(2, "big") + tag + data[2:])
+        assert np.array_equal(read_picture(path), as_it_is)
+        assert np.array_equal(read_colours(path), as_it_is)
 
 
 def test_what_is_wrong_is_named_with_its_file(recording, seen):
@@ -338,6 +382,69 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
         path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
     _, _, unread = read_series(list_folder(recording))
     assert all(len(reason) > 5 for _, reason in unread)
+
+
+def test_numbers_that_are_off_by_one_are_found_out_and_said(recording, seen):
+    one_file_each(recording, lambda p: row(p.ravel()))
+    for k in range(len(POSES)):
+        (recording / f"pose{k + 3:02d}.txt").rename(recording / f"pose{k + 2:02d}.txt")
+    frames, understood, _ = understand(recording, seen)
+    assert understood.about["matched_by"] == "order"
+    assert "taken in order" in understood.notes[0]
+    for frame, pose in zip(frames, POSES, strict=True):
+        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def in_little_light(image: np.ndarray, light: float, seed: int) -> np.ndarray:
+    """The picture by `light` as much light, with noise and a stripe."""
+    across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
+    noise = np.random.default_rng(seed).normal(0, 1, image.shape)
+    return np.clip(light * image + 180 * np.exp(-0.5 * (across / 2.0) ** 2) + noise + 3, 0, 255).astype(np.uint8)
+
+
+def test_three_pictures_of_one_place_are_one_frame(tmp_path, pictures):
+    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "03_board.png"), image)
+    cv2.imwrite(str(tmp_path / "03_laser_off.png"), (0.3 * image + 3).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "03_laser_on.png"), in_little_light(image, 0.3, 1))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD)
+    (used,) = [f for f in frames if f.reason is None]
+    assert (used.name, used.stripe_from, used.stripe_off) == ("03_board.png", "03_laser_on.png", "03_laser_off.png")
+    assert {f.reason.value for f in frames if f is not used} == {"laser_picture"}
+
+
+def test_a_copy_under_another_number_counts_once_and_with_another_pose_it_is_refused(recording):
+    (recording / "frame11.png").symlink_to(recording / "frame03.png")
+    image = cv2.imread(str(recording / "frame04.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(recording / "frame12.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    (recording / "frame13.png").symlink_to(recording / "frame05.png")
+    rows = [row(p.ravel()) for p in [*POSES, POSES[0], POSES[1], POSES[7]]]
+    (recording / "poses.txt").write_text("\n".join(rows))
+    listing = list_folder(recording)
+    series, links, _ = read_series(listing)
+    frames, _ = read_frames(listing, BOARD, links)
+    attach_poses(frames, match_series(series, listing, links)[0], CAMERA, Options())
+    assert [f.reason for f in frames[: len(POSES)]] == [None] * len(POSES)
+    same, again, other = frames[len(POSES) :]
+    assert (same.reason.value, same.text) == ("duplicate", "the same file as frame03.png")
+    assert (again.reason.value, again.text) == ("duplicate", "it shows what frame04.png shows")
+    assert other.reason.value == "no_pose"
+    assert "frame05.png" in other.text
+
+
+def test_a_damaged_file_beside_the_poses_is_named_and_the_others_are_read(recording, seen):
+    tuples(recording)
+    (recording / "old.npz").write_bytes(b"PK\x03\x04junk")
+    (recording / "old.npy").write_bytes(b"")
+    (recording / "camera.json").write_text('{"rows": null, "cols": 4, "data": [1, 2]}')
+    (recording / "deep.json").write_text("[" * 5000)
+    frames, understood, unread = understand(recording, seen)
+    assert understood.notes == []
+    assert all(f.base_from_flange is not None for f in frames)
+    reasons = dict(unread)
+    assert reasons.keys() == {"old.npz", "old.npy", "camera.json", "deep.json"}
+    assert "zip" in reasons["old.npz"]
+    assert "no pose" in reasons["camera.json"]
 
 
 def test_the_laser_in_a_second_picture_is_found_by_name(tmp_path, pictures):

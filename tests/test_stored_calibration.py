@@ -15,7 +15,7 @@ from cell.calibration.solve.results import KEPT, Quality
 from cell.calibration.store import CellCalibration, find_calibration, nominal_camera, save_calibration
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
-from drivers.errors import CalibrationStale
+from drivers.errors import CalibrationStale, NotConnectedError
 
 DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}
 CONFIGURATION = "0123456789abcdef"
@@ -73,6 +73,16 @@ def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept
     for word in (kept or "it does not say which", now or "none that is known", "30001", "run `cell calibrate`"):
         assert word in str(caught.value)
     assert find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, kept).kinematics == kept
+
+
+def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_anew(tmp_path: Path) -> None:
+    save_calibration(replace(made(), kinematics="UR10e 0a1b"), tmp_path / "own.json")
+    why = "port 30001 of 10.0.0.5 sent none within 10 s"
+    with pytest.raises(NotConnectedError, match=f"30001 was not read now: {why}; .*UR10e 0a1b.*connect anew") as caught:
+        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
+    assert "cell calibrate" not in str(caught.value)
+    with pytest.raises(CalibrationStale, match="holds no calibration of these devices"):
+        find_calibration(tmp_path / "none", DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
 
 
 def test_the_arm_that_was_exchanged_is_named(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from cell.lab.bench.stripe_truth import Cell, draw
 from cell.vision.stripe import search as stripe_search
 from cell.vision.stripe import without_compiler as stripe_numpy
+from cell.vision.stripe.extract import extract
 from cell.vision.stripe.find import CANDIDATES, CUT, ENERGY, NOWHERE, START
 
 SHAPE = (200, 333)
@@ -62,3 +63,10 @@ def test_any_line_is_searched_as_without_a_compiler(name, with_dark):
             np.testing.assert_array_equal(cut[r], image[r, cut_at[r] : cut_at[r] + CUT])
     np.testing.assert_allclose(starts[0], starts[1], atol=1e-3)
     assert several[0] == several[1] == bool(starts[0][:, 1, ENERGY].any())
+
+
+def test_light_wider_than_any_stripe_in_a_picture_so_wide_that_it_is_shrunk_is_no_stripe():
+    x = np.arange(5472)
+    light = 60 + 120 * np.exp(-0.5 * ((x - 2200) / 90) ** 2)
+    image = np.clip(light + np.random.default_rng(0).normal(0, 2, (240, len(x))), 0, 255).astype(np.uint8)
+    assert not len(extract(image).rows)

@@ -177,8 +177,8 @@ def test_a_faint_line_beside_another_is_refused_until_the_laser_stands_out():
         assert np.nanmedian(np.abs(seen.centres - 100 - 0.1 * np.arange(240))) < 0.5
 
 
-def test_colours_are_turned_as_the_picture_says(tmp_path):
-    """A camera that stands on its side says so in the EXIF; a board is looked for in the turned picture."""
+def test_colours_are_read_in_the_sensors_frame_whatever_the_picture_says(tmp_path):
+    """A camera that stands on its side says so in the EXIF; its lens does not turn with it, nor does the search."""
     image = np.zeros((40, 60, 3), np.uint8)
     image[:, :10, 2] = 200
     _, data = cv2.imencode(".jpg", image)
@@ -186,5 +186,5 @@ def test_colours_are_turned_as_the_picture_says(tmp_path):
     turned = data.tobytes()[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data.tobytes()[2:]
     (tmp_path / "side.jpg").write_bytes(turned)
     seen = read_colours(tmp_path / "side.jpg")
-    assert seen.shape == (60, 40, 3) == (*read_picture(tmp_path / "side.jpg").shape, 3)
-    assert seen[5, 20, 0] > 150 > 50 > seen[40, 20, 0]
+    assert seen.shape == (40, 60, 3) == (*read_picture(tmp_path / "side.jpg").shape, 3)
+    assert seen[20, 5, 0] > 150 > 50 > seen[20, 40, 0]

@@ -48,3 +48,11 @@ def test_corners_lie_where_they_were_drawn(squares):
 def test_tags_of_another_dictionary_are_named():
     with pytest.raises(PictureRefused, match="DICT_APRILTAG_36h11"):
         find_board(photograph(True), parse_board("aprilgrid:6x5:26mm:20mm:DICT_APRILTAG_25h9"))
+
+
+def test_tags_of_one_row_are_said_to_lie_on_one_line():
+    row = np.zeros((5 * (TAG + GAP) + GAP + 120, 6 * (TAG + GAP) + GAP + 120), np.uint8)
+    row[60 + 2 * (TAG + GAP) : 60 + 3 * (TAG + GAP) + GAP] = 1
+    one = np.where(cv2.warpPerspective(row, TURN, (640, 480)) > 0, photograph(False), 128).astype(np.uint8)
+    with pytest.raises(PictureRefused, match="that were read lie on one line"):
+        find_board(one, parse_board("aprilgrid:6x5:26mm:20mm"))

@@ -27,7 +27,7 @@ from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.report.html import table
 from cell.run.folder import write_json
-from drivers.errors import CalibrationStale
+from drivers.errors import CalibrationStale, NotConnectedError
 
 FORMAT = 1
 
@@ -234,13 +234,19 @@ CLOCK_SLACK_S = 3600.0
 
 
 def find_calibration(
-    folder: Path, identities: dict[str, str], configuration: str, max_age: float, kinematics: str = ""
+    folder: Path,
+    identities: dict[str, str],
+    configuration: str,
+    max_age: float,
+    kinematics: str = "",
+    untold: str = "",
 ) -> CellCalibration:
     """The stored calibration of these devices under this configuration, not older than `max_age` s.
 
-    `kinematics` names the arm's table, as of `kinematics_name`.
+    `kinematics` names the arm's table, as of `kinematics_name`; `untold` says why the arm has not told it now, if so.
 
-    Raises `CalibrationStale` that says what is missing or what differs.
+    Raises `CalibrationStale` that says what is missing or what differs, `NotConnectedError` when the arm has to be
+    asked again before anybody can tell.
     """
     found, unreadable = [], []
     for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
@@ -264,6 +270,13 @@ def find_calibration(
             f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
         )
     fitting = [entry for entry in current if entry.kinematics == kinematics]
+    if not fitting and untold and current[-1].kinematics:
+        raise NotConnectedError(
+            "arm",
+            f"its port 30001 was not read now: {untold}; the calibration of {current[-1].date} was made with the "
+            f"table that it told then ({current[-1].kinematics}), and whether it fits is not known. See that the arm "
+            "is on and that port open, then connect anew",
+        )
     if not fitting:
         raise CalibrationStale(
             f"the calibration of {current[-1].date} was made with another kinematics of the arm "

@@ -20,8 +20,19 @@ from cell.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
 from cell.steps.moves import HOME
 from drivers.clock import Clock
+from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vector, Vehicle
 from drivers.link_table import LinkTable
+
+INTERFACES: dict[str, type] = {
+    "rail": Rail,
+    "arm": Arm,
+    "vehicle": Vehicle,
+    "camera": Camera,
+    "laser": Laser,
+    "claw": Claw,
+}
+"""What each kind of device has to offer, whatever its make."""
 
 
 def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devices:
@@ -52,7 +63,21 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.
         around = Surroundings(clock, look, None, safe_off_outputs(config), lambda table: _forward(config, table))
-    return config.make(name).connect(name, config.device(name), around)
+    make = config.make(name)
+    device = make.connect(name, config.device(name), around)
+    if missing := [method for method in methods(INTERFACES[make.kind]) if not hasattr(device, method)]:
+        if hasattr(device, "close"):
+            device.close()
+        raise ConfigError(
+            f'{name}: the {make.kind} "{make.name}" has no {", ".join(missing)}, which every {make.kind} must have '
+            "now; install a newer version of the package that brings it, or name another driver"
+        )
+    return device
+
+
+def methods(interface: type) -> list[str]:
+    """The methods that an interface asks for, by name; no properties, because to look for one may ask the device."""
+    return [name for name in dir(interface) if not name.startswith("_") and callable(getattr(interface, name))]
 
 
 def _forward(config: CellConfig, table: LinkTable | None) -> Callable[[Vector], Vector]:

@@ -18,7 +18,7 @@ from cell.devices.simulated import SimulatedCell, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle, why_untold
 
 PINGS = 100
 
@@ -129,7 +129,8 @@ def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -
 
 def _arm_state(arm: Arm) -> str:
     state, table = arm.state(), arm.link_table()
-    own = "own kinematics not told" if table is None else f"own kinematics {table.hash()}"
+    why = f" ({reason})" if (reason := why_untold(arm)) else ""
+    own = f"own kinematics not told{why}" if table is None else f"own kinematics {table.hash()}"
     return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg, {own}"
 
 

@@ -26,6 +26,7 @@ from drivers.interfaces import (
     Vector,
     Vehicle,
     VehicleState,
+    why_untold,
 )
 from drivers.link_table import LinkTable
 
@@ -36,6 +37,11 @@ class GatedArm(Gated[Arm]):
     def link_table(self) -> LinkTable | None:
         """See `Arm.link_table`."""
         return self.bare.link_table()
+
+    @property
+    def untold(self) -> str:
+        """See `SaysWhyUntold.untold`."""
+        return why_untold(self.bare)
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""
@@ -154,9 +160,9 @@ class GatedVehicle(Gated[Vehicle]):
         """See `Vehicle.enable`."""
 
         def begin() -> None:
-            # It may drive away from now on.
-            self.gate.interlocks.stand_before(())
+            # Only now may it drive away: one that could not be enabled still stands where it stood.
             self.bare.enable()
+            self.gate.interlocks.stand_before(())
 
         self.gate.begin(Command("vehicle", "enable"), begin, self.bare.brake)
 

@@ -185,6 +185,9 @@ def _kinematics(now: Situation, command: Command) -> str | None:
     state = now.arm.state(PATIENCE_S)
     if _moves(now, state) is not None:
         return None
+    if not state.controlled:
+        # Another tool may be set while no program runs. The device itself refuses then, and says how it goes on.
+        return None
     apart = now.forward(state.joints).actInv(from_ur(state.flange))
     way, turn = np.linalg.norm(apart.translation), np.linalg.norm(pin.log3(apart.rotation))
     if way <= SAME_M and turn <= SAME_RAD:

@@ -53,7 +53,7 @@ class PictureRefused(RefusedError):
 
 
 def read_picture(path: Path) -> Image:
-    """The grey 8-bit image (h, w) of a file; refuses unreadable and cut files."""
+    """The grey 8-bit image (h, w) of a file, as the sensor has it; refuses unreadable and cut files."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -69,7 +69,8 @@ def read_picture(path: Path) -> Image:
         )
     image: NDArray[np.generic] | None = None
     if data:
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        # The lens belongs to the sensor: however the camera was held, the picture is read as the sensor has it.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error as error:

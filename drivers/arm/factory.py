@@ -1,8 +1,8 @@
 """What the controller tells of its own kinematics: the factory's Denavit–Hartenberg table, on the primary interface.
 
-Read once for each connection, over a socket of its own that sends nothing. An arm that does not tell is no error here:
-the user's own model of it is compared with the flange that it reports, whatever that model rests on. Source:
-docs/protocols.md, section 1.
+Read once for each connection of the driver, over sockets of its own that send nothing. An arm that does not tell is no
+error here: the user's own model of it is compared with the flange that it reports, whatever that model rests on.
+Source: docs/protocols.md, section 1.
 """
 
 from __future__ import annotations
@@ -22,48 +22,58 @@ _PART = struct.Struct(">IB")
 _CONTENT = struct.Struct(">6I24dI")
 _LONGEST = 1 << 16
 """Bytes; packages of a real controller have some 1500."""
-_STATUS = {0: "not initialised", 1: "not linearised", 2: "linearised"}
+_NOT_INITIALISED = 0
+"""The status of joints that were not calibrated since the arm was switched on: the numbers beside it are nobody's."""
+_PAUSE_S = 0.5
+"""Before the second try, at most."""
 
 
 @dataclass(frozen=True)
 class FactoryKinematics:
-    """The table that the controller computes with, or None and `missing` says why it is not known.
-
-    `checksum` (6,) and `status` are the controller's own, of the calibration of its joints.
-    """
+    """The table that the controller computes with, or None and `missing` says why it is not known."""
 
     table: LinkTable | None = None
-    checksum: tuple[int, ...] = ()
-    status: str = ""
     missing: str = ""
 
 
-def read_factory_kinematics(address: str, timeout: float = 2.0) -> FactoryKinematics:
-    """Ask the controller at `address` within `timeout` wall seconds; it never raises for what the network does."""
-    deadline = time.monotonic() + timeout
-    try:
-        with socket.create_connection((address, PORT), timeout=timeout) as connection:
-            return _first(connection, deadline)
-    except TimeoutError:
-        why = f"port {PORT} of {address} sent none within {timeout:g} s"
-    except OSError as error:
-        why = f"port {PORT} of {address} cannot be read ({error})"
-    except ValueError as error:
-        why = f"port {PORT} of {address} sent {error}"
-    return FactoryKinematics(missing=why)
+def read_factory_kinematics(address: str, timeout: float = 10.0) -> FactoryKinematics:
+    """Ask the controller at `address` within `timeout` wall seconds; it never raises for what the network does.
+
+    It tells as a connection begins, so a connection that brought nothing in half that time is followed by another.
+    """
+    begun = time.monotonic()
+    heard: list[str] = []
+    for share in (0.5, 1.0):
+        try:
+            return FactoryKinematics(_first(address, begun + share * timeout, heard))
+        except TimeoutError:
+            why = f"sent none within {timeout:g} s"
+        except OSError as error:
+            why = f"cannot be read ({error})"
+        except ValueError as error:
+            heard.append(str(error))
+        if share < 1.0:
+            time.sleep(min(_PAUSE_S, 0.1 * timeout))
+    # What a controller has said tells more than that it then fell silent.
+    return FactoryKinematics(missing=f"port {PORT} of {address} " + (f"sent {heard[-1]}" if heard else why))
 
 
-def _first(connection: socket.socket, deadline: float) -> FactoryKinematics:
-    while True:
-        size, kind = _HEAD.unpack(_bytes(connection, _HEAD.size, deadline))
-        if not _HEAD.size <= size <= _LONGEST:
-            raise ValueError(f"a package of {size} bytes, allowed {_HEAD.size} to {_LONGEST}")
-        content = _bytes(connection, size - _HEAD.size, deadline)
-        if kind != _STATE:
-            continue
-        for part, data in _parts(content):
-            if part == _KINEMATICS:
-                return parse_kinematics_info(data)
+def _first(address: str, deadline: float, heard: list[str]) -> LinkTable:
+    """The first table of a new connection that is one; what is wrong with those before it is added to `heard`."""
+    with socket.create_connection((address, PORT), timeout=deadline - time.monotonic()) as connection:
+        while True:
+            size, kind = _HEAD.unpack(_bytes(connection, _HEAD.size, deadline))
+            if not _HEAD.size <= size <= _LONGEST:
+                raise ValueError(f"a package of {size} bytes, allowed {_HEAD.size} to {_LONGEST}")
+            content = _bytes(connection, size - _HEAD.size, deadline)
+            if kind != _STATE:
+                continue
+            try:
+                for part, data in _parts(content):
+                    if part == _KINEMATICS:
+                        return parse_kinematics_info(data)
+            except ValueError as error:
+                heard.append(str(error))
 
 
 def _parts(content: bytes) -> Iterator[tuple[int, bytes]]:
@@ -79,14 +89,18 @@ def _parts(content: bytes) -> Iterator[tuple[int, bytes]]:
         at += size
 
 
-def parse_kinematics_info(data: bytes) -> FactoryKinematics:
-    """The content of a kinematics info part, 220 bytes; later versions may append. ValueError when it is none."""
+def parse_kinematics_info(data: bytes) -> LinkTable:
+    """The content of a kinematics info part, 220 bytes; later versions may append. ValueError when it tells no table.
+
+    Its checksums are of the joints' calibration and are not needed here.
+    """
     if len(data) < _CONTENT.size:
         raise ValueError(f"kinematics of {len(data)} bytes, {_CONTENT.size} are needed")
     numbers = _CONTENT.unpack_from(data)
     theta, a, d, alpha = (numbers[start : start + 6] for start in (6, 12, 18, 24))
-    status = int(numbers[30])
-    return FactoryKinematics(LinkTable(theta, a, d, alpha), numbers[:6], _STATUS.get(status, f"status {status}"))
+    if numbers[30] == _NOT_INITIALISED or not any(a + d):
+        raise ValueError("a kinematics that is not initialised; switch the arm on")
+    return LinkTable(theta, a, d, alpha)
 
 
 def _bytes(connection: socket.socket, count: int, deadline: float) -> bytes:

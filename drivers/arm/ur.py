@@ -20,7 +20,7 @@ import numpy as np
 from drivers.arm.clock_latch import latch_clock
 from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.session import ArmSession
 from drivers.arm.wrong_arm import Forward
@@ -92,7 +92,7 @@ class UrArm:
             check_positive(name, "braking", braking, 20.0, "rad/s^2"),
             control,
         )
-        self.factory = read_factory_kinematics(address)
+        self.factory = read_factory_kinematics(address, connect_timeout)
         if forward_of is not None:
             forward = forward_of(self.factory.table)
         self._session = ArmSession(
@@ -117,6 +117,11 @@ class UrArm:
     def link_table(self) -> LinkTable | None:
         """The factory's table that the controller computes with, as of the connection; None where it told none."""
         return self.factory.table
+
+    @property
+    def untold(self) -> str:
+        """Why the controller's table was not known at the connection; "" when it was."""
+        return self.factory.missing
 
     def ping(self) -> float:
         """Ask the dashboard server for the robot mode; the round trip in wall seconds."""
@@ -157,6 +162,7 @@ class UrArm:
             digital_inputs=snapshot.inputs,
             digital_outputs=snapshot.outputs,
             device_time=snapshot.device_time,
+            controlled=snapshot.mode == MODE_RUNNING and snapshot.program_running,
         )
 
     # --- moving ---

@@ -10,7 +10,7 @@ leaves the device safe and is idempotent.
 """
 
 from drivers.clock_map import Latch
-from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState
+from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
 from drivers.interfaces.device import Device, Identity, LinkStatistics, Motion, Vector
 from drivers.interfaces.rail import Rail, RailState, Sweep
@@ -37,8 +37,10 @@ __all__ = [
     "Motion",
     "Rail",
     "RailState",
+    "SaysWhyUntold",
     "Sweep",
     "Vector",
     "Vehicle",
     "VehicleState",
+    "why_untold",
 ]

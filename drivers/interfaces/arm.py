@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from drivers.clock_map import Latch
 from drivers.interfaces.device import Device, Motion, Vector
@@ -28,7 +28,8 @@ class ArmState:
 
     `flange` is base_from_flange as (x, y, z, rx, ry, rz), m and rotation vector in rad, as the arm reports it from its
     joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m. `stamp` is the host time at
-    which the packet arrived, `device_time` in s the arm's own clock when it was measured.
+    which the packet arrived, `device_time` in s the arm's own clock when it was measured. `controlled` is False while
+    nothing can move the arm, because it has no power or no control program; its flange may then be that of any tool.
     """
 
     stamp: float
@@ -41,6 +42,7 @@ class ArmState:
     digital_inputs: int
     digital_outputs: int
     device_time: float = 0.0
+    controlled: bool = True
 
 
 class ArmMotion(Motion, Protocol):
@@ -101,3 +103,17 @@ class Arm(Device, Protocol):
         A protective stop is cleared only when a person has `confirmed` it, else `DeviceFault` (arm.protective_stop).
         `stop()` and `close()` end it: it raises `Aborted`, and nothing was unlocked or started after them.
         """
+
+
+@runtime_checkable
+class SaysWhyUntold(Protocol):
+    """What an arm may offer besides `Arm`: a reason beside a link table that it did not tell."""
+
+    @property
+    def untold(self) -> str:
+        """Why `Arm.link_table` is None, in words; "" where it is not, or where the arm never tells one."""
+
+
+def why_untold(arm: Arm) -> str:
+    """Why the arm has told no link table, or "" when it has, or gives no reason."""
+    return arm.untold if isinstance(arm, SaysWhyUntold) else ""

@@ -80,6 +80,7 @@ class DirectArm:
             digital_inputs=model.digital_inputs,
             digital_outputs=model.digital_outputs,
             device_time=self.clock.now(),
+            controlled=model.power is Power.RUNNING,
         )
 
     @contextmanager

@@ -12,12 +12,14 @@ import pytest
 from arm_bench import ArmBench
 from cable import Cable
 
+from cell.devices.diagnosis import _arm_state
 from cell.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
-from drivers.arm.factory import read_factory_kinematics
+from drivers.arm.factory import parse_kinematics_info, read_factory_kinematics
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault
+from drivers.interfaces import why_untold
 
 pytestmark = pytest.mark.wire
 
@@ -28,6 +30,16 @@ FACTORY = np.array(
     ]
 )  # fmt: skip
 """a, d, alpha, joint offset, as a factory may have found them: the offsets of joints 2 to 4 nearly cancel."""
+
+
+TOLD_SIZE = 220
+TOLD = struct.pack(">6I24dI", *range(6), *(k / 8 for k in range(24)), 2)
+"""A controller's kinematics info."""
+
+
+def _package(kinematics):
+    """A state package with this kinematics info in it."""
+    return struct.pack(">iBIB", 10 + len(kinematics), 16, 5 + len(kinematics), 5) + kinematics
 
 
 def forward_of(table):
@@ -44,7 +56,6 @@ def test_an_arm_is_moved_by_the_table_that_its_controller_tells():
     with ArmBench(factory=FACTORY) as bench:
         arm = connect(bench.address)
         try:
-            assert arm.factory.status == "linearised"
             np.testing.assert_array_equal(
                 arm.link_table().alpha, FACTORY[:, 2] + [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
             )
@@ -71,6 +82,8 @@ def test_where_the_controller_tells_no_table_nothing_moves_unless_it_is_the_make
     with ArmBench() as bench, Cable(bench.address, but=(30001,)) as cable:
         arm = connect(cable.address)
         assert arm.link_table() is None
+        assert "port 30001 of" in why_untold(arm)
+        assert "own kinematics not told (port 30001 of" in _arm_state(arm)
         arm.move_joints(arm.state().joints + 0.02, 0.5, 1.0).wait(10.0)
         arm.close()
 
@@ -87,28 +100,50 @@ def test_an_arm_of_another_size_is_named_before_anything_is_sent_to_it():
         (struct.pack(">iB", 3, 16), "package of 3 bytes"),
         (struct.pack(">iB", 15, 16) + struct.pack(">IB", 99, 5) + bytes(5), "part of 99 bytes where 10 are left"),
         (struct.pack(">iB", 70_000, 16), "package of 70000 bytes"),
-        (struct.pack(">iBIB6I24dI", 230, 16, 225, 5, *[0] * 6, *[np.nan] * 24, 2), "theta of a link table"),
+        (_package(struct.pack(">6I24dI", *[0] * 6, *[np.nan] * 24, 2)), "theta of a link table"),
+        (_package(bytes(TOLD_SIZE)), "not initialised; switch the arm on"),
     ],
-    ids=["none", "short", "part", "long", "nan"],
+    ids=["none", "short", "part", "long", "nan", "not initialised"],
 )
 def test_a_port_that_sends_something_else_is_unknown_with_its_reason(sent, why):
-    for number in range(2, 255):
-        try:
-            server = socket.create_server((f"127.0.4.{number}", 30001))
-            break
-        except OSError:
-            continue
-    with server:
-        thread = threading.Thread(target=_send, args=(server, sent), daemon=True)
-        thread.start()
+    with _server() as server:
+        threading.Thread(target=_send, args=(server, sent), daemon=True).start()
         told = read_factory_kinematics(server.getsockname()[0], timeout=0.5)
-        thread.join(3.0)
     assert told.table is None
     assert why in told.missing
 
 
-def _send(server, sent):
-    """Tell the first client this, and wait for it to leave."""
-    with server.accept()[0] as connection:
-        connection.sendall(sent)
-        connection.recv(1)
+@pytest.mark.parametrize(
+    "sent",
+    [
+        (_package(TOLD[:100]) + _package(TOLD),),
+        (_package(bytes(TOLD_SIZE - 4) + struct.pack(">I", 0)) + _package(TOLD),),
+        (struct.pack(">iB", 3, 16), _package(TOLD)),
+        (b"", _package(TOLD)),
+    ],
+    ids=["one that is cut off", "one not initialised", "a broken stream", "silence"],
+)
+def test_what_comes_before_the_table_does_not_hide_it(sent):
+    """Each of `sent` goes to one connection; the table comes last, in the same one or the second."""
+    with _server() as server:
+        threading.Thread(target=_send, args=(server, *sent), daemon=True).start()
+        told = read_factory_kinematics(server.getsockname()[0], timeout=1.0)
+    assert told.table == parse_kinematics_info(TOLD), told.missing
+
+
+def _server():
+    """A listening port 30001 on an address that nobody uses."""
+    for number in range(2, 255):
+        try:
+            return socket.create_server((f"127.0.4.{number}", 30001))
+        except OSError:
+            continue
+    raise AssertionError("no address is free")
+
+
+def _send(server, *sent):
+    """Tell one client after the other this, and wait for each to leave."""
+    for each in sent:
+        with server.accept()[0] as connection:
+            connection.sendall(each)
+            connection.recv(1)

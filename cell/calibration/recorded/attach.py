@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
+from cell.calibration.recorded.agreement import scaled
 from cell.calibration.recorded.conventions import why_not
-from cell.calibration.recorded.decide import Decision, decide, scale_problem, scaled
+from cell.calibration.recorded.decide import Decision, decide, scale_problem
 from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.listing import natural
 from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
@@ -20,6 +23,8 @@ from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES = 3
 FARTHEST_M = 20.0
+# Poses of an arm that stands still, read twice, are no further apart.
+SAME_M, SAME_RAD = 0.5e-3, 2e-3
 
 
 @dataclass
@@ -64,11 +69,13 @@ def attach_poses(
         return Understood(about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
     for one in series:
         _tell_apart(one, frames, len(series) == 1)
+        _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
+    in_order = [other for one in series if (other := _in_order(one, frames)) is not None]
     boards = {}
     for k, frame in enumerate(frames):
-        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
             continue
         try:
             boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
@@ -84,7 +91,7 @@ def attach_poses(
         )
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
-        decision = decide(series, boards, pitch, options.poses, options.setup)
+        decision = decide(series, boards, pitch, options.poses, options.setup, in_order)
     except RefusedError as error:
         return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
     return _apply(decision, frames, pitch, options)
@@ -108,6 +115,12 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             "shift_mm": 1e3 * best.shift,
         },
     )
+    if decision.by_name is not None:
+        decision.by_name.series.alone = []
+        understood.notes.append(
+            f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
+            f"leaves {best.left}; by name they leave {decision.by_name.left}"
+        )
     problem, refused = scale_problem(best, pitch)
     if problem and refused:
         understood.refused = f"no hand-eye: {problem}"
@@ -119,7 +132,7 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
         frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
         pose = poses.get(k)
         if pose is None:
-            if frame.reason is None:
+            if frame.reason in (None, Reason.DUPLICATE):
                 why = why_not(record.numbers, record.named, best.reading.name)
                 frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
             continue
@@ -131,7 +144,46 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             continue
         if not refused:
             frame.base_from_flange = metres
+    _compare_copies(frames)
     return understood
+
+
+def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
+    """Give a frame without a pose that of another picture of its place."""
+    index = {id(frame): k for k, frame in enumerate(frames)}
+    for k, frame in enumerate(frames):
+        if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
+            one.of.setdefault(index[id(frame.shows)], one.of[k])
+
+
+def _in_order(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
+    """The same poses given to the pictures in order, where there are as many and their names say otherwise."""
+    places = [k for k, f in enumerate(frames) if f.shows is None]
+    if one.by not in ("name", "number") or len(places) != len(one.records):
+        return None
+    single = len({r.path for r in one.records}) == len(one.records)
+    records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
+    of = dict(zip(places, records, strict=True))
+    return None if all(one.of.get(k) is r for k, r in of.items()) else Series(one.name, records, of, "order")
+
+
+def _compare_copies(frames: Sequence[RecordedFrame]) -> None:
+    """Refuse pictures that show what another shows, and have another pose; a stripe that is theirs is not used."""
+    for frame in frames:
+        first, own = frame.shows, frame.base_from_flange
+        if first is None or own is None or first.base_from_flange is None:
+            continue
+        apart = first.base_from_flange.actInv(own)
+        way, turn = float(np.linalg.norm(apart.translation)), float(np.linalg.norm(pin.log3(apart.rotation)))
+        if way < SAME_M and turn < SAME_RAD:
+            continue
+        text = (
+            f"its pose ({frame.pose_from}) is {1e3 * way:.1f} mm and {np.degrees(turn):.2f}° from that of {first.name}"
+        )
+        if first.stripe_from == frame.name:
+            first.profile, first.stripe_from, first.stripe_off = None, "", ""
+            first.stripe_text = f"{frame.name} was not taken at the same place: {text}"
+        frame.refuse(Reason.NO_POSE, f"{frame.text}, but {text} ({first.pose_from}): which one is right?")
 
 
 def _tell_apart(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:

@@ -42,7 +42,7 @@ from drivers.errors import RefusedError
 Setup = str
 STRANGE_SHARE, STRANGE_TURN = 0.15, math.radians(10.0)
 LEAST_FRAMES = 4
-"""With three poses everything fits: there is no fourth to disagree."""
+"""Of stops, not of pictures. With three poses everything fits: there is no fourth to disagree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ def solve_chain(
     """
     if len(frames) < LEAST_FRAMES:
         raise RefusedError(
-            f"{len(frames)} frames have a flange pose; a hand-eye that can be checked needs {LEAST_FRAMES} or more"
+            f"{len(frames)} stops have a flange pose; a hand-eye that can be checked needs {LEAST_FRAMES} or more "
+            "(further pictures of one stop do not count)"
         )
     setup, observations, staged = _placed(frames, pictures, known)
     scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)

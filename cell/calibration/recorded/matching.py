@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.calibration.recorded.listing import PICTURES, natural
+from cell.calibration.recorded.listing import PICTURES
 
 # Words that say what is in a file and not which frame it is of.
 ROLES = (
@@ -89,19 +90,19 @@ def _equal(left: list[str], right: list[str], by: str) -> Matched:
 def _nearest(pictures: Sequence[str], labels: Sequence[str | None], times: Sequence[float | None]) -> Matched | None:
     """The pose of the nearest time, where names and table have times of the same clock."""
     shown = [_clock(p) for p in pictures]
-    told = [t if t is not None else _clock(x or "") for t, x in zip(times, labels, strict=True)]
-    have = [t for t in told if t is not None]
-    if len(have) < len(told) or len(have) < 2 or any(s is None for s in shown):
+    told = [t if t is not None and math.isfinite(t) else _clock(x or "") for t, x in zip(times, labels, strict=True)]
+    timed = [k for k, t in enumerate(told) if t is not None]
+    if len(timed) < 2 or 2 * len(timed) < len(told) or any(s is None for s in shown):
         return None
     for scale in (1.0, 1e-3, 1e-6, 1e-9):
         clock = np.array([s for s in shown if s is not None]) * scale
-        table = np.array(have)
+        table = np.array([t for t in told if t is not None])
         apart = np.abs(clock[:, None] - table[None, :])
         near = apart.argmin(axis=1)
         reach = 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
         good = apart.min(axis=1) <= max(reach, 1e-3)
         if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
-            of = [int(k) if g else None for k, g in zip(near, good, strict=True)]
+            of = [timed[k] if g else None for k, g in zip(near, good, strict=True)]
             alone = [k for k in range(len(labels)) if k not in set(of)]
             return Matched(of, "time", alone, {})
     return None
@@ -130,11 +131,6 @@ def _plain(name: str) -> str:
 def series_name(name: str) -> str:
     """A file's name with its numbers taken out: files of one series have the same."""
     return re.sub(r"\d+", "N", name.lstrip("_"))
-
-
-def ordered(names: Sequence[str]) -> list[int]:
-    """Indices of names in natural order."""
-    return sorted(range(len(names)), key=lambda k: natural(names[k]))
 
 
 def frame_key(name: str) -> str:

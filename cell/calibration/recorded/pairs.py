@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from cell.calibration.recorded.result import closed_form_dict, empty_result, hand_eye_dict
 from cell.calibration.recorded.solution import apply_checks
+from cell.calibration.recorded.stops import counted, mean_pair, pairs_by_stop
 from cell.calibration.solve.checks import Check
 from cell.calibration.solve.consistency import misplacements, odd_turns
 from cell.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
@@ -20,6 +21,8 @@ from cell.vision.pictures import Reason
 from drivers.errors import ConfigError, RefusedError
 
 LEAST_PAIRS = 4
+"""Of stops, not of pairs."""
+FARTHEST_M = {"the flange's distance from the base": 10.0, "the board's distance from the camera": 20.0}
 
 
 def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
@@ -27,9 +30,13 @@ def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
 
     Pairs that do not agree with most are left out and named. Raises ConfigError when they give none.
     """
+    _check_unit(pairs)
     result = empty_result(None)
     del result["frames_rms"]
-    wrong = _wrong(pairs)
+    stops = pairs_by_stop(pairs)
+    means = [mean_pair([pairs[k] for k in stop]) for stop in stops]
+    odd = _wrong(means)
+    wrong = {k: text for of, text in odd.items() for k in stops[of]}
     result["frames"] = [
         {
             "name": f"pair {k}", "used": k not in wrong, "reason": str(Reason.NO_POSE) if k in wrong else None,
@@ -37,10 +44,15 @@ def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
         }
         for k in range(len(pairs))
     ]  # fmt: skip
-    kept = [pair for k, pair in enumerate(pairs) if k not in wrong]
+    kept = [pair for k, pair in enumerate(means) if k not in odd]
+    if len(stops) < len(pairs):
+        result["notes"].append(
+            f"{counted(len(pairs), len(stops), 'pairs')}: pairs of one stop share its error and count as one"
+        )
     if len(kept) < LEAST_PAIRS:
         raise ConfigError(
-            f"{len(kept)} pairs of poses agree with each other; a hand-eye that can be checked needs {LEAST_PAIRS}"
+            f"pairs of poses of {len(kept)} stops agree with each other; a hand-eye that can be checked needs "
+            f"{LEAST_PAIRS}"
         )
     boards = [board for _, board in kept]
     solutions: list[tuple[str, HandEye, list[pin.SE3]]] = []
@@ -66,6 +78,21 @@ def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
     result["notes"].append("pairs of poses only: no intrinsics, no light plane, no flatness")
     apply_checks(_checks(refined, closed, sigma, off, boards), result)
     return result
+
+
+def _check_unit(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> None:
+    """Refuse positions that cannot be in m. Raises ConfigError."""
+    said = []
+    for place, (what, farthest) in enumerate(FARTHEST_M.items()):
+        far = float(np.median([np.linalg.norm(pair[place].translation) for pair in pairs]))
+        if far > farthest:
+            said.append(f"{what} would be {far:.4g} m (median, allowed {farthest:g} m)")
+    if not said:
+        return
+    mixed = "" if len(said) == len(FARTHEST_M) else "the two poses of a pair seem to have different units: "
+    raise ConfigError(
+        f"pairs of poses: {mixed}{' and '.join(said)}; positions must be in m: are these in mm? Divide them by 1000"
+    )
 
 
 def _wrong(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[int, str]:

@@ -12,7 +12,8 @@ import pinocchio as pin
 from cell.calibration.recorded.conventions import Reading
 from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
-from cell.calibration.recorded.numbers import Content, Record, read_content
+from cell.calibration.recorded.numbers import read_content
+from cell.calibration.recorded.records import Content, Record
 from drivers.errors import ConfigError
 
 LEAST = 2
@@ -62,8 +63,12 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
         name = listing.name(path)
         try:
             contents[name] = read_content(path)
-        except (ValueError, OSError, RecursionError, MemoryError) as error:
+        except ValueError as error:
             unread.append((name, str(error)))
+            continue
+        except Exception as error:
+            # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
+            unread.append((name, f"it cannot be read ({type(error).__name__}): {error}"))
             continue
         if not contents[name].records and not contents[name].links:
             unread.append((name, "no pose is in it (6, 7, 12 or 16 numbers that belong together)"))

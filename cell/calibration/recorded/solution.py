@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from cell.calibration.collect.stripe_on_board import on_plane
 from cell.calibration.recorded.chain import check_chain, report_chain, solve_chain
 from cell.calibration.recorded.folder import RecordedFrame, used
 from cell.calibration.recorded.result import intrinsics_dict, plane_dict, seen_depths
+from cell.calibration.recorded.stops import by_stop, counted, merged
 from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.checks import Check, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
+from cell.calibration.solve.given_camera import against_pictures
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
 from cell.calibration.solve.plane_checks import (
     PlaneKnown,
@@ -27,12 +30,14 @@ from cell.calibration.solve.plane_checks import (
 from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
+from cell.vision.board.view import BoardView
 from cell.vision.pictures import Reason
 from drivers.errors import RefusedError
 
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
+OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
 OBLIQUE = math.radians(75.0)
 
 
@@ -43,8 +48,11 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
     """
     while True:
         kept = used(frames)
-        views = [f.view for f in kept if f.view is not None]
-        chosen, plain = choose_lens(views) if given is None else (given_camera(given, views),) * 2
+        views = _views(kept)
+        if given is None:
+            chosen, plain = (_of_all(c, views) for c in choose_lens(_views([merged(s) for s in by_stop(kept)])))
+        else:
+            chosen, plain = (given_camera(given, views),) * 2
         worst = int(np.argmax(chosen.view_rms))
         typical = float(np.median(chosen.view_rms))
         if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
@@ -65,6 +73,15 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
                 )
         if not oblique:
             return chosen, plain
+
+
+def _of_all(found: Intrinsics, views: Sequence[BoardView]) -> Intrinsics:
+    """The camera of the stops with the residuals of each picture."""
+    return replace(found, view_rms=np.array([board_pose(view, found.camera).rms_px for view in views]))
+
+
+def _views(frames: Sequence[RecordedFrame]) -> list[BoardView]:
+    return [f.view for f in frames if f.view is not None]
 
 
 def agreeing(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
@@ -99,17 +116,28 @@ def solve_frames(
         posed = [f for f in posed if f.reason is None]
     rest = used(frames)
     result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
+    stops = [merged(stop) for stop in by_stop(rest)]
+    if len(stops) < len(rest):
+        notes.append(
+            f"{counted(len(rest), len(stops))}: pictures of one stop share its error and count as one frame, their mean"
+        )
+    views = _views(stops)
+    beside: list[Check] = []
+    if given is not None:
+        chosen, beside = against_pictures(chosen, views)
+        plain = chosen
     result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
     result["intrinsics_without_distortion"] = intrinsics_dict(plain)
-    views = [f.view for f in rest if f.view is not None]
-    checks = camera_checks(chosen, views, given=given is not None)
+    checks = beside + camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
     if posed:
         if len(rest) > len(posed):
             notes.append(
                 f"{len(rest) - len(posed)} used frames have no flange pose: they count for the intrinsics only"
             )
         try:
-            chain = solve_chain(posed, chosen, setup, hold_camera or given is not None)
+            chain = solve_chain(
+                [merged(stop) for stop in by_stop(posed)], chosen, setup, hold_camera or given is not None
+            )
             checks += check_chain(chain, chosen)
             report_chain(chain, chosen, result)
         except (RefusedError, np.linalg.LinAlgError) as error:
@@ -117,7 +145,7 @@ def solve_frames(
     else:
         notes.append("no used frame has a flange pose: no hand-eye, no flatness")
     if result["light_plane"] is None and result["hand_eye"] is None:
-        checks += _report_plane(rest, chosen, result)
+        checks += _report_plane(stops, chosen, result)
     apply_checks(checks, result)
 
 
@@ -134,6 +162,9 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
         for part in ("hand_eye", "light_plane"):
             if result[part] is not None and part not in failed:
                 failed[part] = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
+        for name in OTHER_CAMERAS:
+            result["refused_values"][name] = result[name]
+            result[name] = None
     for part, text in failed.items():
         result["refused"][part] = text
         result["refused_values"][part] = result[part]
@@ -145,7 +176,7 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
 def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[Check]:
     """The light plane from pictures alone, when the stripe is in them, and its checks."""
     camera = pictures.camera
-    views = [f.view for f in frames if f.view is not None]
+    views = _views(frames)
     profiles = [f.profile for f in frames]
     notes: list[str] = result["notes"]
     if sum(p is not None for p in profiles) < 2:

@@ -116,6 +116,9 @@ def read_on_board(source: Source, channel: Channel) -> ReadStripe:
             profile = extract(image, off, "rows" if axis == "rows" else "columns", laser=channel.chosen)
         except PictureRefused as refused:
             return ReadStripe(text=str(refused))
+        except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
+            # One picture that upsets the search must not end the reading of the others.
+            return ReadStripe(text=f"the search for the stripe failed: {type(error).__name__}: {error}")
         found.append(_on_board(profile, *subtracted(image, off, StripeSettings()), source.view, sheet))
     sure = [f for f in found if f.profile is not None] or found
     return replace(max(sure, key=lambda f: f.points), off=off is not None)
@@ -180,17 +183,37 @@ def _white(plane: NDArray[np.float32], view: BoardView) -> float:
     return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
 
 
+def calmest(path: Path, offs: Sequence[Path], view: BoardView) -> Path:
+    """Of pictures without the laser, one or more, the one that takes most of the board away from the picture `path`."""
+    if len(offs) == 1:
+        return offs[0]
+    try:
+        image = read_colours(path)
+    except PictureRefused:
+        return offs[0]
+    if (image.shape[1], image.shape[0]) != view.size:
+        return offs[0]
+    sheet = _sheet(view)
+    return min(offs, key=lambda off: _without(image, off, sheet)[1])
+
+
 def _calming(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> Shot | None:
     """The picture without the laser, if it is of the same exposure: if the board vanishes when it is taken off."""
+    off, left = _without(image, path, sheet)
+    return off if left < CALMER else None
+
+
+def _without(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> tuple[Shot | None, float]:
+    """The picture without the laser, and the share of what varies on the board that is left when it is taken off."""
     try:
         off = read_colours(path)
     except PictureRefused:
-        return None
+        return None, float("inf")
     if off.shape[:2] != image.shape[:2] or off.dtype != image.dtype:
-        return None
+        return None, float("inf")
     lit, dark = (picture.mean(axis=2) if picture.ndim == 3 else picture.astype(float) for picture in (image, off))
     before, after = (np.percentile(part[sheet], (10, 90)) for part in (lit, lit - dark))
-    return off if np.ptp(after) < CALMER * np.ptp(before) else None
+    return off, float(np.ptp(after) / max(np.ptp(before), 1.0))
 
 
 def _straight(centres: Array, follows: NDArray[np.bool_]) -> int:

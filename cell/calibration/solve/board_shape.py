@@ -29,7 +29,6 @@ class Bend:
     share: float
     certain: float
     camera: Array
-    camera_sigma: Array
 
     @property
     def believed(self) -> bool:
@@ -82,15 +81,11 @@ def bend_of(adjustment: Adjustment, state: State) -> Bend:
     count = len(parts)
     spread = np.sqrt((count - 1) / count * np.sum((others - others.mean(axis=0)) ** 2, axis=0))
     low, high = int(np.argmin(heights)), int(np.argmax(heights))
-    camera, camera_sigma = np.zeros(9), np.zeros(9)
+    camera = np.zeros(9)
     camera[lens] = found[: len(lens)]
-    formal = scale * np.sqrt(np.diag(np.linalg.pinv(information * scale[:, None] * scale)))
-    moved = np.array([values[: len(lens)] for values in left])
-    scattered = np.sqrt((count - 1) / count * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
-    camera_sigma[lens] = np.maximum(formal[: len(lens)], scattered)
     size_m = float(heights[high] - heights[low])
     certain = float(gain.sum() / max(np.sqrt(count) * gain.std(ddof=1), 1e-9))
-    return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera, camera_sigma)
+    return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera)
 
 
 def surface_shapes(at: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.stops import by_stop, merged
 from cell.calibration.solve.hand_eye import park_martin
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
@@ -25,6 +26,8 @@ MOST_ODD = 0.45
 # A board further from where the others see it than this share of its distance, and than this many times what is
 # usual in the folder, was not where the flange pose says.
 MISPLACED_SHARE, MISPLACED_RATIO = 0.008, 6.0
+LEAST_JUDGES = 5
+"""Others that a frame has to disagree with before it is blamed: of fewer, any may be the one that is wrong."""
 REWEIGHTINGS = 40
 ORDER_ROUNDS = 5
 LEAST_OFF_M = 1e-4
@@ -74,16 +77,21 @@ def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> lis
 
 
 def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
-    """Refuse frames whose flange pose puts the board far from where the others see it; the rest."""
-    boards, flanges = _poses(frames, camera)
+    """Refuse frames whose flange pose puts the board far from where the others see it; the rest.
+
+    Frames of one stop are judged as one.
+    """
+    stops = by_stop(frames)
+    boards, flanges = _poses([merged(stop) for stop in stops], camera)
     misplaced = misplacements(flanges, boards)
     for k, (off, others) in misplaced.items():
-        frames[k].refuse(
-            Reason.NO_POSE,
-            f"the flange pose puts the board {1e3 * off:.0f} mm from where the other frames see it, which agree "
-            f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
-        )
-    return [f for k, f in enumerate(frames) if k not in misplaced]
+        for frame in stops[k]:
+            frame.refuse(
+                Reason.NO_POSE,
+                f"the flange pose puts the board {1e3 * off:.0f} mm from where the other frames see it, which agree "
+                f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
+            )
+    return [f for f in frames if f.reason is None]
 
 
 def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int, float]:
@@ -115,13 +123,15 @@ def misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict
     Nothing is misplaced where no hand-eye can be had, or where most frames would be.
     """
     index, found = list(range(len(flanges))), {}
-    while len(index) > 3:
+    while len(index) > LEAST_JUDGES:
         try:
             off, reach = _misplacements([flanges[k] for k in index], [boards[k] for k in index])
         except RefusedError:
             break
         worst = int(np.argmax(off / reach))
-        others = float(np.median(np.delete(off, worst)))
+        # Six unknowns of 3 n figures follow the frames: of a few, what is left over is smaller than their scatter.
+        left = len(index) - 1
+        others = float(np.median(np.delete(off, worst))) * np.sqrt(left / (left - 2))
         if off[worst] < max(MISPLACED_SHARE * reach[worst], MISPLACED_RATIO * others):
             break
         found[index[worst]] = (float(off[worst]), others)

@@ -36,7 +36,7 @@ CENTRED_LENS = 0.002
 
 @dataclass(frozen=True)
 class LensModel:
-    """Which of k1, k2, p1 and p2, k3 are free, and whether fx and fy are one."""
+    """Which of k1, k2, p1 and p2, k3 are free, and whether fx and fy are one; what is not free is 0, or as `given`."""
 
     name: str
     k1: bool = False
@@ -44,6 +44,7 @@ class LensModel:
     tangential: bool = False
     k3: bool = False
     one_focal: bool = False
+    given: bool = False
 
     @property
     def free(self) -> list[bool]:
@@ -56,11 +57,12 @@ class LensModel:
         return replace(priors, lens=(k1, k2, CENTRED_LENS, CENTRED_LENS, k3), one_focal=self.one_focal)
 
     def held(self, camera: CameraModel) -> CameraModel:
-        """The camera with the terms that are not free at 0."""
-        return camera.with_parameters(np.where(self.free, camera.parameters, 0.0))
+        """The camera with the terms that are not free at 0, or as they were given."""
+        return camera if self.given else camera.with_parameters(np.where(self.free, camera.parameters, 0.0))
 
 
 PLAIN = LensModel("no distortion")
+GIVEN = LensModel("given", given=True)
 RADIAL = (LensModel("k1", k1=True), LensModel("k1, k2", k1=True, k2=True))
 FURTHER = (
     ("k3", {"k1": True, "k2": True, "k3": True}),
@@ -74,7 +76,9 @@ class Intrinsics:
 
     `sigma` (9,) is the larger of what the residuals say and of the scatter between calibrations that lack one view.
     `formal` (9,) the former alone. `tried` has the RMS of left-out views of each lens model that was tried.
-    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations.
+    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations. `pull` (n,) is how
+    far each view moves focal lengths and principal point, over what the residuals allow (Cook's distance); empty with
+    too few views.
     """
 
     camera: CameraModel
@@ -87,6 +91,7 @@ class Intrinsics:
     model: LensModel = PLAIN
     tried: dict[str, float] = field(default_factory=dict)
     bend: Bend | None = None
+    pull: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def point_rms_px(self) -> float:
@@ -142,16 +147,20 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     return _intrinsics(best, views, tried), _intrinsics(plain, views, tried)
 
 
-def fit_camera(views: Sequence[BoardView], model: LensModel) -> Intrinsics:
-    """The camera with a given lens model. Raises RefusedError."""
-    start, _ = zhang(views, lens=model.k1)
-    return _intrinsics(_fitted(model, start, _data(views, start)), views, {})
-
-
 def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
-    """A camera that is known, with the views' residuals in it; its own deviation is not known here."""
+    """A camera that is known, with the views' residuals in it; its own deviation is not known here.
+
+    Raises RefusedError without views.
+    """
+    if not views:
+        raise RefusedError("no picture shows the board, and a given camera needs one to be used: see why, by picture")
     rms = np.array([board_pose(view, camera).rms_px for view in views])
-    return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=LensModel("given"))
+    return Intrinsics(camera, rms, _mean(rms, views), _mean(rms, views), np.zeros(9), model=GIVEN)
+
+
+def beside_given(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
+    """Focal lengths and principal point that the views give by themselves, with the lens of a camera that is known."""
+    return _intrinsics(_fitted(GIVEN, camera, _data(views, camera)), views, {})
 
 
 def _clearly_better(more: _Fit, less: _Fit) -> bool:
@@ -193,8 +202,15 @@ def _intrinsics(
             covariance = covariance + np.outer(moved, moved)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Intrinsics(
-        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend
+        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend,
+        np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
     )  # fmt: skip
+
+
+def _pull(camera: CameraModel, left: LeftOut, covariance: Array) -> Array:
+    """Cook's distance (n,) of each view in focal lengths and principal point."""
+    apart = np.array([other.camera.parameters[:4] - camera.parameters[:4] for other in left.states])
+    return np.asarray(np.einsum("ni,ij,nj->n", apart, np.linalg.pinv(covariance[:4, :4]), apart) / 4)
 
 
 def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:

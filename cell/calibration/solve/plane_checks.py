@@ -81,7 +81,8 @@ def odd_stripes(clouds: Sequence[Array]) -> dict[int, str]:
         if away > max(ODD_SHARE * reach, ODD_RATIO * usual):
             found[k] = (
                 f"its stripe lies {1e3 * away:.1f} mm from the plane of the other frames' stripes, which agree to "
-                f"{1e3 * usual:.1f} mm: is it another line of light, or a reflection?"
+                f"{1e3 * usual:.1f} mm: is it another line of light, a reflection, or the stripe of another "
+                "frame?"
             )
     return found
 
@@ -167,7 +168,8 @@ def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
     return Check(
         "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
         f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
-        "points are not those of one plane; are there two lines, or something else that shines?",
+        "points are not those of one plane; are there two lines, something else that shines, or a stripe that is of "
+        "another frame?",
     )  # fmt: skip
 
 

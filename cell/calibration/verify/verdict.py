@@ -163,7 +163,7 @@ class Verification:
                 f"{DETECTED:.0%} of checks like this one (allowed at the place are {allowed})"
             )
         hiding = [
-            f"{d.change.part}, {d.change.kind} ({_size(d)}, {1e3 * effect:.2f} mm at the place)"
+            f"{d.change.part}, {d.change.kind} ({_size(d)}, {_way(effect)} at the place)"
             for d, effect in zip(v.detectable, self.unseen, strict=True)
             if effect >= SHARE * self.tolerance
         ]
@@ -248,6 +248,10 @@ _UNITS = {"m": "mm", "rad": "deg"}
 def _shown(size: float, unit: str) -> float:
     """A size in m as mm, one in rad as degrees."""
     return 1e3 * size if unit == "m" else float(np.degrees(size))
+
+
+def _way(effect: float) -> str:
+    return f"{1e3 * effect:.2f} mm" if np.isfinite(effect) else "any amount"
 
 
 def _size(d: Detectable) -> str:

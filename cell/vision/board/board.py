@@ -1,7 +1,7 @@
 """A calibration board in a picture: its points, and its pose in front of a calibrated camera.
 
-The one way in for all kinds of boards; each refusal says why. `board_spec.py` names boards, `dot_board.py` and
-`chess.py` find them.
+The one way in for all kinds of boards; each refusal says why. `spec.py` names boards; `chess.py`, `charuco.py`,
+`dot_board.py` and `tags.py` find them.
 """
 
 from __future__ import annotations

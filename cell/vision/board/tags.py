@@ -46,6 +46,12 @@ def find_tags(image: Image, spec: BoardSpec) -> BoardView:
         raise PictureRefused(
             Reason.AMBIGUOUS, f"two grids that could be {spec.name} are in view; cover or remove one of them"
         )
+    if any(len(set(line.tolist())) == 1 for line in np.divmod(tags, spec.cols)):
+        raise PictureRefused(
+            Reason.NO_BOARD,
+            f"the {len(tags)} tags of {spec.name} that were read lie on one line, from which no pose can be told; show "
+            "tags of two rows and two columns",
+        )
     layout = max(
         (_layout(spec, corners, tags, up, turn) for up in (0, 1) for turn in range(4)), key=lambda x: x.fits.sum()
     )

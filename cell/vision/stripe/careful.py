@@ -217,7 +217,9 @@ def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidate
         found, chain, along = coarse(value)
         if not len(chain.rows) or chain.score < LEAST_SCORE:
             return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
+        # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))
+    typical = min(typical, SCALES[-1])
     near = scales[np.abs(np.log(scales / typical)) < 0.75]
     found = candidates(value, np.arange(len(value)), tuple(near), along)
     chain = follow(found)

@@ -87,8 +87,9 @@ def read_colours(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
 
     Raises `PictureRefused` for a file that is no picture.
     """
-    # Unlike IMREAD_UNCHANGED these turn a picture as its EXIF says, as whoever looks for a board in it does.
-    image: Any = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    # As the sensor has it, however the camera was held: `read_picture` reads it so, too.
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image: Any = cv2.imread(str(path), flags)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise PictureRefused(Reason.UNREADABLE, f"{path.name} is no picture of 8 or 16 bits; give a PNG, JPEG or TIFF")
     if image.ndim == 2:

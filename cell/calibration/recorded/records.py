@@ -1,0 +1,66 @@
+"""What a text file holds for a calibration: numbers that may be a pose, by what they are named, and links to files."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.geometry.camera import Array
+
+# Numbers of a pose: 6, 7, 3×4, 4×4; one more in front is a time or a number.
+COUNTS = (6, 7, 12, 16)
+# What a column of a position may begin with, and what those of a rotation are called.
+PREFIXES = ("", "t", "p", "pos", "trans", "translation", "position", "tcp", "flange", "robot", "pose")
+TURNS = (
+    (("qx", "qy", "qz", "qw"), "quaternion"),
+    (("x", "y", "z", "w"), "quaternion"),
+    (("rx", "ry", "rz"), "rotation"),
+    (("roll", "pitch", "yaw"), "rotation"),
+    (("a", "b", "c"), "rotation"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Numbers (n,) that may be a pose; `field` is their place in the file, `label` the picture or number they name.
+
+    `named`: "quaternion" (x, y, z, qx, qy, qz, qw) or "rotation" (x, y, z, then three angles) where names said so.
+    """
+
+    path: Path
+    field: str
+    label: str | None
+    numbers: Array
+    named: str = ""
+    time: float | None = None
+
+
+@dataclass
+class Content:
+    """What a text holds: records, and links between files that it names (picture, role or name of the other, file)."""
+
+    records: list[Record] = field(default_factory=list)
+    links: list[dict[str, str]] = field(default_factory=list)
+
+
+def named_numbers(names: list[str], values: list[Any]) -> tuple[Array | None, str]:
+    """A pose of columns or keys such as x y z qx qy qz qw, x y z rx ry rz, in any order, others beside."""
+    clean = [re.sub(r"\(.*?\)|\[.*?\]|_?(?:mm|deg|rad|m)$|[^a-z]", "", n.lower()) for n in names]
+    for prefix in PREFIXES:
+        place = [clean.index(prefix + a) if prefix + a in clean else -1 for a in "xyz"]
+        if min(place) < 0:
+            continue
+        for turn, kind in TURNS:
+            where = [clean.index(t) if t in clean else -1 for t in turn]
+            if min(where) >= 0 and not (turn[0] == "x" and prefix == ""):
+                return np.array([values[k] for k in (*place, *where)], dtype=np.float64), kind
+    return None, ""
+
+
+def file_like(word: str) -> bool:
+    """True for a word that ends as a file's name does."""
+    return re.search(r"\.[A-Za-z]{2,5}$", word) is not None

@@ -1,0 +1,90 @@
+"""Promise: a camera from a file is read as it was meant, or refused with key, value and next step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.calibration.recorded.known_camera import read_camera
+from cell.calibration.recorded.solution import camera_of
+from cell.geometry.camera import CameraModel
+from drivers.errors import ConfigError, RefusedError
+from tests.recorded_scenes import LENS, MATRIX, SIZE, scene
+from tests.test_no_confident_wrong_answer import right, solved
+
+SENSIBLE = CameraModel(1280, 960, 1400, 1400, 650, 470)
+
+
+def file_of(folder, model: str, lens: str, matrix: str = "1400, 0, 650, 0, 1410, 470, 0, 0, 1"):
+    path = folder / "camera.yaml"
+    path.write_text(
+        f"image_width: 1280\nimage_height: 960\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [{matrix}]\n"
+        f"distortion_model: {model}\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [{lens}]\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize("lens", ["-0.1, 0.05, 0.001, -0.001, 0.2", "-0.1, 0.05, 0.001, -0.001, 0.2, 0, 0, 0"])
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial"])
+def test_the_plain_model_is_read(tmp_path, model, lens):
+    camera = read_camera(file_of(tmp_path, model, lens))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1400, 1410, 650, 470)
+    assert camera.dist == (-0.1, 0.05, 0.001, -0.001, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "words"),
+    [
+        ("rational_polynomial", "0.5, 0.1, 0, 0, 0.02, 0.62, 0.2, 0.05", r"distortion_coefficients\[5\] is 0.62"),
+        ("equidistant", "-0.05, 0.02, -0.01, 0.003", "distortion_model is equidistant"),
+        ("fisheye", "-0.05, 0.02, -0.01, 0.003", "distortion_model is fisheye"),
+        ("plumb_bob", "0.1", "distortion_coefficients has 1 numbers"),
+        ("plumb_bob", ".nan, 0, 0, 0, 0", "k1 is nan"),
+    ],
+)
+def test_other_lenses_are_refused_by_name(tmp_path, model, lens, words):
+    with pytest.raises(ConfigError, match=words) as refused:
+        read_camera(file_of(tmp_path, model, lens))
+    assert "--camera out" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        ("-1400, 0, 650, 0, 1410, 470, 0, 0, 1", "fx is -1400 px, allowed are 128"),
+        ("1400, 0, 650, 0, 0, 470, 0, 0, 1", "fy is 0 px"),
+        ("1400, 0, 6500, 0, 1410, 470, 0, 0, 1", "cx is 6500 px"),
+        ("1.4, 0, 0.65, 0, 1.41, 0.47, 0, 0, 1", "fx is 1.4 px"),
+        ("1400, 3, 650, 0, 1410, 470, 0, 0, 1", "camera_matrix is"),
+    ],
+)
+def test_a_matrix_that_is_no_camera_is_refused(tmp_path, matrix, words):
+    with pytest.raises(ConfigError, match=words):
+        read_camera(file_of(tmp_path, "plumb_bob", "0, 0, 0, 0, 0", matrix))
+
+
+def test_a_given_camera_without_pictures_is_refused():
+    with pytest.raises(RefusedError, match="no picture shows the board"):
+        camera_of([], SENSIBLE)
+
+
+def given(fx: float = 1.0, cx: float = 0.0) -> CameraModel:
+    return CameraModel(*SIZE, fx * MATRIX[0, 0], fx * MATRIX[1, 1], MATRIX[0, 2] + cx, MATRIX[1, 2], tuple(LENS))
+
+
+@pytest.mark.parametrize("wrong", [given(fx=1.03), given(cx=25.0)])
+def test_the_file_of_another_camera_is_refused_with_all_that_rests_on_it(wrong):
+    result = solved(scene(laser=False), wrong)
+    assert "given camera against that of the pictures" in result["refused"]["intrinsics"]
+    assert result["hand_eye"] is None
+    assert all(result[name] is None for name in result if name.startswith("intrinsics"))
+    assert result["refused_values"]["intrinsics_from_pictures"]["fx"] == wrong.fx
+
+
+@pytest.mark.parametrize("off", [1.0, 1.003, 0.99])
+def test_what_a_given_camera_is_off_by_is_stated_or_refused(off):
+    result = solved(scene(seed=7, count=6, laser=False), given(fx=off))
+    assert right(result)
+    if off == 1.0:
+        assert not result["refused"]
+        assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0

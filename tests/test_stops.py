@@ -1,0 +1,88 @@
+"""Promise: more pictures of the same stop do not make a calibration look better known than the stops allow."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.calibration.recorded.folder import RecordedFrame, read_pose_pairs
+from cell.calibration.recorded.pairs import calibrate_pairs
+from cell.geometry.camera import CameraModel
+from cell.vision.board.board import board_pose
+from drivers.errors import ConfigError
+from tests.recorded_scenes import DOTS_PX, LENS, MATRIX, SIZE, scene
+from tests.test_no_confident_wrong_answer import right, solved
+
+
+def repeated(frames: list[RecordedFrame], times: int) -> list[RecordedFrame]:
+    """Each frame so many times, every picture with noise of its own, at the pose that the arm told once."""
+    rng = np.random.default_rng(1)
+    made = []
+    for frame in frames:
+        for k in range(times):
+            view = replace(frame.view, pixels=frame.view.pixels + rng.normal(0, DOTS_PX, frame.view.pixels.shape))
+            name = f"{frame.path.stem}_{k}.png"
+            made.append(RecordedFrame(Path(name), name, view, frame.profile, frame.base_from_flange))
+    return made
+
+
+def given_pairs(frames: list[RecordedFrame]) -> list[tuple[pin.SE3, pin.SE3]]:
+    """The frames' flange poses, and their boards as the true camera sees them."""
+    truth = CameraModel(*SIZE, MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2], tuple(LENS))
+    return [(f.base_from_flange, board_pose(f.view, truth).camera_from_board) for f in frames]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_pictures_of_one_stop_count_as_one(seed):
+    result = solved(repeated(scene(seed, count=4, arm_mm=1.0, arm_mrad=2.0, laser=False), 4))
+    assert right(result)
+    assert any(note.startswith("16 pictures of 4 stops") for note in result["notes"])
+    assert len(result["frames_rms"]) == 16
+
+
+def test_the_light_plane_counts_stops_too():
+    once = solved(scene(count=6))
+    often = solved(repeated(scene(count=6), 3))
+    assert right(often)
+    assert often["light_plane"]["sigma_place_mm"] == pytest.approx(once["light_plane"]["sigma_place_mm"], rel=0.5)
+
+
+def test_many_pictures_of_three_stops_are_not_enough():
+    result = solved(repeated(scene(count=3), 5))
+    assert "3 stops" in result["refused"]["hand_eye"]
+    assert right(result)
+
+
+def test_pairs_of_one_stop_count_as_one():
+    pairs = given_pairs(scene(count=6, laser=False))
+    once, often = calibrate_pairs(pairs), calibrate_pairs([pair for pair in pairs for _ in range(4)])
+    assert any(note.startswith("24 pairs of 6 stops") for note in often["notes"])
+    np.testing.assert_allclose(often["hand_eye"]["sigma_mm"], once["hand_eye"]["sigma_mm"], rtol=1e-3)
+    with pytest.raises(ConfigError, match="of 3 stops"):
+        calibrate_pairs([pair for pair in pairs[:3] for _ in range(4)])
+
+
+@pytest.mark.parametrize(
+    ("flange", "board", "words"),
+    [(1e3, 1e3, "flange's .* and the board's"), (1e3, 1.0, "different units"), (1.0, 1e3, "different units")],
+)
+def test_pairs_that_are_not_in_metres_are_refused(flange, board, words):
+    pairs = [
+        (pin.SE3(f.rotation, flange * f.translation), pin.SE3(b.rotation, board * b.translation))
+        for f, b in given_pairs(scene(laser=False))
+    ]
+    with pytest.raises(ConfigError, match=words):
+        calibrate_pairs(pairs)
+
+
+def test_a_pair_without_finite_numbers_is_named(tmp_path):
+    pairs = np.array([(f.homogeneous, b.homogeneous) for f, b in given_pairs(scene(laser=False))])
+    pairs[3, 1, 0, 3] = np.nan
+    (tmp_path / "pairs.json").write_text(json.dumps(pairs.tolist()))
+    with pytest.raises(ConfigError, match="pair 3"):
+        read_pose_pairs(tmp_path)
