@@ -223,7 +223,7 @@ def test_the_list_tells_when_what_how_and_how_long(
     text = capsys.readouterr().out
     assert "2026-03-01 10:00" in text
     assert "2 min  stored" in text
-    assert "31 s  translation along the x" in text
+    assert "31 s  translation along the z" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
