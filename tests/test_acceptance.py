@@ -7,10 +7,11 @@ import pytest
 
 from cell.geometry.light_plane import LightPlane
 from cell.lab.bench import artefacts, form_errors
-from cell.lab.bench.acceptance import _flatness, _probing, _spacing
+from cell.lab.bench.acceptance import NOISE_FACTOR, _flatness, _probing, _spacing
 from cell.lab.paper.rig import Noise, RigSpec, draw_head
 from cell.reconstruction import ScanGeometry
 from drivers.errors import RefusedError
+from sim_backends.world.levels import LEVELS
 
 
 def ball(count: int = 3000, radius: float = 0.0075) -> np.ndarray:
@@ -119,3 +120,7 @@ def test_places_cover_the_volume_as_the_standard_asks() -> None:
     for first, second in bars:
         assert np.linalg.norm(second - first) == pytest.approx(artefacts.SPACING)
     assert len(artefacts.flat_poses(spec)) == 6
+
+
+def test_every_level_has_its_noise() -> None:
+    assert set(NOISE_FACTOR) == set(LEVELS)
