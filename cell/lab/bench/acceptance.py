@@ -25,7 +25,7 @@ CAP = float(np.radians(50.0))
 FLAT_BORDER = 0.001
 """Border of the flat that is left out, m: mixed pixels."""
 NOISE_FACTOR = {"ideal": 0.1, "nominal": 1.0, "harsh": 2.5, "workshop": 1.0}
-"""Of the scan head's noise. Of a workshop's effects the head alone, on its bench, has only what its drawing may be off."""
+"""Of the scan head's noise. Alone, on its bench, the head has of a workshop only what its drawing may be off."""
 GAUSS_95 = 2 * 1.959964
 """Width of the band that holds 95 % of a Gaussian variable, in standard deviations."""
 
