@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cell.inversion.rocking import Rocking, also
+from cell.lab.bench.realism import verdict
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
@@ -178,3 +180,14 @@ def test_the_fan_ends_and_the_sun_moves() -> None:
     late = world._cameras.picture("target", facing, base, False, 0.004, t=100.0).astype(float)
     moved = np.abs(late - early)
     assert np.percentile(moved, 99.5) > 8.0 > 3.0 * np.median(moved)
+
+
+@pytest.mark.parametrize("effect", [*Effects.names(), "workshop"])
+def test_only_a_refusal_that_names_the_effect_is_excused(effect: str) -> None:
+    elsewhere = "the arm, the camera and the laser's light: 3 points of the stripe cover the joint; held at the elbow"
+    assert verdict({"outcome": "refused", "effect": effect, "reason": elsewhere}) == "refused"
+
+
+def test_a_refusal_that_names_rocking_is_one_by_its_name() -> None:
+    reason = f"the parts do not agree {also(Rocking(4.0, 5e-5, 5e-3))}"
+    assert verdict({"outcome": "refused", "effect": "rocking", "reason": reason}) == "named"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +105,8 @@ def _walk(path: Path, data: Any, place: list[str], label: str | None, content: C
 
 def _array(data: Any) -> Array | None:
     """Numbers of a list, the two parts of ((x, y, z), (…)) one behind the other; None where words are among them."""
-    try:
+    with suppress(TypeError, ValueError):
         return np.asarray(data, dtype=np.float64)
-    except (TypeError, ValueError):
-        pass
     try:
         parts = [np.ravel(np.asarray(part, dtype=np.float64)) for part in data]
     except (TypeError, ValueError):

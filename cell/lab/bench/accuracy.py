@@ -6,11 +6,8 @@ cores; at every level the acceptance tests of the trade on the first seed's scan
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -23,6 +20,7 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
 from cell.lab.bench.acceptance import acceptance
 from cell.lab.bench.expected import expect
+from cell.lab.bench.over_cores import over_cores
 from cell.lab.bench.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.report.bound import part_points
@@ -40,7 +38,6 @@ LIMITS: dict[str, dict[str, float]] = {
 COVERAGE = (0.90, 0.98)
 COVERAGE_RUNS = 20
 """Fewer runs cannot tell 90 % from 98 %, and their coverage is not held against the limit."""
-SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def campaign(
@@ -51,27 +48,20 @@ def campaign(
     `workers` processes, by default one a core. Figures of one level stand at the top as well, that of the first.
     """
     load_job(job)
-    # One thread a process: the sums, and so the figures, are then the same on every machine and the cores are full.
-    for name in SINGLE_THREADED:
-        os.environ.setdefault(name, "1")
+    worlds = [(one_run, job, seed, level) for level in levels for seed in seeds]
     runs: list[dict[str, Any]] = []
-    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
-    try:
-        waiting = [pool.submit(one_run, job, seed, level) for level in levels for seed in seeds]
-        tests = {pool.submit(acceptance, seeds[0], level): level for level in levels}
-        for future in as_completed([*waiting, *tests]):
-            if future in tests:
-                done(f"acceptance {tests[future]}: measured")
-                continue
-            run = future.result()
-            runs.append(run)
-            done(f"seed {run['seed']} {run['level']}: {run['outcome']}")
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    tests: dict[str, Any] = {}
+    for number, made in over_cores([*worlds, *((acceptance, seeds[0], level) for level in levels)], workers):
+        if number < len(worlds):
+            runs.append(made)
+            done(f"seed {made['seed']} {made['level']}: {made['outcome']}")
+        else:
+            tests[made["level"]] = made
+            done(f"acceptance {made['level']}: measured")
     runs.sort(key=lambda run: run["seed"])
     by_level = {
-        level: summed_up([run for run in runs if run["level"] == level], level) | {"acceptance": test.result()}
-        for test, level in tests.items()
+        level: summed_up([run for run in runs if run["level"] == level], level) | {"acceptance": tests[level]}
+        for level in levels
     }
     return {"job": job, "seeds": list(seeds), **by_level[levels[0]], "levels": by_level}
 

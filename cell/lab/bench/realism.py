@@ -7,10 +7,7 @@ refused with the effect's name; it is ill when something wrong was told with con
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,8 @@ from cell.config import CellConfig, load_config
 from cell.geometry.poses import difference
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
-from cell.lab.bench.accuracy import SINGLE_THREADED, figures
+from cell.lab.bench.accuracy import figures
+from cell.lab.bench.over_cores import over_cores
 from cell.lab.bench.scan_errors import COVERED
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.report.bound import part_covariance
@@ -34,24 +32,24 @@ PLANE = np.array([0, 1, 5])
 """Of a part's pose: x, y and the turn about z. Contact decides over the others."""
 ALONE, TOGETHER = "nominal", "workshop"
 WORDS: dict[str, tuple[str, ...]] = {
-    "factory_arm": ("kinematics", "arm"),
-    "joint_harmonics": ("joint", "arm"),
-    "path_memory": ("repeat", "arm"),
-    "sag": ("sag", "arm"),
-    "rocking": ("rock",),
-    "sheet_bow": ("bow", "light sheet"),
-    "laser_pointing": ("laser", "contact"),
-    "camera_warm_up": ("camera",),
-    "grasp": ("grasp", "held"),
-    "late_stamps": ("time",),
+    "factory_arm": ("kinematics",),
+    "joint_harmonics": ("harmonics",),
+    "path_memory": ("repeatability",),
+    "sag": ("sags",),
+    "rocking": ("vehicle rocks",),
+    "sheet_bow": ("bowed",),
+    "laser_pointing": ("laser points",),
+    "camera_warm_up": ("warmed",),
+    "grasp": ("grasp",),
+    "late_stamps": ("come so late",),
     "rolling_shutter": ("shutter",),
-    "texture": ("texture", "stripe"),
-    "gloss": ("gloss", "stripe"),
-    "dust": ("dust", "stripe"),
-    "sheet_ends": ("covers", "points"),
-    "sunlight": ("light",),
+    "texture": ("texture",),
+    "gloss": ("gloss",),
+    "dust": ("dust",),
+    "sheet_ends": ("sheet ends",),
+    "sunlight": ("ambient light",),
 }
-"""A refusal with one of these words names the effect."""
+"""A refusal with one of these words names the effect: words that no other refusal has."""
 
 
 def campaign(
@@ -59,18 +57,10 @@ def campaign(
 ) -> dict[str, Any]:
     """Every effect alone on every seed, then all together if "workshop" is among `effects`; `done` is told of each."""
     load_job(job)
-    for name in SINGLE_THREADED:
-        os.environ.setdefault(name, "1")
     runs: list[dict[str, Any]] = []
-    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
-    try:
-        waiting = [pool.submit(one_run, job, seed, effect) for effect in effects for seed in seeds]
-        for future in as_completed(waiting):
-            run = future.result()
-            runs.append(run)
-            done(f"{run['effect']}, seed {run['seed']}: {run['verdict']}")
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    for _, run in over_cores([(one_run, job, seed, effect) for effect in effects for seed in seeds], workers):
+        runs.append(run)
+        done(f"{run['effect']}, seed {run['seed']}: {run['verdict']}")
     runs.sort(key=lambda run: run["seed"])
     by_effect = {name: summed_up(name, [run for run in runs if run["effect"] == name]) for name in effects}
     return {"job": job, "seeds": list(seeds), "effects": by_effect}
