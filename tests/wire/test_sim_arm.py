@@ -192,16 +192,18 @@ def test_an_asynchronous_move_shows_progress_and_can_be_stopped(arm: Client) -> 
 
 def test_a_streamed_joint_trajectory_is_tracked_with_a_small_lag(arm: Client) -> None:
     lag, gain, period = 0.05, 300.0, 0.002
-    errors = []
+    behind = []
     begun = CLOCK.now()
     for k in range(400):
-        elapsed = k * period * SPEED
-        target = HOME + 0.1 * (1 - math.cos(0.5 * math.pi * elapsed))
+        phase = 0.5 * math.pi * k * period * SPEED
+        target = HOME + 0.1 * (1 - math.cos(phase))
         assert arm.control.servoJ(target.tolist(), 0.0, 0.0, period, lag, gain)
-        errors.append(np.abs(target - arm.q()).max())
+        if math.sin(phase) > 0.5:
+            behind.append((target - arm.q()).mean() / (0.1 * 0.5 * math.pi * math.sin(phase)))
         CLOCK.sleep(begun + (k + 1) * period - CLOCK.now())
-    # The target moves at most at 0.157 rad/s: the lag and a few packets' age, no more.
-    assert 0.3 * lag * 0.157 < max(errors) < 0.157 * (lag + 0.02 * SPEED)
+    # The lag and a few packets' age. The median: a moment in which this process was not run is no lag of the arm.
+    assert 0.3 * lag < np.median(behind) < lag + 0.02 * SPEED
+    until(lambda: bool(np.abs(target - arm.q()).max() < 0.001))
     assert arm.control.servoStop(10.0)
     assert arm.control.moveJ(HOME.tolist(), 1.5, 5.0), "the arm must obey moves again after the stream"
 
