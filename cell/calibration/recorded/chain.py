@@ -37,6 +37,7 @@ from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes
 from cell.calibration.solve.scale import Scale, metric_scale
 from cell.calibration.solve.starts import stripe_means
 from cell.geometry.camera import PARAMETER_NAMES
+from cell.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
 Setup = str
@@ -223,9 +224,11 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
     """Put camera, hand-eye, light plane, noise and flatness into the result, lengths in mm."""
     best, choice = chain.choice.best, chain.choice
     adjusted, state, sigma = best.adjusted, best.adjusted.state, best.sigma
+    # Board and hand-eye belong to one camera: that which is reported.
     boards = [
-        o.base_from_flange * state.flange_from_camera * board
-        for o, board in zip(chain.observations, chain.staged.camera_from_board, strict=True)
+        o.base_from_flange * state.flange_from_camera * board_pose(o.view, state.camera).camera_from_board
+        for o in chain.observations
+        if o.view is not None
     ]
     apart = [b.translation - state.base_from_board.translation for b in boards]
     turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]

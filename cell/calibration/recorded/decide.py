@@ -7,7 +7,7 @@ board then scatters in the base tells how well they agree. A reading is taken wh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +19,8 @@ from drivers.errors import RefusedError
 
 # The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
 CLEAR, AGREES = 2.5, 0.06
+# Poses that are shifted by one picture are named when they then agree so much better, in so many frames.
+SHIFTED, LEAST_SHIFTED = 0.5, 6
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
 # … and where that other size leaves no more than this share of the scatter.
@@ -77,7 +79,7 @@ def decide(
             raise RefusedError(f"read as {other.text}, {scale_problem(other, pitch)[0]}")
         raise RefusedError(
             f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
-            "scatter; are they the poses of these pictures, of the flange, and is the board's pitch right?"
+            f"scatter; {_shifted(series, boards, wanted, setup)}"
         )
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
     if rival is not None and rival.score < CLEAR * best.score:
@@ -98,6 +100,27 @@ def _all_fits(
             except RefusedError as error:
                 problems.append(str(error))
     return sorted(fits, key=lambda f: f.score), problems
+
+
+def _shifted(series: Sequence[Series], boards: dict[int, list[pin.SE3]], wanted: str | None, setup: str | None) -> str:
+    """The question that poses ask which agree with no picture: do they agree with the pictures before or after?"""
+    for step, word in ((1, "next"), (-1, "previous")):
+        moved = []
+        for one in series:
+            keys = sorted(one.of)
+            of = {k: one.of[keys[i + step]] for i, k in enumerate(keys) if 0 <= i + step < len(keys)}
+            moved.append(replace(one, of=of))
+        fits, _ = _all_fits(moved, boards, wanted, setup)
+        if fits and fits[0].score < SHIFTED * AGREES and len(boards) >= LEAST_SHIFTED:
+            return (
+                f"with the pose of the {word} picture, {fits[0].text}, they leave {fits[0].left}: are poses and "
+                "pictures shifted by one, and one of either missing? Number them anew"
+            )
+    angles = any(one.count == 6 for one in series)
+    return (
+        f"are they the poses of these pictures, of the flange{' (and not joint angles)' if angles else ''}, and is the "
+        "board's pitch right?"
+    )
 
 
 def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:
