@@ -88,3 +88,11 @@ def test_what_a_given_camera_is_off_by_is_stated_or_refused(off):
     if off == 1.0:
         assert not result["refused"]
         assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0
+
+
+def test_a_given_camera_that_nothing_checks_is_doubted_and_has_a_deviation():
+    result = solved(scene(seed=3, count=3), given(fx=1.01))
+    assert result["intrinsics"]["sigma_px"]["fx"] > 0.009 * MATRIX[0, 0]
+    assert any("not checked" in note and "3 stops" in note for note in result["notes"])
+    assert right(result)
+    assert result["light_plane"]["sigma_place_mm"] > 0.1

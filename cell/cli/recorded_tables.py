@@ -15,7 +15,11 @@ def print_recorded(result: Mapping[str, Any]) -> None:
     console = Console()
     if result["board"] is not None:
         console.print(_frames(result["frames"]))
-        _print_understood(console, result)
+    else:
+        for pair in result["frames"]:
+            if not pair["used"]:
+                console.print(f"{pair['name']} not used: {pair['text']}", markup=False, soft_wrap=True)
+    _print_understood(console, result)
     values = _table("calibration", ("quantity", "value", "unit"), right=1)
     camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
     if camera is not None:

@@ -24,6 +24,7 @@ from cell.calibration.recorded.result import (
     hand_eye_dict,
     plane_dict,
     seen_depths,
+    setup_note,
 )
 from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, SHARED, stripe_block
 from cell.calibration.solve.checks import Check
@@ -269,11 +270,7 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         ],
         "chi2_per_dof": finite(adjusted.chi2_per_dof),
     }
-    if chain.setup == "eye_to_hand":
-        result["notes"].append(
-            "by the poses the camera stands still and the board moves with the flange; if the camera rides on the "
-            "flange, the poses are those of the base in the flange (inverse)"
-        )
+    result["notes"] += setup_note(chain.setup, state.flange_from_camera)
     _report_plane(chain, result)
 
 

@@ -53,7 +53,7 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
     first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
     apart = np.abs(_turns([flanges[k] for k in of]) - _turns([pose for poses in options for pose in poses]))
     best: tuple[float, int, list[int]] | None = None
-    for k in np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)):
+    for k in np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist():
         for right in range(len(options[k])):
             reference = apart[first[k] + right]
             chosen = [int(np.argmin(reference[a : a + len(p)])) for a, p in zip(first, options, strict=True)]
@@ -178,6 +178,16 @@ def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
         solution = np.linalg.lstsq((design * root[:, :, None]).reshape(-1, 6), -(known * root).ravel(), rcond=None)[0]
         off = np.linalg.norm(design @ solution + known, axis=1)
     return off
+
+
+def turns_apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> float:
+    """By how much the flange and the board turned differently between each two frames, as a share of the turn (median).
+
+    A reading in which nothing turns agrees with nothing: its share is 1 as well.
+    """
+    pairs = np.triu_indices(len(flanges), 1)
+    hand, eye = _turns(flanges)[pairs], _turns(boards)[pairs]
+    return float(np.median(np.abs(hand - eye) / np.maximum(np.maximum(hand, eye), LEAST_ANGLE)))
 
 
 def _turns(poses: Sequence[pin.SE3]) -> Array:
