@@ -51,9 +51,10 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
     """
     of = np.repeat(np.arange(len(options)), [len(poses) for poses in options])
     first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
-    apart = np.abs(_turns([flanges[k] for k in of]) - _turns([pose for poses in options for pose in poses]))
+    apart = np.abs(_turns([flanges[k] for k in of.tolist()]) - _turns([pose for poses in options for pose in poses]))
     best: tuple[float, int, list[int]] | None = None
-    for k in np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist():
+    references: list[int] = np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist()
+    for k in references:
         for right in range(len(options[k])):
             reference = apart[first[k] + right]
             chosen = [int(np.argmin(reference[a : a + len(p)])) for a, p in zip(first, options, strict=True)]
