@@ -8,9 +8,9 @@ from typing import Any
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.collect.witness import look_at_witness
+from cell.calibration.finding import find_calibration
 from cell.calibration.store import (
     CellCalibration,
-    find_calibration,
     gathered,
     save_with_observations,
     solve_observations,
