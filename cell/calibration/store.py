@@ -19,9 +19,10 @@ from cell.calibration import (
     TargetObservation,
 )
 from cell.calibration.archive import SUFFIX, Observations, write_archive
+from cell.calibration.solve.cameras import adjust_scan, adjust_target
 from cell.calibration.solve.faults import refuse_wrong_lead
 from cell.calibration.solve.joint import Joint
-from cell.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
+from cell.calibration.solve.results import Quality, sigmas
 from cell.calibration.witness import Witness
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
