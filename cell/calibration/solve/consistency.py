@@ -99,7 +99,8 @@ def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> li
             frame.refuse(
                 Reason.NO_POSE,
                 f"the flange pose puts the board {1e3 * off:.0f} mm from where the other frames see it, which agree "
-                f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
+                f"to {1e3 * others:.1f} mm: is it the pose of another frame, had the board moved, or is the picture "
+                "cropped or scaled?",
             )
     return [f for f in frames if f.reason is None]
 
