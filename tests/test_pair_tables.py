@@ -9,9 +9,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from cell.calibration.recorded.attach import Options
 from cell.calibration.recorded.command import calibrate_folder
+from cell.cli.app import app
 from drivers.errors import ConfigError, RefusedError
 from tests.recorded_scenes import FLANGE_FROM_CAMERA, scene
 from tests.test_stops import given_pairs
@@ -102,3 +104,15 @@ def test_a_camera_far_from_the_flange_is_doubted(tmp_path):
     (tmp_path / "board2cam.txt").write_text(rows([b for _, b in PAIRS], Rotation.as_quat))
     notes = calibrate_folder(tmp_path, None)["notes"]
     assert any("1.53 m away" in note and "invert" in note for note in notes)
+
+
+def test_people_are_told_how_the_tables_were_read_and_which_rows_are_not_used(tmp_path):
+    flanges = [f for f, _ in PAIRS]
+    flanges[2], flanges[7] = flanges[7], flanges[2]
+    (tmp_path / "robot.txt").write_text(rows(flanges, Rotation.as_quat))
+    (tmp_path / "board2cam.txt").write_text(rows([b for _, b in PAIRS], Rotation.as_quat))
+    ran = CliRunner().invoke(app, ["calibrate", "--from", str(tmp_path)])
+    assert ran.exit_code == 0, ran.output
+    assert "quaternion xyzw" in ran.stdout
+    assert "evidence" in ran.stdout
+    assert all(f"pair {k} not used" in ran.stdout for k in (2, 7))
