@@ -26,8 +26,10 @@ from cell.calibration.sessions import arm_table, serial_numbers
 from cell.calibration.store import (
     CellCalibration,
     find_calibration,
+    save_calibration,
     save_with_observations,
 )
+from cell.calibration.verify.confirm import keep_confirmed
 from cell.calibration.verify.verdict import Verification
 from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
@@ -502,7 +504,8 @@ class Cell:
         """Look at the deck boards again and say how good the stored calibration is today.
 
         Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
-        seen. `job` names the part that may be in the claw and what the place error is reckoned for.
+        seen. `job` names the part that may be in the claw and what the place error is reckoned for. A turn of the laser
+        that the board confirms is kept with the calibration, for jobs.
         """
         stops = self._stops
         loaded, _ = load_job(job)
@@ -517,10 +520,37 @@ class Cell:
                 return sessions.verify(self.config, self.devices, mover, calibration, loaded, hands, tell)
 
             made = self._recorded(run, "verification", work)
+            keep_confirmed(self.calibrations_folder, calibration, made)
             tell(1.0, "done")
             return made
 
         return self.begin("verification", verification, observer, stops).result()
+
+    def time_stamps(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
+        """Measure how late the scan camera's time stamps come, by sweeps to and fro over the fine board; kept with the
+        stored calibration, which is returned with it, and reckoned with by every sweep of the rail from then on.
+
+        Raises `CalibrationStale` when there is no calibration, `RefusedError` for a rolling shutter, for stamps that no
+        correction mends, and when the sweeps do not tell. `job` names the part that may be in the claw.
+        """
+        stops = self._stops
+        loaded, _ = load_job(job)
+        calibration = self.calibration()
+
+        def timing(run: Run[CellCalibration]) -> CellCalibration:
+            def tell(fraction: float, text: str) -> None:
+                run.tell(Event("progress", "timing", {"fraction": fraction, "text": text}))
+
+            def work(hands: Hands) -> CellCalibration:
+                mover = self.mover(loaded, hands.safe_point)
+                return sessions.time_stamps(self.config, self.devices, mover, calibration, hands, tell)
+
+            made = self._recorded(run, "timing", work)
+            save_calibration(made, self.calibrations_folder / f"{made.name}.json")
+            tell(1.0, "stored")
+            return made
+
+        return self.begin("timing", timing, observer, stops).result()
 
     def home(self, device: str | None = None) -> None:
         """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""

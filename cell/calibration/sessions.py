@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.timing import collect_timing
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.store import CellCalibration, gathered, solve_observations
 from cell.calibration.verify.verdict import Verification
@@ -64,3 +66,13 @@ def verify(
     devices.vehicle.recover()
     seen = collect_verification(config, devices, mover, calibration, hands.check, tell, hands.keep)
     return Verification.of(calibration, job, seen)
+
+
+def time_stamps(
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, hands: Hands, tell: Progress
+) -> CellCalibration:
+    """Sweep to and fro over the fine board: `calibration` with how late the scan camera's time stamps come."""
+    devices.interlocks.work_with(calibration.configuration)
+    devices.vehicle.recover()
+    timing = collect_timing(config, devices, mover, calibration, hands.check, tell, hands.keep)
+    return replace(calibration, scan=replace(calibration.scan, timing=timing))
