@@ -115,4 +115,4 @@ def _swept(
             f"no picture of a sweep over the fine board shows it ({refused or 'none came'}); clean it, see that it is "
             "lit, and that scan_camera.photo_exposure is enough for a quarter of it"
         )
-    return TimedSweep(speed if stop > start else -speed, exposure, made)
+    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made)
