@@ -125,7 +125,9 @@ class CellConfig(Table):
         for name, kind in DEVICES.items():
             make = self.make(name)
             if make.calibrated:
-                parts[name] = self.device(name).model_dump(include=set(make.calibrated))
+                record = self.device(name)
+                since = record.model_dump(include=set(make.calibrated_since), exclude_defaults=True)
+                parts[name] = {**record.model_dump(include=set(make.calibrated)), **since}
             if make not in BUILT_IN:
                 parts[name] = {**parts.get(name, {}), "driver": f"{kind}.{make.name}"}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

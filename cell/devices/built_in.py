@@ -35,6 +35,16 @@ if TYPE_CHECKING:
 MODULE_COUNTS = 2**31 - 1
 """Microsteps to which the rail's module counts, positions and microsteps per second alike."""
 
+BAUDS = (9600, 14400, 19200, 28800, 38400, 57600, 76800, 115200, 230400, 250000, 500000, 1_000_000)
+"""What the rail's module can be set to (its global parameter 65); over USB none of them matters."""
+REFERENCE_MODES = (*range(1, 9), *range(65, 69), *range(133, 137))
+"""Axis parameter 193 of the rail's module; +64 swaps left and right, +128 is for a home switch that opens."""
+MODES_TOLD = (
+    ": 1 left limit switch, 2 right then left, 3 right then both sides of the left, 4 both sides of the left, 5 home "
+    "switch in negative direction turning at the left switch, 6 in positive direction turning at the right, 7 and 8 "
+    "the same without the limit switches; 64 more swaps the sides of 1-4, 128 more for a home switch 5-8 that opens"
+)
+
 Connector = Annotated[int, whole(0, 17, meaning=": 0-7 standard, 8-15 configurable, 16-17 tool")]
 
 
@@ -49,6 +59,8 @@ class TmclRailConfig(RailConfig):
     motor: Annotated[int, whole(0, 5)] = 0
     steps_per_turn: Annotated[int, whole(20, 2000)]
     microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
+    baud: Annotated[int, whole(9600, 1_000_000, *BAUDS)] = 9600
+    reference_mode: Annotated[int, whole(1, 255, *REFERENCE_MODES, meaning=MODES_TOLD)] = 5
 
     @model_validator(mode="after")
     def _countable(self) -> Self:
@@ -147,6 +159,8 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
         acceleration=config.acceleration,
         address=config.address,
         motor=config.motor,
+        baud=config.baud,
+        reference_mode=config.reference_mode,
         control=not around.look,
         clock=around.clock,
     )
@@ -225,7 +239,7 @@ _OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_ca
 BUILT_IN: tuple[AnyMake, ...] = (
     Make(
         "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
-        simulated=_with("url"),
+        calibrated_since=frozenset(("reference_mode",)), simulated=_with("url"),
     ),
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),

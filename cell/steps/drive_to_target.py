@@ -156,6 +156,8 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     vehicle = here.devices.vehicle
     if trouble := vehicle.state().trouble:
         context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
+    if warnings := vehicle.state().warnings:
+        context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
     if not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
