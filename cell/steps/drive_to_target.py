@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pinocchio as pin
 
 from cell.job import Job
+from cell.motion.bodies import Body
 from cell.steps.approach import Planar, drive_line, turn_to
 from cell.steps.camera_poses import look_pose
 from cell.steps.moves import HOME
@@ -60,17 +61,19 @@ def drive_to_target(
     progress: Callable[[float, str], None],
     note: Callable[[str], None],
     hold: Callable[[], None] = lambda: None,
+    carried: Sequence[Body] = (),
 ) -> Arrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
     The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than the
     staging pose, and only when `whereabouts` knows where it stands. `photograph` gives the board in the base; `check`
     raises when the run is to end; `note` takes what is worth keeping; `hold` is called before
-    each way, with the vehicle at rest: a paused run waits in it.
+    each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and part as they stand, in the
+    arm base, which are kept off the station as the vehicle itself is.
     Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
     close to the station, and when the tolerance is not met after five tries.
     """
-    way = Way(job, vehicle_from_base, whereabouts)
+    way = Way(job, vehicle_from_base, whereabouts, carried)
 
     def place_from_vehicle(fix: BoardFix) -> Planar:
         return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
@@ -179,6 +182,7 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
         context.progress,
         lambda text: context.note(text=text),
         context.safe_point,
+        here.mover.solids(),
     )
 
 
