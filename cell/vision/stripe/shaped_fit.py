@@ -45,6 +45,23 @@ class Plane:
     albedo: NDArray[np.float32] | None = None
 
 
+def binned(plane: Plane, k: int) -> Plane:
+    """The plane of pixels that are `k` px wide, each the mean of what it holds; the last ones may fall away."""
+    if k == 1:
+        return plane
+    n = plane.value.shape[1] // k
+
+    def mean(part: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        if part is None:
+            return None
+        return np.asarray(part[:, : n * k].reshape(len(part), n, k).mean(axis=2), dtype=np.float32)
+
+    value = mean(plane.value)
+    assert value is not None
+    usable = np.asarray(plane.usable[:, : n * k].reshape(len(value), n, k).all(axis=2))
+    return Plane(value, usable, mean(plane.shade), mean(plane.albedo))
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Fits of m lines in windows of k px: `centre` in px, `amplitude` and `level` in DN, `log_scale` of the profile,
