@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from drivers.rail.tmcl import TmclRail
     from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
     from drivers.vehicle.agilex import AgilexVehicle
+    from drivers.vehicle.fixed import FixedVehicle
 
 MODULE_COUNTS = 2**31 - 1
 """Microsteps to which the rail's module counts, positions and microsteps per second alike."""
@@ -110,6 +111,19 @@ class AgilexVehicleConfig(VehicleConfig):
     def held(self) -> str:
         """Interface and channel: two interfaces may count their channels alike."""
         return f"{self.interface}:{real_path(self.place)}"
+
+
+class FixedVehicleConfig(VehicleConfig):
+    """No vehicle: the arm stands on a fixed frame. What is said of driving is not asked for."""
+
+    ADDRESS: ClassVar[str] = "driver"
+    DRIVES: ClassVar[bool] = False
+
+    driver: Literal["fixed"] = "fixed"
+    track: Annotated[float, quantity("mm", 100, 3000)] = 1.0
+    max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)] = 1.5
+    max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)] = 1.0
+    lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0
 
 
 class StreamCameraConfig(CameraConfig):
@@ -204,6 +218,12 @@ def _vehicle(name: str, config: AgilexVehicleConfig, around: Surroundings) -> Ag
     )
 
 
+def _no_vehicle(name: str, config: FixedVehicleConfig, around: Surroundings) -> FixedVehicle:
+    from drivers.vehicle.fixed import FixedVehicle
+
+    return FixedVehicle(name, around.clock)
+
+
 def _camera(name: str, config: StreamCameraConfig, around: Surroundings) -> StreamCamera:
     from drivers.camera.stream import StreamCamera
 
@@ -243,6 +263,7 @@ BUILT_IN: tuple[AnyMake, ...] = (
     ),
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
+    Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle),
     Make("camera", "stream", StreamCameraConfig, _camera, _OPTICS, simulated=_with("address")),
     Make(
         "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),

@@ -135,17 +135,40 @@ def drive_to_target(
         else:
             go(target)
     vehicle.brake()
-    raise RefusedError(
-        f"the vehicle stands {1e3 * error.x:.1f} mm along, {1e3 * error.y:.1f} mm across and "
-        f"{math.degrees(error.yaw):.2f} deg from its target after {count} photographs, allowed "
-        f"{1e3 * approach.tolerance:.0f} mm and {math.degrees(approach.tolerance_angle):.1f} deg; "
-        "check the floor and the wheels",
-        Measured("vehicle off its target, along", 1e3 * error.x, "mm", most=1e3 * approach.tolerance),
-        Measured("vehicle off its target, across", 1e3 * error.y, "mm", most=1e3 * approach.tolerance),
-        Measured(
-            "vehicle turned off its target", math.degrees(error.yaw), "deg", most=math.degrees(approach.tolerance_angle)
-        ),
-    ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]})
+    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", "check the floor and the wheels")
+
+
+def stand_at_target(
+    job: Job, vehicle_from_base: pin.SE3, vehicle: Vehicle, whereabouts: Whereabouts, photograph: Callable[[], BoardFix]
+) -> Arrival:
+    """What `drive_to_target` is for an arm on a fixed frame: look whether the station stands where the job has it.
+
+    Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
+    """
+    fix = photograph()
+    base_from_place = fix.base_from_board * job.place_from_board.inverse()
+    stands = Planar.of((vehicle_from_base * base_from_place).inverse())
+    whereabouts.see(stands)
+    error = Planar.of(job.approach.target.se3()).inverse() * stands
+    most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
+    if max(abs(error.x), abs(error.y)) > most or abs(error.yaw) > most_angle:
+        raise _off_target(
+            error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
+        )
+    vehicle.brake()
+    return Arrival(base_from_place, fix, error.x, error.y, error.yaw, 1)
+
+
+def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
+    most, most_angle = 1e3 * job.approach.tolerance, math.degrees(job.approach.tolerance_angle)
+    along, across, turned = 1e3 * error.x, 1e3 * error.y, math.degrees(error.yaw)
+    return RefusedError(
+        f"{who} stands {along:.1f} mm along, {across:.1f} mm across and {turned:.2f} deg from its target{after}, "
+        f"allowed {most:.0f} mm and {most_angle:.1f} deg; {remedy}",
+        Measured("vehicle off its target, along", along, "mm", most=most),
+        Measured("vehicle off its target, across", across, "mm", most=most),
+        Measured("vehicle turned off its target", turned, "deg", most=most_angle),
+    ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]} if fix.frames else None)
 
 
 def _at(here: Workplace, context: StepContext) -> Arrival:
@@ -170,6 +193,9 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     here.mover.to(look, "the looking pose")
     here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    if not here.config.vehicle.DRIVES:
+        stand = here.config.arm.vehicle_from_base.se3()
+        return stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
     vehicle.enable()
     return drive_to_target(
         here.job,
