@@ -14,8 +14,8 @@ from drivers.errors import ConfigError, DeviceFault
 from drivers.rail.tmcl_codec import Axis
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, WRONG_VALUE, CommandRefused, TmclLink
 
-SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "1290")
-"""Modules of the vendor with one axis, a six-point ramp and speeds in pulses per second."""
+SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "6212", "6214")
+"""Modules of the vendor with a six-point ramp that take speeds in pulses per second."""
 STOP_SPEED = 10
 """Pulses per second at which the ramp may end: the smallest that the ramp's chip recommends."""
 PULSES_MODE = 1
