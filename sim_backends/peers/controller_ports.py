@@ -49,6 +49,8 @@ class Client:
 
     def offer(self, data: bytes) -> None:
         """Send `data` whole, or not at all while the client has not taken what was sent before."""
+        if self._backlog:
+            self.send(b"")
         if not self._backlog:
             self.send(data)
 

@@ -74,12 +74,15 @@ class Session:
                 return
 
     def send_state(self, view: View, tick: int, late: int = 0) -> None:
-        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one."""
+        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one.
+
+        A client that does not keep up misses packets, as it does on a controller.
+        """
         for recipe in self._outputs:
             if tick % recipe.every == 0:
                 self._held.append((tick, recipe.packet(view)))
         while self._held and self._held[0][0] + late <= tick:
-            self._client.send(self._held.popleft()[1])
+            self._client.offer(self._held.popleft()[1])
 
     def _reply(self, kind: str, payload: bytes) -> None:
         self._client.send(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)

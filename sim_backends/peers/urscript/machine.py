@@ -82,7 +82,7 @@ class Machine:
             raise ProgramError(f"{self.name}: a secondary program may not take time")
 
     def _round(self) -> None:
-        for number in sorted(self._threads):
+        for number in sorted(self._threads, reverse=True):
             thread = self._threads.get(number)
             if thread is None:
                 continue
