@@ -159,6 +159,7 @@ class ControlProgram:
         clients neither. Such a cycle does not count as silence, since a real controller runs in real time.
         """
         self._cycles += not held_up
+        self._environment.held_up = held_up
         self._follow_safety()
         self._change_over()
         if self.runtime_state is RuntimeState.PLAYING:

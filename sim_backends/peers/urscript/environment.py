@@ -17,6 +17,10 @@ _BRAKE = 4.0
 """Deceleration in rad/s² of a motion whose thread was killed or whose stream dried up."""
 
 
+_MOST_READS = 10
+"""Readings of sockets in one cycle."""
+
+
 class Environment:
     """Of one program run; `context` has the arm and its registers, and `pause` pauses the program."""
 
@@ -29,6 +33,9 @@ class Environment:
         self.force: ForceMode | None = None
         self.popup_open = False
         self.cycles = 0
+        self.held_up = False
+        """This cycle is made up for: the host did not let the controller run in time, and perhaps no client either."""
+        self._reads = 0
         self.watches: list[Watch] = []
         self._numbers = itertools.count(1)
         self._mover: int | None = None
@@ -38,6 +45,11 @@ class Environment:
     def next_thread(self) -> int:
         """A number for a new thread; 0 is the program itself."""
         return next(self._numbers)
+
+    def may_read(self) -> bool:
+        """Whether what has come in over a socket is taken in this cycle; a flood is taken in parts."""
+        self._reads += 1
+        return self._reads <= _MOST_READS
 
     def on_close(self, act: Callable[[], None]) -> None:
         """Have `act` done when the program ends."""
@@ -75,6 +87,7 @@ class Environment:
     def end_cycle(self) -> None:
         """After all threads: brake a stream that nobody has fed, be compliant while nothing moves, mind the watches."""
         self.cycles += 1
+        self._reads = 0
         model = self.context.model
         if self._stream_ends is not None and self.cycles > self._stream_ends:
             self._stream_ends = None

@@ -26,7 +26,8 @@ _MOST_NUMBERS = 30
 class _Connections:
     """The open sockets of one program, by name, and what has come in over them."""
 
-    def __init__(self) -> None:
+    def __init__(self, environment: Environment) -> None:
+        self._environment = environment
         self._open: dict[str, socket.socket] = {}
         self._received: dict[str, bytes] = {}
 
@@ -74,13 +75,16 @@ class _Connections:
         while True:
             self._receive(name)
             received = self._received.get(name, b"")
-            if count := enough(received):
+            if (count := enough(received)) and self._environment.may_read():
                 self._received[name] = received[count:]
                 return received[:count]
-            cycles -= 1
-            if cycles < 0 or name not in self._open:
+            cycles -= not self._environment.held_up
+            if cycles < 0:
                 return b""
+            # A closed connection costs a cycle as well: a script that reads on must not keep the others waiting.
             yield
+            if name not in self._open:
+                return b""
 
     def _receive(self, name: str) -> None:
         connection = self._open.get(name)
@@ -100,7 +104,7 @@ class _Connections:
 
 def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     """By name; those that take time are generator functions."""
-    links = _Connections()
+    links = _Connections(environment)
     environment.on_close(links.close_all)
 
     def socket_open(address: str, port: int, socket_name: str = _NAME) -> Generator[None, None, bool]:
