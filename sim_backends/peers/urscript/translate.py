@@ -313,9 +313,13 @@ class _Translator:
         if word.kind == "text":
             return repr(word.text[1:-1])
         if word.text == "(":
-            inner = self._expression()
+            inner = [self._expression()]
+            while self._now.text == ",":
+                self._take()
+                inner.append(self._expression())
             self._expect(")")
-            return f"({inner})"
+            # Clients write lists in round brackets too, and controllers take them.
+            return f"({inner[0]})" if len(inner) == 1 else f"List([{', '.join(inner)}])"
         if word.text == "[":
             return f"List({self._elements()})"
         if word.text == "p" and self._now.text == "[":

@@ -17,7 +17,7 @@ class List(list[Any]):
 
     def __getitem__(self, index: Any) -> Any:
         """The element at a whole number, counted from 0; negative ones do not exist."""
-        return list.__getitem__(self, _whole(index))
+        return list.__getitem__(self, index if isinstance(index, slice) else _whole(index))
 
     def __setitem__(self, index: Any, value: Any) -> None:
         """Change the element at a whole number."""
