@@ -38,7 +38,7 @@ _WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45
 Only simulated arms are driven faster than the wall, and they share a busy machine with everything else.
 """
 _TOLD_S = 2.0
-"""What the controller has for telling its table, wall seconds: it does so ten times a second unless the port is shut."""
+"""What the controller has for telling its table, wall seconds; it does so ten times a second if the port is open."""
 _OUTPUTS = 18
 _SAFETY = {
     "": ArmSafety.NORMAL,

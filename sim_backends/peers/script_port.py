@@ -1,8 +1,8 @@
 """What the primary and the secondary port tell their clients: the version once, the state ten times a second, messages.
 
 Numbers are big-endian: a package is i32 size, u8 type and its content, a part of it u32 size, u8 type and its content.
-Source: the maker's client interface guide and `Universal_Robots_Client_Library`, `src/primary`. Of the documented parts
-only the internal ones (9 to 12) are not sent; currents, temperatures and voltages are zero or usual values.
+Source: the maker's client interface guide and `Universal_Robots_Client_Library`, `src/primary`. Parts and their order
+are those of a controller's recorded package; the internal ones (9, 10) are empty, currents and temperatures usual values.
 """
 
 from __future__ import annotations
@@ -57,13 +57,17 @@ def robot_state(model: ArmModel, runtime_state: int, analog_out: list[float]) ->
         model,
         runtime_state,
         _joints(model),
-        _part(2, struct.pack(">bbddfBffB", 0, 0, 0.0, 0.0, 48.0, 0, 0.0, 30.0, _mode(model))),
-        _masterboard(model, analog_out),
         _cartesian(model),
         _kinematics(model.params.dh),
+        _part(9, bytes(48)),
+        _masterboard(model, analog_out),
+        _part(2, struct.pack(">bbddfBffB", 0, 0, 0.0, 0.0, 48.0, 0, 0.0, 30.0, _mode(model))),
         _configuration(model),
         _part(7, struct.pack(">7d", *model.felt, 0.0)),
-        _part(8, bytes(3)),
+        _part(8, bytes(4)),
+        _part(10, bytes(38)),
+        _part(11, struct.pack(">?iiiff", False, 115200, 0, 1, 1.5, 3.5)),
+        _part(12, bytes(3)),
     )
 
 
