@@ -2,7 +2,7 @@
 
 Numbers are big-endian: a package is i32 size, u8 type and its content, a part of it u32 size, u8 type and its content.
 Source: the maker's client interface guide and `Universal_Robots_Client_Library`, `src/primary`. Parts and their order
-are those of a controller's recorded package; the internal ones (9, 10) are empty, currents and temperatures usual values.
+are those of a recorded controller; the internal ones (9, 10) are empty, currents and temperatures usual values.
 """
 
 from __future__ import annotations
