@@ -14,7 +14,7 @@ import numpy as np
 
 from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
@@ -72,7 +72,7 @@ def diagnose(
     _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
         return _diagnose(config, only)
-    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
+    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot", gige=on_gige(config))
     try:
         return _diagnose(with_endpoints(config, simulated.endpoints), only)
     finally:

@@ -70,7 +70,9 @@ class Make(Generic[Record, Connected]):
     `record` is the table as a typed record; `connect(name, record, surroundings)` gives the device or raises a
     `CellError` that names it. `calibrated` are the record's keys that a calibration depends on, `identity` tells one
     device from another of the same make. `simulated(record, endpoint)` is the record with the address of the peer that
-    `cell sim serve` has for it; None where it has none. `on_arm`: it hangs on the arm's connectors.
+    `cell sim serve` has for it; None where it has none. `on_arm`: it hangs on the arm's connectors. `missing()` says
+    what has to be installed before it can be connected, empty when nothing has. `replays`: what it delivers is of
+    another day, so nothing may move by it.
     """
 
     kind: str
@@ -81,6 +83,8 @@ class Make(Generic[Record, Connected]):
     identity: Callable[[Connected], str] = serial_number
     simulated: Callable[[Record, Mapping[str, Any]], Record] | None = None
     on_arm: bool = False
+    missing: Callable[[], str] = lambda: ""
+    replays: bool = False
 
 
 AnyMake = Make[Any, Any]
