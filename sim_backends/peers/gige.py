@@ -94,6 +94,10 @@ class GigePeer:
         """From now on a packet is lost when `lost(its number in the picture)`; one that is sent again is not."""
         self._to_lose = lost
 
+    def drop_controller(self) -> None:
+        """Forget who controls the camera, as after a short loss of its power."""
+        self._release()
+
     def pulse(self) -> None:
         """A pulse on Line1."""
         if self._memory.word(memory.TRIGGER_SOURCE) == memory.LINE:

@@ -15,13 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from drivers.camera.genicam.aravis import G_TYPE_UINT, Aravis, AravisError, Status
+from drivers.camera.genicam.aravis import Aravis, AravisError, Status
 from drivers.camera.genicam.device import GenicamDevice
 from drivers.camera.genicam.pixels import NAMES, to_grey
 from drivers.errors import CellError
 from drivers.interfaces import Image, LinkStatistics
 
 _POP_US = 10_000
+_FIXED = 0
+_SOCKET_BUFFER = 4 * 1024 * 1024
 _IMAGE = 1
 _WRAP = 0xFFFF
 """Block ids of 16 bits run from 1 to this and begin again at 1; longer ones do not wrap in a lifetime."""
@@ -121,13 +123,17 @@ class Acquisition:
             self._library.plain("g_object_unref", self._stream)
 
     def _set_network(self, network: Network) -> None:
-        library = self._library
-        resend = int(network.resend)
-        library.set_property(
-            self._stream, b"packet-resend", library.plain("arv_gv_stream_packet_resend_get_type"), resend
-        )
-        for name, seconds in ((b"packet-timeout", network.packet_timeout), (b"frame-retention", network.retention)):
-            library.set_property(self._stream, name, G_TYPE_UINT, round(seconds * 1e6))
+        for name, kind, value in (
+            ("packet-resend", "gv_stream_packet_resend", int(network.resend)),
+            # All of a picture's packets may be asked for again, not only a quarter of them.
+            ("packet-request-ratio", "double", 1.0),
+            ("packet-timeout", "uint", round(network.packet_timeout * 1e6)),
+            ("frame-retention", "uint", round(network.retention * 1e6)),
+            # What arrives while this computer is busy has to wait somewhere; the system may allow less.
+            ("socket-buffer", "gv_stream_socket_buffer", _FIXED),
+            ("socket-buffer-size", "int", _SOCKET_BUFFER),
+        ):
+            self._library.set_property(self._stream, name, kind, value)
 
     def _push(self, buffer: Any) -> None:
         self._library.plain("arv_stream_push_buffer", self._stream, buffer)

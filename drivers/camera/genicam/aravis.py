@@ -98,16 +98,20 @@ _CANNOT_FAIL: dict[str, tuple[Any, ...]] = {
     "arv_buffer_get_image_region": (_NOTHING, _POINTER, _OUT_INT, _OUT_INT, _OUT_INT, _OUT_INT),
     "arv_buffer_get_image_padding": (_NOTHING, _POINTER, _OUT_INT, _OUT_INT),
     "arv_gv_stream_packet_resend_get_type": (c_size_t,),
+    "arv_gv_stream_socket_buffer_get_type": (c_size_t,),
     "g_object_unref": (_NOTHING, _POINTER),
     "g_error_free": (_NOTHING, _POINTER),
     "g_inet_address_new_from_string": (_POINTER, _TEXT),
     "g_value_init": (_POINTER, _POINTER, c_size_t),
     "g_value_set_enum": (_NOTHING, _POINTER, c_int),
     "g_value_set_uint": (_NOTHING, _POINTER, c_uint),
+    "g_value_set_int": (_NOTHING, _POINTER, c_int),
+    "g_value_set_double": (_NOTHING, _POINTER, c_double),
     "g_object_set_property": (_NOTHING, _POINTER, _TEXT, _POINTER),
 }
 
-G_TYPE_UINT = 7 << 2
+_BASIC = {"int": 6 << 2, "uint": 7 << 2, "double": 15 << 2}
+"""GObject's numbers of its basic types."""
 
 
 class Status(IntEnum):
@@ -133,6 +137,7 @@ class AravisError(Exception):
 
     SILENT = (2, 4, 5, 10)
     """Not connected, transfer failed, no answer in time, control lost."""
+    ACCESS_DENIED = 17
 
     def __init__(self, function: str, code: int, text: str) -> None:
         super().__init__(text)
@@ -182,12 +187,13 @@ class Aravis:
         """Call a function that does not report errors."""
         return self._cannot_fail[name](*arguments)
 
-    def set_property(self, thing: Any, name: bytes, kind: int, value: int) -> None:
-        """Set a property of an object: an unsigned number for `G_TYPE_UINT`, else an enumeration's."""
+    def set_property(self, thing: Any, name: str, kind: str, value: float) -> None:
+        """Set a property of an object; `kind` is "int", "uint", "double" or the name of an enumeration of Aravis."""
+        number = _BASIC[kind] if kind in _BASIC else self.plain(f"arv_{kind}_get_type")
         packed = GValue()
-        self.plain("g_value_init", ctypes.byref(packed), kind)
-        self.plain("g_value_set_uint" if kind == G_TYPE_UINT else "g_value_set_enum", ctypes.byref(packed), value)
-        self.plain("g_object_set_property", thing, name, ctypes.byref(packed))
+        self.plain("g_value_init", ctypes.byref(packed), number)
+        self.plain(f"g_value_set_{kind if kind in _BASIC else 'enum'}", ctypes.byref(packed), value)
+        self.plain("g_object_set_property", thing, name.encode(), ctypes.byref(packed))
 
     def open_gige(self, host: str) -> Any:
         """The device at the IPv4 address `host`; only that address is spoken to."""

@@ -26,6 +26,8 @@ from drivers.interfaces import Frame, Identity, LinkStatistics
 
 _QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
+_TRIES = 3
+_PACKETS_LOST = "camera.packets_lost"
 
 
 @dataclass(frozen=True)
@@ -94,23 +96,20 @@ class GenicamCamera:
         """One frame whose exposure began after the call: never a buffered one.
 
         Refused with `InterlockError` while a stream is open. Raises `DeadlineError` when no frame comes in `timeout` s,
-        `DeviceFault` when the camera is lost (camera.lost), packets are missing (camera.packets_lost) or its time stamp
-        is none of this exposure (camera.clock).
+        `DeviceFault` when the camera is lost (camera.lost), packets are missing of three pictures in turn
+        (camera.packets_lost) or its time stamp is none of this exposure (camera.clock).
         """
         with self._exclusive() as device:
             self._stamps.compare(device)
             triggered = set_trigger(device, self._setup.trigger, self._timing(device), photograph=True)
-            with self._acquire(device, capacity=4, whole=True) as frames:
-                called = self._clock.now()
-                if triggered:
-                    device.call("software_trigger")
-                while True:
-                    frame = frames.next(timeout)
-                    if triggered:
-                        return self._stamps.judged(frame, called)
-                    if frame.host_time >= called - self._stamps.slack:
-                        return frame
-                    self.statistics.count("stale_frames")
+            tried = 0
+            while True:
+                try:
+                    return self._photograph(device, timeout, triggered=triggered)
+                except DeviceFault as fault:
+                    tried += 1
+                    if fault.code != _PACKETS_LOST or tried == _TRIES:
+                        raise
 
     @contextmanager
     def stream(self) -> Iterator[FrameQueue]:
@@ -195,6 +194,8 @@ class GenicamCamera:
         if self._closed:
             raise NotConnectedError(self.name, "the camera was closed. Open it again")
         if not self._device.open or not self._device.held:
+            if self._device.open:
+                self.statistics.count("link_lost")
             self.statistics.count("reconnected")
             self._device.close()
             self._connect()
@@ -255,6 +256,19 @@ class GenicamCamera:
             self._queue = self._acquisition = None
             queue.close()
 
+    def _photograph(self, device: GenicamDevice, timeout: float, *, triggered: bool) -> Frame:
+        with self._acquire(device, capacity=4, whole=True) as frames:
+            called = self._clock.now()
+            if triggered:
+                device.call("software_trigger")
+            while True:
+                frame = frames.next(timeout)
+                if triggered:
+                    return self._stamps.judged(frame, called)
+                if frame.host_time >= called - self._stamps.slack:
+                    return frame
+                self.statistics.count("stale_frames")
+
     def _frame(self, picture: Picture, count: int) -> Frame:
         received = self._clock.now()
         if picture.image.shape != self.shape:
@@ -274,7 +288,7 @@ class GenicamCamera:
     def _packets_lost(self) -> DeviceFault:
         return DeviceFault(
             self.name,
-            "camera.packets_lost",
+            _PACKETS_LOST,
             "packets of a picture were lost on the way and did not come again",
             recoverable=True,
             hint="Use packets that the network carries (packet_size, jumbo frames), pause between them (packet_delay), "

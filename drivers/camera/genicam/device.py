@@ -198,6 +198,14 @@ class GenicamDevice:
         self.library.call("arv_device_read_register", self._device, address, ctypes.byref(value))
         return value.value
 
+    def _was_released(self, error: AravisError) -> bool:
+        """Whether the camera denied something because it has forgotten who controls it, as after a loss of power."""
+        if not self._holds or error.code != AravisError.ACCESS_DENIED:
+            return False
+        with suppress(AravisError):
+            return self._register(CONTROL_PRIVILEGE) == 0
+        return True
+
     def _holder(self) -> str:
         # The register is younger than the protocol; a camera without it answers with an error or with zero.
         with suppress(AravisError):
@@ -211,14 +219,15 @@ class GenicamDevice:
             yield
         except AravisError as error:
             asked = " ".join([function, *(a.decode() if isinstance(a, bytes) else f"{a}" for a in arguments)])
-            if error.code in AravisError.SILENT or not self.held:
+            if error.code in AravisError.SILENT or not self.held or self._was_released(error):
                 raise self.lost(f"{error} at {asked!r}") from error
             raise DeviceFault(
                 self.name,
                 "camera.refused",
                 f"the camera refused {asked!r}: {error}",
                 recoverable=True,
-                hint="Correct what it names; `arv-tool-0.8 -a ADDRESS control` shows what this camera offers.",
+                hint="Correct what it names (`arv-tool-0.8 -a ADDRESS control` shows what it has); where access is "
+                "denied, see that no other application has taken the camera.",
             ) from error
 
     def lost(self, reason: str) -> DeviceFault:
