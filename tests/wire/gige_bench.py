@@ -19,6 +19,7 @@ from drivers.interfaces import Frame
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec
 from sim_backends.peers.gige import GigePeer
+from tests.wire.clocks import ahead
 
 SPEED = 3.0
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)
@@ -57,7 +58,7 @@ class Bench:
     def shown(self, frame: Frame) -> float:
         """Host time that the picture shows."""
         world = float(np.frombuffer(frame.image[0, :8].tobytes(), np.float64)[0])
-        return world + self.clock.now() - self.world.now()
+        return world + ahead(self.clock, self.world)
 
 
 @contextmanager

@@ -216,6 +216,21 @@ def test_a_lost_link_is_told_and_the_camera_is_used_again_when_it_is_back(bench:
     camera.close()
 
 
+def test_a_silent_camera_is_a_deadline_and_is_used_again(bench: Bench) -> None:
+    camera = bench.open()
+    camera.configure(0.004, 50.0)
+    with camera.stream() as frames:
+        frames.next(5.0)
+        bench.peer.fault("camera.silent")
+        with pytest.raises(DeadlineError, match=r"no frame within 0\.5 s"):
+            while True:
+                frames.next(0.5)
+        bench.peer.clear()
+        assert frames.next(5.0).lost_before > 0
+    assert camera.grab().exposure == pytest.approx(0.004)
+    camera.close()
+
+
 def test_another_camera_at_the_address_is_not_taken_for_the_lost_one() -> None:
     with served() as bench:
         camera = bench.open()
