@@ -69,7 +69,7 @@ class GigeCameraConfig(GenicamConfig):
     packet_delay: Annotated[float, quantity("us", 0, 10_000)] = 0.0
     resend: bool = True
     packet_timeout: Annotated[float, quantity("ms", 1, 1000)] = 0.02
-    retention: Annotated[float, quantity("ms", 10, 10_000)] = 0.2
+    retention: Annotated[float, quantity("ms", 10, 10_000)] = 0.5
 
 
 class Usb3CameraConfig(GenicamConfig):

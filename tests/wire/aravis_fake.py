@@ -16,7 +16,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import LIBRARIES
+from drivers.camera.genicam.camera import GenicamCamera, Setup
+from drivers.camera.genicam.device import GigePlace
+from drivers.camera.genicam.settings import Region
+from drivers.clock import Clock
 from tests.wire.gige_bench import require_aravis
 
 HOST = "127.0.0.1"
@@ -64,6 +69,12 @@ def fake_camera(picture: Callable[[float], NDArray[np.uint8]], serial: str = "GV
         yield HOST
     finally:
         library.g_object_unref(camera)
+
+
+def opened(host: str, clock: Clock) -> GenicamCamera:
+    """The driver on it, set to 640 x 480 pixels; what the camera sends in one go is not cut short on a busy machine."""
+    setup = Setup(Region(640, 480), network=Network(packet_size=8000, retention=2.0))
+    return GenicamCamera("scan_camera", GigePlace(host), setup, clock=clock)
 
 
 def _loaded(name: str) -> ctypes.CDLL | None:

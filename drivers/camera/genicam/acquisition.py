@@ -49,7 +49,7 @@ class Network:
     packet_delay: float = 0.0
     resend: bool = True
     packet_timeout: float = 0.02
-    retention: float = 0.2
+    retention: float = 0.5
 
 
 class BlockCount:
