@@ -17,7 +17,7 @@ from cell.devices.make import Surroundings
 from cell.devices.makes import installed, make_of
 from drivers.camera.genicam import aravis
 from drivers.camera.recording import RecordedCamera
-from drivers.camera.v4l2 import Timing, to_grey
+from drivers.camera.v4l2_pictures import Timing, to_grey
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera

@@ -103,7 +103,8 @@ class FolderCameraConfig(CameraConfig):
 
 def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
     from drivers.camera.genicam.acquisition import Network
-    from drivers.camera.genicam.camera import GenicamCamera, Setup
+    from drivers.camera.genicam.camera import GenicamCamera
+    from drivers.camera.genicam.connection import Setup
     from drivers.camera.genicam.settings import Region, Trigger
 
     left, top = config.offset

@@ -11,15 +11,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
 from drivers.camera.frame_queue import FrameQueue
+from drivers.camera.v4l2_pictures import Timing, to_grey
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError, NotConnectedError
-from drivers.interfaces import Frame, Identity, Image, LinkStatistics
+from drivers.interfaces import Frame, Identity, LinkStatistics
 from drivers.quantities import check_positive, check_range, shown
 
 FORMATS = ("GREY", "YUYV", "MJPG")
@@ -30,19 +29,6 @@ _MANUAL = 1
 _TOLERANCE = 0.02
 _OLDEST_S = 10.0
 _QUEUE_BYTES = 64 * 1024 * 1024
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Exposure in s and frame rate in Hz."""
-
-    exposure: float
-    frame_rate: float
-
-    @property
-    def open_s(self) -> float:
-        """By how much the exposure may have begun before the picture's stamp, s."""
-        return self.exposure + 1.0 / self.frame_rate
 
 
 class V4l2Camera:
@@ -270,17 +256,3 @@ class V4l2Camera:
 
     def _fault(self, code: str, what: str, hint: str) -> DeviceFault:
         return DeviceFault(self.name, code, f"{what} from {self._path}", recoverable=False, hint=hint)
-
-
-def to_grey(raw: object, shape: tuple[int, int]) -> Image:
-    """Grey (height, width) uint8 of what OpenCV read: grey as it is, the first plane of YUYV, or BGR converted."""
-    if not isinstance(raw, np.ndarray) or raw.dtype != np.uint8:
-        raise ValueError(f"a picture is {getattr(raw, 'dtype', type(raw).__name__)} instead of 8 bit")
-    if raw.ndim == 3 and raw.shape[2] == 3:
-        grey = cv2.cvtColor(raw, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-    else:
-        height, width = shape
-        grey = raw.reshape(height, width, -1)[:, :, 0].copy()
-    if grey.shape != shape:
-        raise ValueError(f"a picture has {grey.shape[1]}x{grey.shape[0]} pixels instead of {shape[1]}x{shape[0]}")
-    return grey

@@ -12,7 +12,6 @@ import socket
 import struct
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 
 import numpy as np
@@ -24,19 +23,13 @@ from sim_backends.peers import gige_registers as memory
 from sim_backends.peers.frame_session import Exposure, FrameSession, Render
 from sim_backends.peers.frame_wire import Rejected
 from sim_backends.peers.gige_memory import GigeMemory
-from sim_backends.peers.gige_pixels import ENCODERS
-from sim_backends.peers.gvcp import PORT, Command, Leader, Refused, Request, Status, packets, test_packet
+from sim_backends.peers.gige_stream import GigeStream
+from sim_backends.peers.gvcp import PORT, Command, Refused, Request, Status
 
 __all__ = ["GigePeer"]
 
 _FIRE = 1 << 31
 _LATCH = 2
-_KEPT = 8
-"""Pictures whose packets can be asked for again."""
-_BURST = 60_000
-"""Bytes that are sent at once; the receiver's buffer holds little more. A pause follows."""
-_PAUSE_S = 0.0005
-
 Address = tuple[str, int]
 
 
@@ -54,14 +47,11 @@ class GigePeer:
         self._clock = clock
         self._control, self.address = _bound(host)
         self._memory = GigeMemory(spec, self.address)
-        self._pictures = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._pictures.bind((self.address, 0))
+        self._stream = GigeStream(self.address, self._memory)
         self._session = FrameSession(name, self.camera, clock, render, self._send)
         self._controller: Address | None = None
         self._heard = 0.0
         self._first = 1
-        self._sent: OrderedDict[int, list[bytes]] = OrderedDict()
-        self._to_lose: Callable[[int], bool] = lambda number: False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=f"{name}-control", daemon=True)
 
@@ -74,12 +64,11 @@ class GigePeer:
         """End all threads and release the address; idempotent."""
         self._stopping.set()
         self._session.end()
-        for thread in (self._thread,):
-            if thread.ident is not None:
-                thread.join()
-                self._session.join()
+        if self._thread.ident is not None:
+            self._thread.join()
+            self._session.join()
         self._control.close()
-        self._pictures.close()
+        self._stream.close()
 
     def fault(self, name: str, count: int = 1) -> None:
         """Cause a fault (see `CameraModel.fault`); ValueError for another name."""
@@ -88,11 +77,11 @@ class GigePeer:
     def clear(self) -> None:
         """Take away all faults."""
         self.camera.clear()
-        self._to_lose = lambda number: False
+        self.lose_packets(lambda number: False)
 
     def lose_packets(self, lost: Callable[[int], bool]) -> None:
         """From now on a packet is lost when `lost(its number in the picture)`; one that is sent again is not."""
-        self._to_lose = lost
+        self._stream.lost = lost
 
     def drop_controller(self) -> None:
         """Forget who controls the camera, as after a short loss of its power."""
@@ -148,7 +137,8 @@ class GigePeer:
             address, size = struct.unpack(">II", request.data)
             return request.data[:4] + self._memory.read(address, size & 0xFFFF)
         if request.command == Command.RESEND:
-            self._send_again(request)
+            _, block_id, first, last = struct.unpack_from(">HHII", request.data)
+            self._stream.send_again(block_id, first & 0xFFFFFF, last & 0xFFFFFF)
             return b""
         if request.command not in (Command.WRITE_REGISTERS, Command.WRITE_MEMORY):
             raise Refused(Status.NOT_IMPLEMENTED)
@@ -170,10 +160,8 @@ class GigePeer:
         value = struct.unpack(">I", data)[0] if len(data) == 4 else 0
         if address == memory.PACKET_SIZE and value & _FIRE:
             value &= ~_FIRE
-            data = struct.pack(">I", value)
-            self._memory.write(address, data)
-            with contextlib.suppress(OSError):
-                self._pictures.sendto(test_packet(value & 0xFFFF), self._destination())
+            self._memory.write(address, struct.pack(">I", value))
+            self._stream.test()
             return
         self._memory.write(address, data)
         if address == memory.CONTROL:
@@ -192,7 +180,7 @@ class GigePeer:
 
     def _acquire(self, wanted: bool) -> None:
         self._session.halt()
-        self._sent.clear()
+        self._stream.forget()
         self._memory.set_word(memory.ACQUISITION, int(wanted))
         if wanted:
             self._first = self.camera.next_frame_id
@@ -207,50 +195,13 @@ class GigePeer:
             with contextlib.suppress(Rejected):
                 self._session.trigger()
 
-    # --- pictures ---
-
-    def _destination(self) -> Address:
-        host = socket.inet_ntoa(struct.pack(">I", self._memory.word(memory.STREAM_ADDRESS)))
-        if not host.startswith("127."):
-            raise OSError(f"{host} is not on this computer")
-        return host, self._memory.word(memory.STREAM_PORT) & 0xFFFF
-
     def _send(self, exposure: Exposure, image: NDArray[np.uint8]) -> None:
         if self.camera.silent or self._controller is None:
             return
-        spec, read = self.camera.spec, self._memory
-        left, top, width, height = (read.word(a) for a in (memory.LEFT, memory.TOP, memory.WIDTH, memory.HEIGHT))
-        code = read.word(memory.PIXEL_FORMAT)
-        part = image[top : top + height, left : left + width]
-        if gain := read.real(memory.GAIN):
-            part = np.minimum(part * 10.0 ** (gain / 20.0), 255.0).astype(np.uint8)
+        spec = self.camera.spec
         # Block ids have 16 bits and none is 0.
         block_id = (exposure.frame_id - self._first) % 0xFFFF + 1
-        leader = Leader(spec.device_ns(exposure.begin + spec.latency), code, width, height, left, top)
-        pixels = ENCODERS[code][2](np.ascontiguousarray(part))
-        made = list(packets(block_id, leader, pixels, read.word(memory.PACKET_SIZE) & 0xFFFF))
-        self._sent[block_id] = made
-        while len(self._sent) > _KEPT:
-            self._sent.popitem(last=False)
-        size = 0
-        for number, packet in enumerate(made):
-            if not self._to_lose(number):
-                self._put(packet)
-            size += len(packet)
-            if size > _BURST:
-                time.sleep(_PAUSE_S)
-                size = 0
-
-    def _send_again(self, request: Request) -> None:
-        _, block_id, first, last = struct.unpack_from(">HHII", request.data)
-        made = self._sent.get(block_id, [])
-        for packet in made[first & 0xFFFFFF : (last & 0xFFFFFF) + 1]:
-            self._put(packet)
-
-    def _put(self, packet: bytes) -> None:
-        # Nobody may be listening any more; a camera does not mind.
-        with contextlib.suppress(OSError):
-            self._pictures.sendto(packet, self._destination())
+        self._stream.send(image, block_id, spec.device_ns(exposure.begin + spec.latency))
 
 
 def _bound(host: str | None) -> tuple[socket.socket, str]:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import LIBRARIES
-from drivers.camera.genicam.camera import GenicamCamera, Setup
+from drivers.camera.genicam.camera import GenicamCamera
+from drivers.camera.genicam.connection import Setup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock

@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import AravisMissing, load
-from drivers.camera.genicam.camera import GenicamCamera, Setup
+from drivers.camera.genicam.camera import GenicamCamera
+from drivers.camera.genicam.connection import Setup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock

@@ -13,7 +13,8 @@ import pytest
 from cell.devices.contracts import Bench as ContractBench
 from cell.devices.contracts.camera import CameraContract
 from drivers.camera.genicam.acquisition import BlockCount, Network
-from drivers.camera.genicam.camera import GenicamCamera, Setup
+from drivers.camera.genicam.camera import GenicamCamera
+from drivers.camera.genicam.connection import Setup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.pixels import FORMATS
 from drivers.camera.genicam.settings import Region, Trigger

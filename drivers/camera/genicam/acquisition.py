@@ -95,6 +95,7 @@ class Acquisition:
         self._statistics = statistics
         self._ids = BlockCount()
         self._ended = threading.Event()
+        self._stopping = threading.Lock()
         payload = int(device.call("get_payload"))
         self._stream = device.call("create_stream", None, None)
         if network is not None:
@@ -110,8 +111,11 @@ class Acquisition:
 
     def stop(self) -> None:
         """End it; a camera that is lost is not asked. Idempotent."""
-        if self._ended.is_set():
-            return
+        with self._stopping:
+            if not self._ended.is_set():
+                self._stop()
+
+    def _stop(self) -> None:
         try:
             if self.failure is None and self._device.held:
                 self._device.call("stop_acquisition")

@@ -11,13 +11,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 from drivers.camera.frame_queue import FrameQueue
-from drivers.camera.genicam.acquisition import Acquisition, Network, Picture
-from drivers.camera.genicam.aravis import AravisMissing, load
+from drivers.camera.genicam.acquisition import Acquisition, Picture
+from drivers.camera.genicam.connection import Setup, connect
 from drivers.camera.genicam.device import GenicamDevice, Place
-from drivers.camera.genicam.settings import Region, Trigger, Wish, set_image, set_timing, set_trigger
+from drivers.camera.genicam.settings import Wish, set_timing, set_trigger
 from drivers.camera.genicam.stamps import Stamps
 from drivers.clock import Clock
 from drivers.endings import in_the_end
@@ -28,17 +27,6 @@ _QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
 _TRIES = 3
 _PACKETS_LOST = "camera.packets_lost"
-
-
-@dataclass(frozen=True)
-class Setup:
-    """How the camera is to be set: the picture's format and region, gain in dB (None: as it is), trigger, network."""
-
-    region: Region
-    pixel_format: str = "Mono8"
-    gain: float | None = None
-    trigger: Trigger = field(default_factory=Trigger)
-    network: Network = field(default_factory=Network)
 
 
 class GenicamCamera:
@@ -142,58 +130,24 @@ class GenicamCamera:
     # --- connection ---
 
     def _connect(self) -> None:
-        try:
-            library = load()
-        except AravisMissing as error:
-            raise NotConnectedError(self.name, str(error)) from error
-        device = GenicamDevice(self.name, self._place, library, look=self._look)
-        try:
-            serial = device.identity().serial
-            if self._serial not in (None, serial):
-                raise NotConnectedError(
-                    self.name,
-                    f"the camera at {self._place.text} has serial number {serial} now, it was {self._serial}. "
-                    "Open the cell again, with the calibration of this camera",
-                )
-            self._device, self._serial, self._stamps = device, serial, Stamps(self.name, self._clock)
-            if not self._look:
-                set_image(device, self._setup.region, self._setup.pixel_format, self._setup.gain)
-                self._set_packets(device)
-                if self._wish is not None:
-                    set_timing(device, self._wish, paced=self._setup.trigger.paced)
+        device, self._serial = connect(
+            self.name, self._place, self._setup, self._wish, look=self._look, serial=self._serial
+        )
+        self._device, self._stamps = device, Stamps(self.name, self._clock)
+        if not self._look:
+            try:
                 self._stamps.compare(device)
-        except CellError:
-            device.close()
-            raise
-
-    def _set_packets(self, device: GenicamDevice) -> None:
-        if not self._place.control:
-            return
-        network = self._setup.network
-        # Raw sockets need rights that a cell should not have; the size is settled here, once, and not behind our back.
-        device.plain("gv_set_stream_options", 1)
-        device.plain("gv_set_packet_size_adjustment", 0)
-        if network.packet_size is None:
-            device.call("gv_auto_packet_size")
-        else:
-            device.call("gv_set_packet_size", network.packet_size)
-            taken = device.call("gv_get_packet_size")
-            if taken != network.packet_size:
-                raise DeviceFault(
-                    self.name,
-                    "camera.setting",
-                    f"the camera took packets of {taken} bytes instead of {network.packet_size}",
-                    recoverable=False,
-                    hint='Choose what it and the network carry, such as "1500 byte", or leave packet_size out.',
-                )
-        if network.packet_delay:
-            device.call("gv_set_packet_delay", round(network.packet_delay * 1e9))
+            except CellError:
+                device.close()
+                raise
 
     def _ready(self) -> GenicamDevice:
         """The camera, connected anew if it was lost."""
         if self._closed:
             raise NotConnectedError(self.name, "the camera was closed. Open it again")
         if not self._device.open or not self._device.held:
+            if self._acquisition is not None:
+                raise self._device.lost("its link is down while pictures are being taken")
             if self._device.open:
                 self.statistics.count("link_lost")
             self.statistics.count("reconnected")
@@ -275,7 +229,7 @@ class GenicamCamera:
             height, width = picture.image.shape
             raise ValueError(f"a picture has {width}x{height} pixels, set were {self.shape[1]}x{self.shape[0]}")
         assert self._wish is not None
-        device_time = picture.device_ns * 1e-9
+        device_time = picture.device_ns * 1e-9 if self._device.stamps else 0.0
         host_time = self._stamps.host_time(device_time, latest=received - self._wish.exposure)
         return Frame(picture.image, count, self._wish.exposure, device_time, host_time, received)
 

@@ -108,6 +108,8 @@ class GenicamDevice:
             )
         frequency = library.call("arv_gv_device_get_timestamp_tick_frequency", self._device) if place.control else 0
         self._seconds_per_tick = 1.0 / frequency if frequency else 0.0
+        self.stamps = not place.control or bool(frequency)
+        """Whether its pictures carry stamps of a clock of its own; else the library puts the time of their arrival."""
 
     def close(self) -> None:
         """Let go of the camera; idempotent."""
