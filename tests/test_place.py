@@ -15,6 +15,7 @@ from cell.geometry.poses import from_matrix, from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import load_job
 from cell.lab.bench.whole_job import NoFrames
+from cell.motion.collision import CollisionError
 from cell.run.resumption import UnfinishedRun
 from cell.steps import drive_to_target
 from cell.steps.kinds import PLACE
@@ -120,6 +121,8 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     assert site.cell.world.collisions.found == ()
     where = site.part.where
     assert where is not None
+    with pytest.raises(CollisionError, match="claw and placed part"):
+        site.mover.plan_to(where * JOB.grasp.flange_from_part.se3().inverse(), "where the part stands now")
     true = pin.SE3(site.base_from_surface * JOB.place.surface_from_part.se3())
     assert np.linalg.norm(where.translation - true.translation) < 1e-3
 

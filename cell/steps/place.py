@@ -116,7 +116,7 @@ def place(
     claw.release()
     part.state = PartState.RELEASED
     note(part)
-    mover.leave_part()
+    mover.leave_part(part.where)
     progress(0.9, "retreating")
     mover.line(above, plan.speed, TOUCHES)
     progress(0.95, "folding the arm")
