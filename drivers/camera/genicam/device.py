@@ -54,7 +54,7 @@ class GigePlace:
 
 
 class UsbPlace:
-    """A USB3 Vision camera with a GUID, twelve hexadecimal digits that `lsusb -v` shows."""
+    """A USB3 Vision camera with a GUID, twelve hexadecimal digits that its maker's viewer shows."""
 
     control = False
 
@@ -62,7 +62,7 @@ class UsbPlace:
         self.text = f"USB3 {guid}"
         self.guid = guid
         self.absent = (
-            "check cable and GUID (`lsusb -v` shows it), that this user may use the device (Aravis' udev rules), and "
+            "check cable and GUID (its maker's viewer shows it), that this user may use the device (Aravis' udev rules), and "
             "that no other program has it open"
         )
 
