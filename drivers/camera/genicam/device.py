@@ -62,7 +62,7 @@ class UsbPlace:
         self.text = f"USB3 {guid}"
         self.guid = guid
         self.absent = (
-            "check cable and GUID (its maker's viewer shows it), that this user may use the device (Aravis' udev rules), and "
+            "check cable and GUID (its maker's viewer shows it), that this user may use it (Aravis' udev rules), and "
             "that no other program has it open"
         )
 
