@@ -25,6 +25,7 @@ _POP_US = 10_000
 _FIXED = 0
 _SOCKET_BUFFER = 4 * 1024 * 1024
 _IMAGE = 1
+_STOP_WALL_S = 0.5
 _WRAP = 0xFFFF
 """Block ids of 16 bits run from 1 to this and begin again at 1; longer ones do not wrap in a lifetime."""
 
@@ -117,14 +118,37 @@ class Acquisition:
 
     def _stop(self) -> None:
         try:
-            if self.failure is None and self._device.held:
-                self._device.call("stop_acquisition")
+            if self.failure is None and self._device.held and self._device.open:
+                self._ask_for_the_end()
         finally:
             self._ended.set()
             if self._thread.ident is not None:
                 self._thread.join()
             self._count_packets()
-            self._library.plain("g_object_unref", self._stream)
+            # The library tells the camera that its stream is over, which takes seconds where nobody answers.
+            giver = threading.Thread(target=self._library.plain, args=("g_object_unref", self._stream), daemon=True)
+            giver.start()
+            if self._device.open and self.failure is None:
+                giver.join()
+
+    def _ask_for_the_end(self) -> None:
+        """Who ends a sweep has a laser to switch off: it waits for no camera that is silent."""
+        failed: list[CellError] = []
+
+        def ask() -> None:
+            try:
+                self._device.call("stop_acquisition")
+            except CellError as error:
+                failed.append(error)
+
+        asker = threading.Thread(target=ask, name=f"{self._device.name} stop", daemon=True)
+        asker.start()
+        asker.join(_STOP_WALL_S)
+        if asker.is_alive():
+            self._device.abandon()
+            raise self._device.lost(f"no answer to the end of its acquisition within {_STOP_WALL_S:g} s")
+        if failed:
+            raise failed[0]
 
     def _set_network(self, network: Network) -> None:
         for name, kind, value in (

@@ -125,7 +125,8 @@ class GenicamCamera:
         try:
             self.stop()
         finally:
-            self._device.close()
+            if self._device.open:
+                self._device.close()
 
     # --- connection ---
 
@@ -148,11 +149,9 @@ class GenicamCamera:
         if not self._device.open or not self._device.held:
             if self._acquisition is not None:
                 raise self._device.lost("its link is down while pictures are being taken")
-            if self._device.open:
-                self.statistics.count("link_lost")
-            self.statistics.count("reconnected")
-            self._device.close()
+            self._device.abandon()
             self._connect()
+            self.statistics.count("link_lost")
         return self._device
 
     # --- acquisition ---
@@ -168,8 +167,7 @@ class GenicamCamera:
                 yield self._ready()
             except DeviceFault as fault:
                 if fault.code == "camera.lost":
-                    self.statistics.count("link_lost")
-                    self._device.close()
+                    self._device.abandon()
                 raise
         finally:
             self._acquiring.release()

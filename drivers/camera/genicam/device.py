@@ -83,6 +83,7 @@ class GenicamDevice:
         self.place = place
         self.library = library
         self._lock = threading.RLock()
+        self._abandoned = False
         self._device: Any = None
         self.camera: Any = None
         self._holds = not look and place.control
@@ -119,10 +120,16 @@ class GenicamDevice:
                     self.library.plain("g_object_unref", thing)
             self.camera = self._device = None
 
+    def abandon(self) -> None:
+        """Let go of a camera that does not answer, without waiting for it: the library may take seconds to give up."""
+        if not self._abandoned:
+            self._abandoned = True
+            threading.Thread(target=self.close, name=f"{self.name} given up", daemon=True).start()
+
     @property
     def open(self) -> bool:
-        """False after `close`."""
-        return self.camera is not None
+        """False after `close` or `abandon`."""
+        return self.camera is not None and not self._abandoned
 
     @property
     def held(self) -> bool:
