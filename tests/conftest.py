@@ -30,6 +30,8 @@ GROUPS = (
         "test_end_screen.py",
         "test_direct_devices.py",
         "test_verify_job.py",
+        "test_touch.py",
+        "test_confirmed_turn.py",
     ),
     # One device at a time.
     (
