@@ -22,6 +22,7 @@ from cell.cli.options import (
 
 if TYPE_CHECKING:
     from cell.devices.diagnosis import Diagnosis
+    from drivers.interfaces import Reading
 
 
 def register(app: typer.Typer) -> None:
@@ -97,7 +98,7 @@ def diag(
     speed: SpeedOption = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Ask the devices how they are: connection, identity, round trips, errors, state. Exit code 1 if any fails.
+    """Ask the devices how they are: identity, state, errors, figures with their limits. Exit code 1 if any is not well.
 
     Looks only: nothing on a device is set, started or ended.
     """
@@ -135,6 +136,7 @@ def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    console = Console()
     table = Table(title="devices", show_lines=True)
     for name in ("device", "identity", "address", "ms p50\np99", "errors", "state"):
         table.add_column(name, overflow="fold", justify="right" if name.startswith("ms") else "left")
@@ -149,4 +151,31 @@ def _print_table(rows: list[Diagnosis]) -> None:
             row.errors_text,
             row.state,
         )
-    Console().print(table)
+    console.print(table)
+    figures = Table(title="figures and what they may be")
+    for name in ("device", "figure", "value", "unit", "allowed", ""):
+        figures.add_column(name, overflow="fold", justify="right" if name in ("value", "allowed") else "left")
+    outside: list[str] = []
+    for row in rows:
+        for reading in row.readings:
+            mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
+            told = f"{reading.value:.4g}", reading.unit, _allowed(reading)
+            figures.add_row(row.device, reading.what, *told, mark if told[-1] else "")
+            if not reading.ok:
+                outside.append(f"{row.device}, {reading.what} {told[0]} {told[1]}, allowed {told[2]}: {reading.remedy}")
+    if figures.row_count:
+        console.print(figures)
+    for line in outside:
+        console.print(line, style="red", markup=False, soft_wrap=True)
+
+
+def _allowed(reading: Reading) -> str:
+    match reading.least, reading.most:
+        case None, None:
+            return ""
+        case None, most:
+            return f"≤ {most:g}"
+        case least, None:
+            return f"≥ {least:g}"
+        case least, most:
+            return f"{least:g} to {most:g}"

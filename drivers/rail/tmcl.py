@@ -12,8 +12,9 @@ from collections.abc import Callable
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, ConfigError, InterlockError
-from drivers.interfaces import Identity, LinkStatistics, RailState
+from drivers.interfaces import Identity, LinkStatistics, RailState, Reading
 from drivers.quantities import check_positive, check_range, shown
+from drivers.rail import health
 from drivers.rail.arrival import Arrival, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_ramp
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
@@ -97,6 +98,10 @@ class TmclRail:
     def ping(self) -> float:
         """Read the position once; returns the round trip in wall seconds."""
         return self._clock.wall(self._link.get_stamped(Axis.POSITION)[2])
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """What the module tells of its motor driver, at once; see `drivers.rail.health`."""
+        return health.readings(self._link.get(Axis.DRIVER_ERRORS))
 
     def state(self) -> RailState:
         """Read position, velocity, switches and whether it is homed now.
