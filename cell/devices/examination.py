@@ -66,8 +66,11 @@ def stream_figures(device_times: Sequence[float], lost: int, time_bound: float, 
     uneven = float(np.percentile(gaps, 99)) / median if median > 0 else np.nan
     return [
         Reading("frame rate by its clock", 1.0 / median if median > 0 else np.nan, "Hz"),
-        Reading("longest frame period over the median, p99", uneven, "", most=MOST_UNEVEN, remedy=_FRAMES_MISSED),
-        Reading("frames lost", float(lost), "", most=0.0, remedy=_FRAMES_MISSED),
+        Reading(
+            "longest frame period over the median, p99", uneven, "", most=MOST_UNEVEN if judged else None,
+            remedy=_FRAMES_MISSED,
+        ),
+        Reading("frames lost", float(lost), "", most=0.0 if judged else None, remedy=_FRAMES_MISSED),
         Reading(
             "clock known to", 1e3 * time_bound, "ms", most=1e3 * LARGEST_TIME_BOUND_S if judged else None,
             remedy="Use a cable of its own, and end programs that keep this computer busy.",

@@ -20,7 +20,7 @@ from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, se
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
 from drivers.rail.tmcl_codec import Axis, Reference
-from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import ZeroMark
 
 _AT_START_M = 20e-6
@@ -101,7 +101,12 @@ class TmclRail:
 
     def examine(self, seconds: float) -> list[Reading]:
         """What the module tells of its motor driver, at once; see `drivers.rail.health`."""
-        return health.readings(self._link.get(Axis.DRIVER_ERRORS))
+        try:
+            return health.readings(self._link.get(Axis.DRIVER_ERRORS))
+        except CommandRefused as refused:
+            if refused.status == NO_SUCH_TYPE:
+                return []
+            raise
 
     def state(self) -> RailState:
         """Read position, velocity, switches and whether it is homed now.
