@@ -13,11 +13,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from cell.config import DEVICES, CellConfig, default_toml
-from cell.devices.truth_link import ask_truth, cause_fault
+from cell.config import DEVICES, CellConfig
+from cell.devices.truth_link import ask_truth, cause_fault, make_ready
 from drivers.errors import ConfigError, DeviceFault
+
+if TYPE_CHECKING:
+    # It knows the world's drawing, which takes long to load: only who simulates a cell needs it.
+    from cell.devices.described import Described
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 
@@ -38,6 +42,12 @@ class Simulation(Protocol):
     def fault(self, name: str) -> None:
         """Cause a fault by its name, one of `sim_backends.faults.FAULT_NAMES`."""
 
+    def make_ready(self, described: Described) -> None:
+        """As a person does: set up the job's station, with its part in the claw; nothing where that is so already.
+
+        `ConfigError` for a job that cannot be simulated as it is described.
+        """
+
     def close(self) -> None:
         """End its world."""
 
@@ -45,9 +55,12 @@ class Simulation(Protocol):
 class SimulatedCell:
     """A served simulated cell; `endpoints` is the JSON object that it printed."""
 
-    def __init__(self, *, seed: int, level: str, speed: float, surface: str) -> None:
+    def __init__(self, config: CellConfig, described: Described, *, seed: int, level: str, speed: float) -> None:
+        """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so."""
+        self._config = config
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
-        command += ["--seed", str(seed), "--level", level, "--speed", repr(speed), "--surface", surface]
+        command += ["--seed", str(seed), "--level", level, "--speed", repr(speed)]
+        command += ["--drawing", described.drawing(config).as_json()]
         # A file, because a pipe that nobody reads would block the writer; closed with the process.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
@@ -78,6 +91,10 @@ class SimulatedCell:
     def fault(self, name: str) -> None:
         """Cause a fault by its name; `CellError` when that was not taken."""
         cause_fault(self.endpoints["truth"]["address"], name)
+
+    def make_ready(self, described: Described) -> None:
+        """See `Simulation`; `CellError` when that was not taken."""
+        make_ready(self.endpoints["truth"]["address"], described.drawing(self._config).as_json())
 
     @property
     def pid(self) -> int:
@@ -147,22 +164,22 @@ def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
     return config.model_copy(update=changed)
 
 
-def endpoint_toml(endpoints: dict[str, Any]) -> str:
-    """The shipped configuration's text with the addresses of a served simulated cell in it."""
-    values = {
-        ("cell", "time_scale"): str(float(endpoints["speed"])),
-        ("cell", "truth"): json.dumps(endpoints["truth"]["address"]),
-        ("rail", "url"): json.dumps(endpoints["rail"]["url"]),
-        ("arm", "address"): json.dumps(endpoints["arm"]["address"]),
-        ("vehicle", "interface"): json.dumps(endpoints["vehicle"]["interface"]),
-        ("vehicle", "channel"): json.dumps(endpoints["vehicle"]["channel"]),
-        ("scan_camera", "address"): json.dumps(endpoints["scan_camera"]["address"]),
-        ("target_camera", "address"): json.dumps(endpoints["target_camera"]["address"]),
-    }
-    table, lines = "", []
-    for line in default_toml().splitlines():
-        if line.startswith("["):
-            table = line[1 : line.index("]")]
-        value = values.get((table, line.split(" = ")[0]))
-        lines.append(line if value is None else f"{line.split(' = ')[0]} = {value}")
+def endpoint_toml(config: dict[str, Any], endpoints: dict[str, Any]) -> str:
+    """A configuration's tables as TOML, with the addresses of a served simulated cell in it."""
+    tables = {name: dict(table) for name, table in config.items()}
+    tables["cell"] |= {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+    for name in DEVICES:
+        tables[name] |= endpoints.get(name, {})
+    lines = ["# A simulated cell that is served: the configuration with its addresses."]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
     return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML has it; tables within tables in braces."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(inner) for inner in value) + "]"
+    return json.dumps(value, ensure_ascii=False)
