@@ -15,6 +15,15 @@ from cell.job import job_path
 
 Changes = Mapping[str, Mapping[str, str]]
 """Table, key: the value as TOML text. A key that the table lacks is added."""
+Numbers = tuple[float, float, float]
+
+
+def pose(translation: Numbers, rotation: Numbers) -> str:
+    """A pose as TOML, mm and degrees."""
+    mm, deg = (
+        ", ".join(f'"{v:g} {unit}"' for v in values) for values, unit in ((translation, "mm"), (rotation, "deg"))
+    )
+    return f"{{ translation = [{mm}], rotation = [{deg}] }}"
 
 
 def changed(text: str, changes: Changes) -> str:

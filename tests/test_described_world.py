@@ -27,17 +27,7 @@ from sim_backends.world.nominal import inverse
 from sim_backends.world.own_surface import own_surface
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
-from tests.described_cells import Changes, described, saddle, write_saddle
-
-Numbers = tuple[float, float, float]
-
-
-def pose(translation: Numbers, rotation: Numbers) -> str:
-    """A pose as TOML, mm and degrees."""
-    mm, deg = (
-        ", ".join(f'"{v:g} {unit}"' for v in values) for values, unit in ((translation, "mm"), (rotation, "deg"))
-    )
-    return f"{{ translation = [{mm}], rotation = [{deg}] }}"
+from tests.described_cells import Changes, Numbers, described, pose, saddle, write_saddle
 
 
 def drawing(folder: Path, config: Changes | None = None, job: Changes | None = None) -> Drawing:
