@@ -538,7 +538,7 @@ def test_a_file_that_is_none_is_refused(
         (("calibrate", "solve", "gone.npz"), ("gone.npz",)),
         (("calibrate", "solve", "pot.stl"), ("pot.stl",)),
         (("sim", "serve", "--job", "teapot"), ("teapot", "pot")),
-        (("sim", "fill"), ("cell.truth is empty", "cell sim serve --config-out")),
+        (("sim", "fill"), ("there is no cell.toml",)),
         (("sim", "serve", "--config-out", "pot.stl"), ("exists already",)),
         (("sim", "serve", "--config-out", "no/such/sim.toml"), ("no/such",)),
         (("fly",), ("No such command",)),
