@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
-from cell.config import CellConfig, Confirm, beside, config_to_open
+from cell.config import Confirm, beside, config_to_open
 from cell.devices.assembly import connect, connected_for
-from cell.devices.devices import Devices
-from cell.devices.simulated import SimulatedCell, Simulation, with_endpoints
+from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.opened import Opened
 from cell.run.lock import CellLock
 from drivers.errors import ConfigError
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
-
-
-@dataclass(frozen=True)
-class Opened:
-    """What a cell consists of; `lock` is held, `simulated` is None for real devices."""
-
-    config: CellConfig
-    folder: Path
-    lock: AbstractContextManager[object]
-    devices: Devices
-    simulated: Simulation | None
 
 
 def open_devices(

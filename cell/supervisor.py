@@ -12,43 +12,36 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
 from cell.calibration import sessions
-from cell.calibration.archive import Observations
-from cell.calibration.sessions import arm_table, serial_numbers
-from cell.calibration.store import (
-    CellCalibration,
-    find_calibration,
-    save_with_observations,
-)
+from cell.calibration.store import CellCalibration
 from cell.calibration.verify.verdict import Verification
 from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
 from cell.devices.injection import Injector
 from cell.devices.simulated import Simulation
-from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
-from cell.devices.truth_link import ask_truth
+from cell.devices.stopping import stop_cell
 from cell.job import Job, load_job
+from cell.opened import Opened
 from cell.opening import open_devices
 from cell.run.folder import find_run
-from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.job_run import Observer, RunOutcome
+from cell.run.job_work import JobWork
 from cell.run.maintenance import recorded_maintenance
 from cell.run.ready_job import ReadyJob
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.recorded_work import Hands
 from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
+from cell.run.runs import Runs
 from cell.steps.kinds import find_kind
 from cell.steps.moves import HOME, Mover
 from cell.steps.whereabouts import Whereabouts
-from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, InterlockError
-from drivers.interfaces import why_untold
+from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
@@ -56,9 +49,6 @@ from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
 """The devices that `home` can bring home one at a time, and which have to be connected for each: the arm moves only
 while the vehicle is braked."""
-
-CLOSE_WAIT_S = 20.0
-"""Wall seconds that a run has to end when the cell is closed."""
 
 Made = TypeVar("Made")
 
@@ -84,15 +74,11 @@ class Cell:
         self.folder = folder
         self.devices = devices
         self.simulated = simulated
-        self._lock = lock
+        self._here = Opened(config, folder, lock, devices, simulated)
         if simulated is not None and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
-        self._beginning = threading.Lock()
-        self._run: Run[Any] | None = None
-        self._stops = 0
-        self._stopped: Run[Any] | None = None
-        self._closed = False
+        self._runs = Runs(config.cell.name)
         self._signals = EndSignals()
 
     @classmethod
@@ -158,33 +144,32 @@ class Cell:
             if error is None:
                 raise
 
-    @cached_property
+    @property
     def whereabouts(self) -> Whereabouts:
         """What is known of where the vehicle stands."""
-        return Whereabouts(self.devices.vehicle)
+        return self._here.whereabouts
 
     @property
     def runs_folder(self) -> Path:
         """Where run folders go."""
-        return self.folder / self.config.cell.runs
+        return self._here.runs_folder
 
     @property
     def calibrations_folder(self) -> Path:
         """Where calibrations are stored."""
-        return self.folder / self.config.cell.calibrations
+        return self._here.calibrations_folder
 
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm, for jogging and calibration; with a job, its part is in the claw.
 
         `hold` is called before each free motion: a paused run waits in it.
         """
-        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks)
+        return self._here.mover(job, hold)
 
     @property
     def current(self) -> Run[Any] | None:
         """The run that is going on, or None."""
-        run = self._run
-        return None if run is None or run.done else run
+        return self._runs.current
 
     def stop(self) -> None:
         """End the run that is going on, and bring the whole cell to rest now, whatever it does.
@@ -195,11 +180,7 @@ class Cell:
         until a person begins a run or calls `clear_stop`.
         Raises `DeviceFault` that lists what could not be confirmed; everything was tried all the same.
         """
-        with self._beginning:
-            self._stops += 1
-            run = self._stopped = self.current
-        if run is not None:
-            run.abort("stopped with Cell.stop()")
+        self._runs.stop()
         stop_cell(self.devices)
 
     def clear_stop(self, by: str) -> None:
@@ -228,7 +209,7 @@ class Cell:
             if (run := self.current) is not None:
                 run.tell(Event("note", None, {"text": text}))
             else:
-                over.enter_context(recorded_maintenance(self.runs_folder, self._facts(), reason, lift))
+                over.enter_context(recorded_maintenance(self.runs_folder, self._here.facts, reason, lift))
             log.warning("%s", text)
             try:
                 yield
@@ -242,20 +223,13 @@ class Cell:
         as `SignalInterrupt`.
         """
         with SignalWatch() as signals:
-            with self._beginning:
-                if self._closed:
-                    return
-                self._closed = True
+            if not self._runs.close():
+                return
             try:
-                if (run := self.current) is not None:
-                    run.abort("the cell is being closed")
-                    try:
-                        run.ended(CLOSE_WAIT_S)
-                    except DeadlineError as error:
-                        log.warning("closing the cell: %s", error)
+                self._runs.end()
                 problems = self.devices.stop() + self.devices.close()
             finally:
-                self._lock.__exit__(None, None, None)
+                self._here.lock.__exit__(None, None, None)
                 if self.simulated is not None:
                     self.simulated.close()
         self._signals.__exit__(None, None, None)
@@ -267,7 +241,7 @@ class Cell:
     @property
     def stops(self) -> int:
         """How often it was stopped so far; work that is prepared first hands this to `begin` or `perform`."""
-        return self._stops
+        return self._runs.stops
 
     def begin(
         self,
@@ -280,21 +254,7 @@ class Cell:
 
         `stops` is the count of stops when it was asked for: `Aborted` when another one came since.
         """
-        with self._beginning:
-            self._require_free()
-            if stops not in (None, self._stops):
-                raise Aborted(f"the cell was stopped before the {kind} began; nothing was begun")
-            run = Run(kind, work, observer)
-            self._run = run
-            return run
-
-    def _require_free(self) -> None:
-        if self._closed:
-            raise InterlockError(self.config.cell.name, "the cell was closed; open it again")
-        if (going := self.current) is not None:
-            raise InterlockError(
-                self.config.cell.name, f"a {going.kind} is going on; wait for its end or abort it, then begin again"
-            )
+        return self._runs.begin(kind, work, observer, stops)
 
     def perform(
         self,
@@ -305,34 +265,7 @@ class Cell:
         stops: int | None = None,
     ) -> Made:
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
-        return self.begin(kind, lambda run: self._recorded(run, kind, work, info), observer, stops).result()
-
-    def _recorded(
-        self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
-    ) -> Made:
-        facts = {**self._facts(), **(info or {})}
-        health = require_no_emergency_stop if kind == "jog" else require_healthy
-        return RecordedWork(run, kind, self.devices, self.runs_folder, facts, health).perform(work)
-
-    def _facts(self) -> dict[str, Any]:
-        return {"cell": self.config.cell.name, **self._world()}
-
-    def _world(self) -> dict[str, Any]:
-        """Whether this cell is simulated, and which world; and the interlocks that do not hold, if any."""
-        if lifted := sorted(self.devices.interlocks.names_lifted):
-            return {**self._simulation(), "interlocks_lifted": lifted}
-        return self._simulation()
-
-    def _simulation(self) -> dict[str, Any]:
-        if self.simulated is None:
-            return {"simulated": False, "seed": None, "level": None, "clock": "wall"}
-        return self.simulated.facts
-
-    def _truth(self) -> Callable[[], dict[str, Any]] | None:
-        """How the report asks a simulated world for its truth; None where there is none."""
-        if self.simulated is not None:
-            return self.simulated.truth
-        return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
+        return self.begin(kind, lambda run: self._here.recorded(run, kind, work, info), observer, stops).result()
 
     # --- jobs ---
 
@@ -411,14 +344,9 @@ class Cell:
         until: str | None = None,
         script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
-        self._require_free()
-        stopped, self._stopped = self._stopped, None
-        if stopped is not None and stopped.control.late:
-            raise Aborted(
-                f"the cell was stopped as the {stopped.kind} before had just ended; nothing was begun. See that it is "
-                "safe, then begin the job again"
-            )
-        stops = self._stops
+        self._runs.require_free()
+        self._runs.require_no_late_stop()
+        stops = self.stops
         ready = ReadyJob.read(job, self.config, until, script, calibrates=self.simulated is not None)
         if self.simulated is not None:
             from cell.devices.described import Described
@@ -430,80 +358,24 @@ class Cell:
         except CalibrationStale:
             if self.simulated is None:
                 raise
-        info |= {**self._world(), **ready.info}
-
-        def work(run: Run[RunOutcome]) -> RunOutcome:
-            def note(text: str) -> None:
-                run.tell(Event("note", None, {"text": text}))
-
-            if at_start:
-                self.whereabouts.say_at_start()
-            calibration = stored
-            if calibration is None:
-                note("this simulated cell has no calibration yet: calibrating first")
-                calibration = self._calibrate(run, job)
-            earlier = None
-            if before is not None:
-                earlier, why = before.sweep(ready.job, self.config, calibration)
-                note(why if earlier is not None else f"{why}: sweeping again")
-            job_run = JobRun(
-                run,
-                self.config,
-                self.devices,
-                ready.job,
-                ready.nominal,
-                calibration,
-                info,
-                ready.kind,
-                script,
-                inline,
-                earlier,
-                self._truth(),
-            )
-            try:
-                return job_run.perform(self.runs_folder, self.whereabouts)
-            finally:
-                if at_start:
-                    self.whereabouts.forget_word()
-
-        return self.begin("job", work, observer, stops)
+        info |= {**self._here.world, **ready.info}
+        work = JobWork(self._here, job, ready, info, stored, before, inline, at_start)
+        return self.begin("job", work.perform, observer, stops)
 
     # --- calibration ---
 
     def calibration(self) -> CellCalibration:
         """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
-        return find_calibration(
-            self.calibrations_folder,
-            serial_numbers(self.devices),
-            self.config.calibration_hash(),
-            self.config.calibration.max_age,
-            arm_table(self.config, self.devices),
-            why_untold(self.devices.arm),
-        )
+        return sessions.stored(self._here)
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
         """Move through the calibration poses over the deck boards, solve, and store the result and what it came from.
 
         `job` names the part that may be in the claw, so that it does not touch anything on the way.
         """
-        stops = self._stops
+        stops = self.stops
         load_job(job)
-        return self.begin("calibration", lambda run: self._calibrate(run, job), observer, stops).result()
-
-    def _calibrate(self, run: Run[Any], job: str | Path) -> CellCalibration:
-        part_of, _ = load_job(job)
-
-        def tell(fraction: float, text: str) -> None:
-            run.tell(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
-
-        def work(hands: Hands) -> tuple[Observations, CellCalibration]:
-            mover = self.mover(part_of, hands.safe_point)
-            return sessions.calibrate(self.config, self.devices, mover, hands, tell)
-
-        observations, calibration = self._recorded(run, "calibration", work)
-        save_with_observations(calibration, observations, self.calibrations_folder)
-        tell(1.0, "stored")
-        return calibration
+        return self.begin("calibration", lambda run: sessions.calibrate(self._here, run, job), observer, stops).result()
 
     def verify(self, observer: Observer | None = None, job: str | Path = "pot") -> Verification:
         """Look at the deck boards again and say how good the stored calibration is today.
@@ -511,27 +383,16 @@ class Cell:
         Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
         seen. `job` names the part that may be in the claw and what the place error is reckoned for.
         """
-        stops = self._stops
+        stops = self.stops
         loaded, _ = load_job(job)
         calibration = self.calibration()
-
-        def verification(run: Run[Verification]) -> Verification:
-            def tell(fraction: float, text: str) -> None:
-                run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
-
-            def work(hands: Hands) -> Verification:
-                mover = self.mover(loaded, hands.safe_point)
-                return sessions.verify(self.config, self.devices, mover, calibration, loaded, hands, tell)
-
-            made = self._recorded(run, "verification", work)
-            tell(1.0, "done")
-            return made
-
-        return self.begin("verification", verification, observer, stops).result()
+        return self.begin(
+            "verification", lambda run: sessions.verify(self._here, run, calibration, loaded), observer, stops
+        ).result()
 
     def home(self, device: str | None = None) -> None:
         """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
-        stops = self._stops
+        stops = self.stops
         if device not in (None, *HOMED):
             raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 

@@ -30,6 +30,7 @@ GROUPS = (
         "test_end_screen.py",
         "test_direct_devices.py",
         "test_described_jobs.py",
+        "test_verify_job.py",
     ),
     # One device at a time.
     (
@@ -47,7 +48,7 @@ GROUPS = (
         "wire/test_safe_stop_over_wires.py",
     ),
     # Long ones begin early, so that no worker is left with one of them at the end.
-    ("recorded/test_recorded_calibration.py",),
+    ("recorded/test_recorded_calibration.py", "recorded/test_recorded_command.py"),
     ("test_inversion.py",),
     ("test_board_campaign.py",),
     ("test_calibration_archive.py",),
@@ -59,8 +60,11 @@ of its own, after them."""
 
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
-GIVES_WAY = 10
-"""By how much what only computes is nicer than what keeps deadlines on the wall."""
+WHOLE_CELL, COMPUTES = 5, 10
+"""How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
+deadlines of seconds on the wall, and what only computes keeps none."""
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
 
 
 def place(file: Path) -> tuple[int, int]:
@@ -87,10 +91,22 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileS
     return Grouped(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
+def pytest_configure() -> None:
+    """Before the workers start, which inherit it."""
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A worker that has begun to compute gives way to those that wait for devices; the groups over wires come first."""
-    if "PYTEST_XDIST_WORKER" in os.environ and item.get_closest_marker("wire") is None and os.nice(0) < GIVES_WAY:
-        os.nice(GIVES_WAY)
+    """A worker gives way to those whose times matter more; a worker's groups come in that order."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    if item.get_closest_marker("wire") is None:
+        wanted = COMPUTES
+    else:
+        wanted = WHOLE_CELL if place(item.path)[0] == 0 else 0
+    if os.nice(0) < wanted:
+        os.nice(wanted - os.nice(0))
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.cli.run import abort
+from cell.cli.runs import abort
 from cell.config import CellConfig, default_toml, load_config
 from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
 from cell.run.lock import CellLock

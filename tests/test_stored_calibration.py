@@ -11,8 +11,9 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration import ScanCalibration, TargetCalibration
+from cell.calibration.finding import find_calibration
 from cell.calibration.solve.results import KEPT, Quality
-from cell.calibration.store import CellCalibration, find_calibration, nominal_camera, save_calibration
+from cell.calibration.store import CellCalibration, nominal_camera, save_calibration
 from cell.config import load_config
 from cell.geometry.light_plane import LightPlane
 from drivers.errors import CalibrationStale, NotConnectedError

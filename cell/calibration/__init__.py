@@ -2,7 +2,8 @@
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
-from cell.calibration.solve.results import ScanCalibration, TargetCalibration, calibrate_scan, calibrate_target
+from cell.calibration.solve.cameras import calibrate_scan, calibrate_target
+from cell.calibration.solve.results import ScanCalibration, TargetCalibration
 
 __all__ = [
     "Priors",

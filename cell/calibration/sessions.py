@@ -1,23 +1,31 @@
-"""The cell's work on its own calibration: make one over the boards on the deck, or look how good the stored one is."""
+"""The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.collect.witness import look_at_witness
-from cell.calibration.store import CellCalibration, gathered, solve_observations
+from cell.calibration.finding import find_calibration
+from cell.calibration.store import (
+    CellCalibration,
+    gathered,
+    save_with_observations,
+    solve_observations,
+)
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.config import CellConfig
 from cell.devices.devices import Devices
-from cell.job import Job
+from cell.job import Job, load_job
 from cell.motion.arm_models import kinematics_name
+from cell.opened import Opened
 from cell.run.recorded_work import Hands
-from cell.steps.moves import Mover
-
-Progress = Callable[[float, str], None]
+from cell.run.run import Run
+from drivers.interfaces import why_untold
+from statemachine.step import Event
 
 
 def serial_numbers(devices: Devices) -> dict[str, str]:
@@ -35,32 +43,60 @@ def arm_table(config: CellConfig, devices: Devices) -> str:
     return kinematics_name(config.arm.model, devices.arm.link_table())
 
 
-def calibrate(
-    config: CellConfig, devices: Devices, mover: Mover, hands: Hands, tell: Progress
-) -> tuple[Observations, CellCalibration]:
-    """Move through the calibration poses and solve: what was seen, and the calibration from it."""
-    # In command, so that a vehicle that somebody else moves or releases is noticed.
-    devices.vehicle.recover()
-    given = config, devices, mover, hands.check
-    scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
-    witness = look_at_witness(config, devices, hands.keep)
-    target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
-    tell(0.96, "solving")
-    observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
-    return observations, solve_observations(observations).calibration
+def stored(cell: Opened) -> CellCalibration:
+    """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
+    return find_calibration(
+        cell.calibrations_folder,
+        serial_numbers(cell.devices),
+        cell.config.calibration_hash(),
+        cell.config.calibration.max_age,
+        arm_table(cell.config, cell.devices),
+        why_untold(cell.devices.arm),
+    )
 
 
-def verify(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    calibration: CellCalibration,
-    job: Job,
-    hands: Hands,
-    tell: Progress,
-) -> Verification:
-    """Look at the deck boards again: how good `calibration` is today, and what place error of `job` that makes."""
-    devices.interlocks.work_with(calibration.configuration)
-    devices.vehicle.recover()
-    seen = collect_verification(config, devices, mover, calibration, hands.check, tell, hands.keep)
-    return Verification.of(calibration, job, seen)
+def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
+    """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
+
+    `job` names the part that may be in the claw.
+    """
+    part_of, _ = load_job(job)
+    config, devices = cell.config, cell.devices
+
+    def tell(fraction: float, text: str) -> None:
+        run.tell(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
+
+    def work(hands: Hands) -> tuple[Observations, CellCalibration]:
+        mover = cell.mover(part_of, hands.safe_point)
+        # In command, so that a vehicle that somebody else moves or releases is noticed.
+        devices.vehicle.recover()
+        given = config, devices, mover, hands.check
+        scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
+        witness = look_at_witness(config, devices, hands.keep)
+        target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
+        tell(0.96, "solving")
+        observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
+        return observations, solve_observations(observations).calibration
+
+    observations, calibration = cell.recorded(run, "calibration", work)
+    save_with_observations(calibration, observations, cell.calibrations_folder)
+    tell(1.0, "stored")
+    return calibration
+
+
+def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> Verification:
+    """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`."""
+
+    def tell(fraction: float, text: str) -> None:
+        run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
+
+    def work(hands: Hands) -> Verification:
+        mover = cell.mover(job, hands.safe_point)
+        cell.devices.interlocks.work_with(calibration.configuration)
+        cell.devices.vehicle.recover()
+        seen = collect_verification(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
+        return Verification.of(calibration, job, seen)
+
+    made = cell.recorded(run, "verification", work)
+    tell(1.0, "done")
+    return made

@@ -100,15 +100,32 @@ class CameraModel:
         target = (np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not any(self.dist):
             return target
-        xy = target.copy()
-        error = np.full_like(xy, np.inf)
-        for _ in range(UNDISTORT_STEPS):
-            error = self.distort(xy) - target
-            if np.nanmax(np.abs(error), initial=0.0) < UNDISTORT_TOLERANCE:
-                break
-            xy = xy - _solve2(self._distortion_jacobian(xy[:, 0], xy[:, 1]), error)
-        xy[~(np.abs(error).max(axis=1) < 1e-9)] = np.nan
-        return xy
+        k1, k2, p1, p2, k3 = self.dist
+        to_x, to_y = target.T
+        x, y, off = to_x, to_y, np.full(len(target), np.inf)
+        # Written out, because every solve of a calibration comes through here many times.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for _ in range(UNDISTORT_STEPS):
+                xx, yy, xy = x * x, y * y, x * y
+                r2 = xx + yy
+                radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+                off_x = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx) - to_x
+                off_y = y * radial + p1 * (r2 + 2 * yy) + 2 * p2 * xy - to_y
+                off = np.maximum(np.abs(off_x), np.abs(off_y))
+                if np.fmax.reduce(off, initial=0.0) < UNDISTORT_TOLERANCE:
+                    break
+                slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
+                by_x, by_y = (
+                    radial + xx * slope + 2 * p1 * y + 6 * p2 * x,
+                    radial + yy * slope + 6 * p1 * y + 2 * p2 * x,
+                )
+                both = xy * slope + 2 * (p1 * x + p2 * y)
+                determinant = by_x * by_y - both * both
+                x = x - (by_y * off_x - both * off_y) / determinant
+                y = y - (by_x * off_y - both * off_x) / determinant
+        found = np.column_stack([x, y])
+        found[~(off < 1e-9)] = np.nan
+        return found
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (n, 3) in the camera frame through pixels (n, 2)."""
@@ -146,7 +163,3 @@ def _inverse2(m: Array) -> Array:
     inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(inverse / determinant[:, None, None], dtype=np.float64)
-
-
-def _solve2(m: Array, right: Array) -> Array:
-    return np.asarray((_inverse2(m) @ right[:, :, None])[:, :, 0], dtype=np.float64)

@@ -64,6 +64,13 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> pin.SE3:
     return from_parts(translation, rotation)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products along the last axis of length 3, with broadcasting; several times quicker than NumPy's."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def transform(pose: pin.SE3, points: ArrayLike) -> Array:
     """Points (…, 3) of frame b in frame a, for `pose` = a_from_b."""
     p = np.asarray(points, dtype=np.float64)

@@ -16,6 +16,7 @@ from cell.geometry.poses import from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
 from cell.vision import StripeProfile, StripeStream
+from cell.vision.stripe.rehearsal import drawn
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Vector
 
@@ -109,15 +110,11 @@ class Swath:
 def rehearse(geometry: ScanGeometry) -> None:
     """Take two drawn profiles and let them go: what is loaded or compiled on first use is so before anything moves.
 
-    Done under way it takes longer than the gaps that frames and the arm's states may have. One picture is an ordinary
-    one, the other has a stripe with a flat top, which is read carefully.
+    Done under way it takes longer than the gaps that frames and the arm's states may have.
     """
-    rows, columns = np.mgrid[: geometry.camera.height, : geometry.camera.width]
-    away = columns - 0.5 * geometry.camera.width - 4 * np.sin(rows / 40)
-    grain = np.random.default_rng(0).normal(0.0, 2.0, away.shape)
     builder = ProfileBuilder(geometry, 2)
-    for stripe in (np.exp(-0.5 * (away / 2) ** 2), 1 / (1 + np.exp(2 * (np.abs(away) - 6)))):
-        builder.see(StripeStream().extract(np.clip(12.5 + 140 * stripe + grain, 0, 255).astype(np.uint8)))
+    for picture in drawn(geometry.camera.height, geometry.camera.width):
+        builder.see(StripeStream().extract(picture))
 
 
 @dataclass(eq=False)

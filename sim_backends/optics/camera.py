@@ -109,6 +109,23 @@ def distort_jacobian(x: float, y: float, k: Vector) -> tuple[float, float, float
 
 
 @compiled
+def step_on_plane(
+    point: Vector, normal: Vector, du: float, dv: float, intrinsics: Vector
+) -> tuple[float, float, float]:
+    """How a point (3,) on its tangent plane of this normal (3,) moves, m, as its picture moves by (du, dv) px.
+
+    Not finite where the plane is seen edge on.
+    """
+    z = point[2]
+    x, y = point[0] / z, point[1] / z
+    ux, uy, vx, vy = distort_jacobian(x, y, intrinsics)
+    det = ux * vy - uy * vx
+    dx, dy = (vy * du - uy * dv) / det, (ux * dv - vx * du) / det
+    dz = -z * (normal[0] * dx + normal[1] * dy) / (normal[0] * x + normal[1] * y + normal[2])
+    return z * dx + dz * x, z * dy + dz * y, dz
+
+
+@compiled
 def project_points(points: Vector, k: Vector) -> Vector:
     """Compiled core of `CameraOptics.project`."""
     pixels = np.empty((points.shape[0], 2))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.optics.camera import distort_jacobian
+from sim_backends.optics.camera import step_on_plane
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.pattern import albedo_at
 
@@ -99,17 +99,10 @@ def expose(
     for i in range(rows.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         mx, my, mz = normals[i, 0], normals[i, 1], normals[i, 2]
-        x, y = px / pz, py / pz
-        ux, uy, vx, vy = distort_jacobian(x, y, intrinsics)
-        det = ux * vy - uy * vx
-        # How the point on the tangent plane moves with u along the row and with v along the column.
-        facing = mx * x + my * y + mz
-        if facing == 0.0:
-            continue
-        xu, yu = vy / det, -vx / det
-        zu = -pz * (mx * xu + my * yu) / facing
-        gx, gy, gz = pz * xu + zu * x, pz * yu + zu * y, zu
+        gx, gy, gz = step_on_plane(points[i], normals[i], 1.0, 0.0, intrinsics)
         distance_per_px = plane_normal[0] * gx + plane_normal[1] * gy + plane_normal[2] * gz
+        if not np.isfinite(distance_per_px):
+            continue
         floor = NARROWEST * pz / intrinsics[0]
         if abs(distance_per_px) < floor:
             distance_per_px = floor if distance_per_px >= 0 else -floor
@@ -124,6 +117,8 @@ def expose(
         disc = camera[0] / camera[1] * camera[0] * abs(pz - camera[2]) / (pz * (camera[2] - camera[0])) / camera[3]
         lens = camera[4] * camera[4] + disc * disc / 16.0
         slope = min(max(slopes[i], -20.0), 20.0)
+        # Along the stripe, one row further: the point on the plane seen at (u + slope, v + 1).
+        sx, sy, sz = step_on_plane(points[i], normals[i], slope, 1.0, intrinsics)
         row_width = np.sqrt(lens + 1.0 / 12.0)
         step = 0.6 * geometric
         total = 0.0
@@ -143,12 +138,9 @@ def expose(
                 albedo = 0.0
                 for m in range(sub_rows):
                     rise = 0.9 * row_width * (m - sub_rows // 2)
-                    # Along the stripe, one row further: the point on the plane seen at (u + slope, v + 1).
-                    xs, ys = (vy * slope - uy) / det, (ux - vx * slope) / det
-                    zs = -pz * (mx * xs + my * ys) / facing
-                    qx = px + shift * gx + rise * (pz * xs + zs * x) - pose[0, 3]
-                    qy = py + shift * gy + rise * (pz * ys + zs * y) - pose[1, 3]
-                    qz = pz + shift * gz + rise * zs - pose[2, 3]
+                    qx = px + shift * gx + rise * sx - pose[0, 3]
+                    qy = py + shift * gy + rise * sy - pose[1, 3]
+                    qz = pz + shift * gz + rise * sz - pose[2, 3]
                     bx = pose[0, 0] * qx + pose[1, 0] * qy + pose[2, 0] * qz
                     by = pose[0, 1] * qx + pose[1, 1] * qy + pose[2, 1] * qz
                     share = np.exp(-0.5 * (0.9 * (m - sub_rows // 2)) ** 2) / row_total

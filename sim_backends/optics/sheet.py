@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.optics.camera import distort_jacobian
+from sim_backends.optics.camera import step_on_plane
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.profile import NARROWEST
 from sim_backends.optics.scene import Grain, LaserOptics
@@ -48,19 +48,9 @@ def bend(columns: Vector, points: Vector, normals: Vector, intrinsics: Vector, l
 def slide(columns: Vector, points: Vector, normals: Vector, intrinsics: Vector, plane: Vector, sag: Vector) -> None:
     """Core of `bend`: along the row, on the surface's tangent plane, until the point is `sag` off the plane."""
     for i in range(columns.shape[0]):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        mx, my, mz = normals[i, 0], normals[i, 1], normals[i, 2]
-        x, y = px / pz, py / pz
-        ux, uy, vx, vy = distort_jacobian(x, y, intrinsics)
-        det = ux * vy - uy * vx
-        facing = mx * x + my * y + mz
-        if facing == 0.0:
-            continue
-        xu, yu = vy / det, -vx / det
-        zu = -pz * (mx * xu + my * yu) / facing
-        gx, gy, gz = pz * xu + zu * x, pz * yu + zu * y, zu
+        gx, gy, gz = step_on_plane(points[i], normals[i], 1.0, 0.0, intrinsics)
         per_px = plane[0] * gx + plane[1] * gy + plane[2] * gz
-        if abs(per_px) < NARROWEST * pz / intrinsics[0]:
+        if not np.isfinite(per_px) or abs(per_px) < NARROWEST * points[i, 2] / intrinsics[0]:
             continue
         step = sag[i] / per_px
         columns[i] += step

@@ -33,18 +33,37 @@ def calibrate(folder: Path, *options: str):
     return CliRunner().invoke(app, ["calibrate", "--from", str(folder), *options])
 
 
-def test_json_goes_to_scripts_without_nan():
+@pytest.fixture(scope="module")
+def dot_board():
+    """What `--json` prints of the dot board, read as a script reads it."""
     ran = calibrate(recording("dot_board"), "--board", "dots:6x6:34mm", "--json")
     assert ran.exit_code == 0, ran.output
 
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
-    assert json.loads(ran.stdout, parse_constant=refuse)["board"] == "dots:6x6:34mm"
+    return json.loads(ran.stdout, parse_constant=refuse)
 
 
-def test_people_get_tables_with_units():
-    ran = calibrate(recording("dot_board"), "--board", "dots:6x6:34mm")
+def test_json_goes_to_scripts_without_nan(dot_board):
+    assert dot_board["board"] == "dots:6x6:34mm"
+
+
+def test_the_dot_board_gives_the_published_camera(dot_board):
+    assert sum(f["used"] for f in dot_board["frames"]) == 5
+    assert all(f["order_assumed"] for f in dot_board["frames"])
+    camera = dot_board["intrinsics_without_distortion"]
+    assert camera["rms_px"] < 0.33
+    assert camera["fx"] == pytest.approx(276.509794, rel=0.01)
+    assert camera["fy"] == pytest.approx(272.959474, rel=0.01)
+    assert camera["cx"] == pytest.approx(163.865226, abs=1.0)
+    assert camera["cy"] == pytest.approx(113.304585, abs=1.0)
+
+
+def test_people_get_tables_with_units(tmp_path):
+    for number in (1, 2, 3):
+        shutil.copy(recording("dot_board") / f"circles-{number:02d}.jpg", tmp_path)
+    ran = calibrate(tmp_path, "--board", "dots:6x6:34mm")
     assert ran.exit_code == 0, ran.output
     assert "circles-03.jpg" in ran.stdout
     assert "px" in ran.stdout

@@ -42,10 +42,10 @@ def cell(*arguments: str, folder: Path, timeout: float = 240.0) -> subprocess.Co
 @contextmanager
 def started(*arguments: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A `cell` command that is going on; killed at the end if it still is."""
+    # In the tests' own session: Linux shares a machine among sessions first, whatever is nice within one.
     process = subprocess.Popen(
-        command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
-    )  # fmt: skip
+        command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     try:
         yield process
     finally:

@@ -30,6 +30,7 @@ from drivers.errors import (
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
 from sim_backends.peers.frames import CameraSpec, FramePeer
+from tests.wire.clocks import ahead
 
 SPEED = 4.0
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)
@@ -47,7 +48,7 @@ class Bench:
     def shown(self, frame: Frame) -> float:
         """Host time that the picture shows, as drawn into its first pixels."""
         world = float(np.frombuffer(frame.image[0, :8].tobytes(), np.float64)[0])
-        return world + self.clock.now() - self.world.now()
+        return world + ahead(self.clock, self.world)
 
 
 def render(t_mid: float, exposure: float) -> NDArray[np.uint8]:

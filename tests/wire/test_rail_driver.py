@@ -27,6 +27,7 @@ from drivers.rail.tmcl import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.tmcl import TmclPeer
+from tests.wire.clocks import ahead
 
 SPEED = 5.0
 MAX_SPEED = 0.05
@@ -47,7 +48,7 @@ class Bench:
         """True place of the carriage in m, at a host time of the past or now."""
         if host_time is None:
             return self.model.carriage(self.world.now())
-        return self.model.carriage(host_time + self.world.now() - self.clock.now())
+        return self.model.carriage(host_time - ahead(self.clock, self.world))
 
 
 def connect(

@@ -31,7 +31,6 @@ class Served:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            start_new_session=True,
         )
         assert self.process.stdout is not None
         self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())

@@ -330,10 +330,10 @@ def test_late_replies_are_late_until_the_faults_are_cleared(peer: TmclPeer, port
         return clock.now()
 
     peer.fault("rail.late_reply")
-    assert 0.2 < round_trip() < 0.5
-    assert 0.2 < round_trip() < 0.5
+    assert 0.2 < min(round_trip(), round_trip()) < 0.5
     peer.clear()
-    assert round_trip() < 0.15
+    # The shortest: whoever asks may not be run for a moment.
+    assert min(round_trip() for _ in range(3)) < 0.15
 
 
 @pytest.mark.wire

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.circles import seen_centres_with_jacobians
 from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_parts, perturbed
+from cell.geometry.poses import cross, from_parts, perturbed
 
 CAMERA, PLANE, RAIL = slice(0, 9), slice(9, 12), slice(12, 15)
 HAND, BOARD = slice(15, 21), slice(21, 27)
@@ -87,13 +87,6 @@ class State:
         """Pose of the board in the camera at a flange pose and a rail position."""
         base_from_camera = flange * self.flange_from_camera * from_parts(rail * self.rail_direction)
         return base_from_camera.inverse() * self.base_from_board
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Cross products along the last axis of length 3, with broadcasting; several times quicker than NumPy's."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def tangents(normal: Array) -> tuple[Array, Array]:

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.solve.adjustment import Priors
 from cell.calibration.solve.blocks import HAND, SHARED, State
 from cell.calibration.solve.bow import FLAT
-from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped
-from cell.calibration.solve.joint import (
-    Joint,
-    Staged,
-    effective_hand_eye_covariance,
-    solve_joint,
-    solve_staged,
-)
-from cell.calibration.solve.joint_checks import joint_checks
+from cell.calibration.solve.joint import Joint, effective_hand_eye_covariance
 from cell.calibration.solve.reference import Reference
 from cell.calibration.witness import Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
@@ -29,8 +18,6 @@ from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_matrix, from_parts
 from cell.reconstruction.build import ScanGeometry
-from cell.vision.board.board import board_pose
-from drivers.errors import RefusedError
 
 PARAMETERS = (
     "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
@@ -231,60 +218,6 @@ class TargetCalibration:
             Quality(**data["quality"]),
             Reference.read(data.get("reference")),
         )
-
-
-def calibrate_scan(
-    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
-) -> ScanCalibration:
-    """Closed form and joint adjustment; raises `RefusedError` when the observations do not determine it."""
-    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors))
-
-
-def adjust_scan(
-    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
-) -> Joint:
-    """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
-    staged = solve_staged(observations, nominal, rail_direction)
-    return _solve(observations, staged, priors, "scan", "fine", nominal)
-
-
-def calibrate_target(
-    observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors
-) -> TargetCalibration:
-    """The same for a camera without laser and rail."""
-    return TargetCalibration.of(adjust_target(observations, nominal, priors))
-
-
-def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
-    """The joint adjustment of a camera without laser and rail."""
-    same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
-    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large", nominal)
-
-
-def _solve(
-    observations: Sequence[ScanObservation],
-    staged: Staged,
-    priors: Priors,
-    camera: str,
-    board: str,
-    nominal: CameraModel,
-) -> Joint:
-    """The joint adjustment, after and before the checks for faults that have a name, and the absolute ones."""
-    rests = [o for o in observations if not o.same_rest]
-    names = [o.name for o in rests]
-    if all(o.view is not None for o in rests):
-        refuse_exchanged(names, [o.base_from_flange for o in rests], staged.camera_from_board)
-    joint = solve_joint(observations, staged, priors)
-    refuse_bent(board, joint.adjusted, joint.views)
-    seen = [o.view for o in rests if o.view is not None]
-    if len(seen) == len(rests):
-        poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
-        alone = [view for view in joint.views if not view.same_rest]
-        refuse_slipped(camera, names, joint.adjusted, alone, poses)
-    wrong = [check.text for check in joint_checks(joint, nominal) if check.verdict == "refused"]
-    if wrong:
-        raise RefusedError(f"the {camera} camera's calibration: {'; '.join(wrong)}")
-    return joint
 
 
 def sigmas(covariance: Array) -> dict[str, float]:

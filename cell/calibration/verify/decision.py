@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cell.calibration.solve.blocks import BOARD, PLANE, RAIL, SHARED, State
+from cell.calibration.solve.results import PARAMETERS
 from cell.calibration.verify.detectability import Detectable, detectable
 from cell.calibration.verify.evidence import Evidence
 from cell.calibration.verify.hypotheses import Hypothesis, hypotheses, log_factor, log_mean
@@ -40,6 +42,10 @@ class Suspect:
     change: Array
     spread: Array
 
+    def as_dict(self) -> dict[str, Any]:
+        """For reports, units in the names."""
+        return {"part": self.part, "probability": round(self.probability, 3), "change": _named(self.change)}
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -49,6 +55,10 @@ class Figure:
     value: float
     sigma: float
     unit: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """For reports."""
+        return {"name": self.name, "value": round(self.value, 5), "sigma": round(self.sigma, 5), "unit": self.unit}
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +154,19 @@ def _figures(name: str, weighed: Evidence, state: State) -> list[Figure]:
             change, spread = weighed.change(np.hstack([board, np.eye(SHARED)[:, index]]))
             made.append(Figure(text, factor * float(change[-1]), factor * float(np.sqrt(spread[-1, -1])), unit))
     return made
+
+
+def _named(change: Array) -> dict[str, float]:
+    """The parameters that change, px or relative as they are, m as mm and rad as mrad."""
+    made = {}
+    for k, name in enumerate(PARAMETERS):
+        if change[k] == 0.0:
+            continue
+        plain = name[0] in "fck"
+        unit = "" if plain else "_per_mille" if name.startswith("rail") else "_mrad" if _angle(name) else "_mm"
+        made[name.replace(" ", "_") + (unit or "_px")] = round(float(change[k]) * (1.0 if plain else 1e3), 4)
+    return made
+
+
+def _angle(name: str) -> bool:
+    return "tilt" in name or name.split()[-1] in ("rx", "ry", "rz")

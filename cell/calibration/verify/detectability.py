@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,6 +66,32 @@ class Detectable:
     def enough(self) -> bool:
         """Whether a change of the size that has to be found shows."""
         return self.size <= self.change.wanted
+
+    @property
+    def words(self) -> str:
+        """How large a change may be that does not show."""
+        if not np.isfinite(self.size):
+            return "of any size"
+        shown = f"{_shown(self.size, self.change.unit):.3f}"
+        return f"up to {shown} mm{self.change.where}" if self.change.unit == "m" else f"up to {shown}°"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For reports, sizes in mm or degrees; None for one that is infinite."""
+        return {
+            "part": self.change.part,
+            "change": self.change.kind,
+            "size": round(_shown(self.size, self.change.unit), 4) if np.isfinite(self.size) else None,
+            "wanted": round(_shown(self.change.wanted, self.change.unit), 4),
+            "unit": _UNITS[self.change.unit] + self.change.where,
+        }
+
+
+_UNITS = {"m": "mm", "rad": "deg"}
+
+
+def _shown(size: float, unit: str) -> float:
+    """A size in m as mm, one in rad as degrees."""
+    return 1e3 * size if unit == "m" else float(np.degrees(size))
 
 
 def changes(chain: str, state: State) -> list[Change]:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from cell.calibration.solve.place_effect import scan_effect, target_effect
-from cell.calibration.solve.results import PARAMETERS
 from cell.calibration.store import CellCalibration
 from cell.calibration.verify.decision import WORST_FIT, Suspect, Verdict
-from cell.calibration.verify.detectability import DETECTED, Detectable
+from cell.calibration.verify.detectability import DETECTED
 from cell.calibration.verify.looks import CheckObservations, check_witness, verify
 from cell.calibration.verify.pointing import WitnessCheck
 from cell.geometry.camera import Array
@@ -163,7 +162,7 @@ class Verification:
                 f"{DETECTED:.0%} of checks like this one (allowed at the place are {allowed})"
             )
         hiding = [
-            f"{d.change.part}, {d.change.kind} ({_size(d)}, {_way(effect)} at the place)"
+            f"{d.change.part}, {d.change.kind} ({d.words}, {_way(effect)} at the place)"
             for d, effect in zip(v.detectable, self.unseen, strict=True)
             if effect >= SHARE * self.tolerance
         ]
@@ -192,9 +191,7 @@ class Verification:
             "residuals_allowed": WORST_FIT,
             "suspects": [
                 {
-                    "part": s.part,
-                    "probability": round(s.probability, 3),
-                    "change": _named(s.change),
+                    **s.as_dict(),
                     "place_error_mm": round(1e3 * effect, 4),
                     "place_error_at_most_mm": round(1e3 * most, 4),
                 }
@@ -203,20 +200,8 @@ class Verification:
             if v.changed
             else [],
             "detectable_share": DETECTED,
-            "detectable": [
-                {
-                    "part": d.change.part,
-                    "change": d.change.kind,
-                    "size": round(_shown(d.size, d.change.unit), 4) if np.isfinite(d.size) else None,
-                    "wanted": round(_shown(d.change.wanted, d.change.unit), 4),
-                    "unit": _UNITS[d.change.unit] + d.change.where,
-                }
-                for d in v.detectable
-            ],
-            "figures": [
-                {"name": f.name, "value": round(f.value, 5), "sigma": round(f.sigma, 5), "unit": f.unit}
-                for f in v.figures
-            ],
+            "detectable": [d.as_dict() for d in v.detectable],
+            "figures": [f.as_dict() for f in v.figures],
         }
 
 
@@ -242,36 +227,5 @@ _DECK = {
 }
 
 
-_UNITS = {"m": "mm", "rad": "deg"}
-
-
-def _shown(size: float, unit: str) -> float:
-    """A size in m as mm, one in rad as degrees."""
-    return 1e3 * size if unit == "m" else float(np.degrees(size))
-
-
 def _way(effect: float) -> str:
     return f"{1e3 * effect:.2f} mm" if np.isfinite(effect) else "any amount"
-
-
-def _size(d: Detectable) -> str:
-    if not np.isfinite(d.size):
-        return "of any size"
-    shown = f"{_shown(d.size, d.change.unit):.3f}"
-    return f"up to {shown} mm{d.change.where}" if d.change.unit == "m" else f"up to {shown}°"
-
-
-def _named(change: np.ndarray) -> dict[str, float]:
-    """The parameters that change, px or relative as they are, m as mm and rad as mrad."""
-    made = {}
-    for k, name in enumerate(PARAMETERS):
-        if change[k] == 0.0:
-            continue
-        plain = name[0] in "fck"
-        unit = "" if plain else "_per_mille" if name.startswith("rail") else "_mrad" if _angle(name) else "_mm"
-        made[name.replace(" ", "_") + (unit or "_px")] = round(float(change[k]) * (1.0 if plain else 1e3), 4)
-    return made
-
-
-def _angle(name: str) -> bool:
-    return "tilt" in name or name.split()[-1] in ("rx", "ry", "rz")

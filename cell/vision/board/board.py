@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.circles import lens_shift, seen_centres
-from cell.geometry.poses import difference, from_parts, perturbed, transform
+from cell.geometry.poses import cross, difference, from_parts, perturbed, transform
 from cell.vision.board.charuco import find_charuco
 from cell.vision.board.chess import find_chessboard
 from cell.vision.board.dot_board import find_dots
@@ -197,7 +197,7 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
     for _ in range(STEPS):
         arm = points @ pose.rotation.T
         _, by_point, _ = camera.project_with_jacobians(arm + pose.translation)
-        jacobian = np.concatenate([by_point, np.cross(arm[:, None, :], by_point)], axis=2)
+        jacobian = np.concatenate([by_point, cross(arm[:, None, :], by_point)], axis=2)
         jacobian = (factor[:, None, None] * jacobian).reshape(-1, 6)
         normal = jacobian.T @ jacobian
         right = jacobian.T @ (factor[:, None] * residual).ravel()

@@ -7,7 +7,7 @@ followed as a line, its profile learned, and the deviation told from what surrou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,28 +15,18 @@ from numpy.typing import NDArray
 
 from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
 from cell.vision.stripe.learning import FREE_SCALE, learn_profile
+from cell.vision.stripe.look import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
 from cell.vision.stripe.planes import MIXES, Laser, Picture
-from cell.vision.stripe.shape import Shape, gaussian
-from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, fit_shape
-from cell.vision.stripe.surroundings import around, carried, wander
+from cell.vision.stripe.shape import Shape
+from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
+from cell.vision.stripe.surroundings import around, carried, surrounded, wander
 
 if TYPE_CHECKING:
     from cell.vision.stripe.profile import StripeSettings
 
 Array = NDArray[np.float64]
 
-COARSE_ROWS, COARSE_COLUMNS = 160, 1400
-ALONG, FAR_ALONG, WEAK_SCORE = 0.8, 3.0, 8.0
-"""Rows are blurred by the first before the line is looked for in them, in px; by the second where it scores less."""
-BINNED_WIDTH = 4.0
-"""A stripe wider than twice this, σ in px, is looked at through pixels so large that it has about this width."""
-ABOUT_AS_WELL = 0.75
-"""Mixes of colours that show the line by this share of the best are compared by what they know of its centres."""
-KNOWN_PX, FLANKS_ALONE = 0.03, 0.5
 MOST_WANDER = 8.0
-SURE = 3.5
-"""Least amplitude of a stripe in its standard deviations."""
-LEAST_SCORE = 0.35
 WIDEST = 36.0
 """σ in px of the widest stripe that is one; what is wider is light and shade on the scenery."""
 
@@ -81,7 +71,7 @@ def read_carefully(
     """
     lines = picture.value.shape[0]
     mix = like.mix if like is not None else choose_mix(picture, off, laser)
-    value, usable, shade = _difference(picture, off, mix)
+    value, usable, shade = difference(picture, off, mix)
     rival = np.zeros(lines)
     if starts is None:
         found, chain, scale, along = _follow(value, like)
@@ -117,96 +107,6 @@ def read_carefully(
     return Careful(
         out.centres, out.sigma * factor, out.amplitude, out.width, out.saturated, rival, out.misfit, learned
     )  # fmt: skip
-
-
-def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
-    """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names.
-
-    Of the mixes that show it about as well, the one in which its centres are known best: a channel in which the core is
-    saturated, or the noise or the texture strong, gives way to another.
-    """
-    if not picture.coloured or laser is not Laser.AUTO:
-        return laser.value if picture.coloured else "grey"
-    looks = {mix: coarse(_difference(picture, off, mix)[0]) for mix in MIXES}
-    best = max(look.chain.score for look in looks.values())
-    shown = [m for m, look in looks.items() if look.chain.score >= ABOUT_AS_WELL * best and len(look.chain.rows)]
-    if len(shown) < 2:
-        return shown[0] if shown else "grey"
-    return max(
-        shown, key=lambda mix: _knowledge(*_difference(picture, off, mix), looks[mix].found, looks[mix].chain, mix)
-    )
-
-
-def _knowledge(
-    value: NDArray[np.float32], usable: NDArray[np.bool_], shade: NDArray[np.float32] | None, found: Candidates,
-    chain: Chain, mix: str,
-) -> float:  # fmt: skip
-    """How much the lines of a chain say about their centres, in 1/px², the sum of all that are worth a fit."""
-    rows, at = found.rows[chain.rows], found.place[chain.rows, chain.which]
-    scale = float(np.median(found.scale[chain.rows, chain.which]))
-    k = max(1, int(scale / BINNED_WIDTH))
-    plane, at, width = binned(Plane(value, usable, shade), k), (at - 0.5 * (k - 1)) / k, scale / k
-    noise = surrounded(plane, rows, at, 4 * width, Noise(0.1, 1 / 40 * float(np.abs(MIXES[mix]).sum())))
-    fitted = fit_shape(plane, rows, at, gaussian(width, 4 * width + 3), noise, FREE_SCALE)
-    good = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
-    good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
-    variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)
-    sigma = carried(fitted, variance, correlation)[good] * k * np.sqrt(np.maximum(1.0, fitted.chi2[good]))
-    # A line that is known very well says no more than that it is; flanks are a poorer witness than a whole profile.
-    core = np.abs(fitted.x[good]) < width
-    hidden = np.asarray(core & np.isinf(fitted.variance[good])).any(axis=1)
-    return float(np.sum((1 - FLANKS_ALONE * hidden) / (KNOWN_PX**2 + sigma**2)))
-
-
-def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:
-    """The noise with the floor that the surroundings of the lines show, no less than it has."""
-    variance, _, level = around(plane, rows, at, reach)
-    return Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)
-
-
-class Look(NamedTuple):
-    """What a coarse look at a plane gave: candidates, the chain through them, and by how many px rows were blurred."""
-
-    found: Candidates
-    chain: Chain
-    along: float
-
-
-def coarse(value: NDArray[np.float32]) -> Look:
-    """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels.
-
-    Where there is hardly a line to see, rows are blurred more: what is noisy is often straight.
-    """
-    look = _coarse(value, ALONG)
-    if look.chain.score > WEAK_SCORE:
-        return look
-    further = _coarse(value, FAR_ALONG)
-    return further if further.chain.score > 1.2 * look.chain.score else look
-
-
-def _coarse(value: NDArray[np.float32], along: float) -> Look:
-    step = max(1, len(value) // COARSE_ROWS)
-    calm = cv2.GaussianBlur(value, (1, 2 * int(2.5 * along) + 1), sigmaX=0.0, sigmaY=along)
-    part: NDArray[np.float32] = np.ascontiguousarray(calm[::step], dtype=np.float32)
-    shrink = -(-part.shape[1] // COARSE_COLUMNS)
-    if shrink > 1:
-        size = (part.shape[1] // shrink, len(part))
-        part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    found = candidates(part, np.arange(0, len(part)), SCALES, along=0.0)
-    place = found.place * shrink + 0.5 * (shrink - 1)
-    found = Candidates(found.rows * step, place, found.response, found.clear, found.scale * shrink)
-    return Look(found, follow(found, step), along)
-
-
-def _difference(
-    picture: Picture, off: Picture | None, mix: str
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32] | None]:
-    """The plane, the pixels that can be used, and what was taken off it."""
-    value, usable = picture.plane(mix)
-    if off is None:
-        return value, usable, None
-    shade, fine = off.plane(mix)
-    return value - shade, usable & fine, shade
 
 
 def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float, float]:
@@ -266,23 +166,6 @@ def _second_line(found: Candidates, chain: Chain) -> Array:
         inside = slice(int(rows[0]), int(rows[-1]) + 1)
         rival[inside] = np.maximum(rival[inside], float(np.median(found.response[rows, which])) / max(height, 1e-6))
     return rival
-
-
-def binned(plane: Plane, k: int) -> Plane:
-    """The plane of pixels that are `k` px wide, each the mean of what it holds; the last ones may fall away."""
-    if k == 1:
-        return plane
-    n = plane.value.shape[1] // k
-
-    def mean(part: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-        if part is None:
-            return None
-        return np.asarray(part[:, : n * k].reshape(len(part), n, k).mean(axis=2), dtype=np.float32)
-
-    value = mean(plane.value)
-    assert value is not None
-    usable = np.asarray(plane.usable[:, : n * k].reshape(len(value), n, k).all(axis=2))
-    return Plane(value, usable, mean(plane.shade), mean(plane.albedo))
 
 
 BRIGHT, SMOOTH_PX = 25.0, 31

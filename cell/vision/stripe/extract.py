@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell import compiled
-from cell.vision.stripe.careful import choose_mix, read_carefully
+from cell.vision.stripe.careful import read_carefully
+from cell.vision.stripe.look import choose_mix
 from cell.vision.stripe.planes import FULL, Picture, as_picture
 from cell.vision.stripe.planes import Laser as Laser
 from cell.vision.stripe.profile import Array as Array

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.vision.stripe.careful import LEAST_SCORE, Look, choose_mix, coarse
 from cell.vision.stripe.extract import Axis, Laser, StripeProfile, StripeSettings, extract, subtracted
+from cell.vision.stripe.look import LEAST_SCORE, Look, choose_mix, coarse
 from cell.vision.stripe.sureness import refuse_unsure
 
 LEAST_POINTS = 30

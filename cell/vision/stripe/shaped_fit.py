@@ -45,6 +45,23 @@ class Plane:
     albedo: NDArray[np.float32] | None = None
 
 
+def binned(plane: Plane, k: int) -> Plane:
+    """The plane of pixels that are `k` px wide, each the mean of what it holds; the last ones may fall away."""
+    if k == 1:
+        return plane
+    n = plane.value.shape[1] // k
+
+    def mean(part: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        if part is None:
+            return None
+        return np.asarray(part[:, : n * k].reshape(len(part), n, k).mean(axis=2), dtype=np.float32)
+
+    value = mean(plane.value)
+    assert value is not None
+    usable = np.asarray(plane.usable[:, : n * k].reshape(len(value), n, k).all(axis=2))
+    return Plane(value, usable, mean(plane.shade), mean(plane.albedo))
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Fits of m lines in windows of k px: `centre` in px, `amplitude` and `level` in DN, `log_scale` of the profile,
@@ -89,62 +106,71 @@ def fit_shape(
     at = lines[:, None], column
     value = plane.value[at].astype(np.float64)
     usable = inside & plane.usable[at]
-    shade = 0.0 if plane.shade is None else plane.shade[at].astype(np.float64)
-    albedo = 1.0 if plane.albedo is None else plane.albedo[at].astype(np.float64)
+    shade, albedo = (
+        np.broadcast_to(np.float64(without), value.shape) if known is None else known[at].astype(np.float64)
+        for known, without in ((plane.shade, 0.0), (plane.albedo, 1.0))
+    )
     # What is lighter or darker than its surroundings is not known exactly to be so.
     speckle = noise.contrast**2 + (ALBEDO_DOUBT * (1 - 1 / albedo)) ** 2
     expected = np.zeros(len(lines)) if log_scales is None else log_scales
-    centre, log_scale = starts - origin, expected.copy()
     ramp = np.broadcast_to(offset / half, value.shape)
-    amplitude, level, slope = _linear_start(value, usable, offset, centre, log_scale, shape, ramp)
+    centre = starts - origin
+    found = np.stack([centre, *_linear_start(value, usable, offset, centre, expected, shape, ramp), expected], axis=1)[
+        :, [0, 1, 4, 2, 3]
+    ]
     good = usable.sum(axis=1) > LEAST_PIXELS
     precision = scale_prior**-2
+    limit = LARGEST_STEP * width
     going = good.copy()
-    inverse = np.zeros((len(lines), PARAMETERS, PARAMETERS))
+    inverses = np.zeros((len(lines), PARAMETERS, PARAMETERS))
+    # Most lines settle in a few steps, a few take all of them: one that has settled is looked at once more and left.
+    left = np.arange(len(lines))
     for _ in range(STEPS):
-        stripe, jacobian, mean = _model(offset, centre, log_scale, amplitude, level, slope, shape, ramp, albedo)
-        variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + speckle * stripe**2
-        weight = usable / variance
-        weighted = jacobian * weight[:, None, :]
+        now, began, middle = found[left], going[left], expected[left]
+        stripe, jacobian, mean = _model(offset, now, shape, ramp[left], albedo[left])
+        variance = noise.floor + noise.gain * np.maximum(mean + shade[left], 0.0) + speckle[left] * stripe**2
+        weighted = jacobian * (usable[left] / variance)[:, None, :]
         normal = weighted @ np.swapaxes(jacobian, 1, 2)
-        right = np.einsum("mpk,mk->mp", weighted, value - mean)
+        right = np.einsum("mpk,mk->mp", weighted, value[left] - mean)
         normal[:, 2, 2] += precision
-        right[:, 2] += precision * (expected - log_scale)
+        right[:, 2] += precision * (middle - now[:, 2])
         scale = np.sqrt(np.maximum(np.einsum("mpp->mp", normal), 1e-30))
         scaled = normal / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(PARAMETERS)
         inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-        step = np.einsum("mpq,mq->mp", inverse, right) * going[:, None]
-        limit = LARGEST_STEP * width
-        centre = centre + np.clip(step[:, 0], -limit, limit)
-        amplitude = np.clip(amplitude + step[:, 1], 0.2 * amplitude, 5 * amplitude + 1e-6)
-        log_scale = log_scale + np.clip(step[:, 2], -LARGEST_SCALE_STEP, LARGEST_SCALE_STEP)
-        level, slope = level + step[:, 3], slope + step[:, 4]
-        good &= np.abs(centre) < half
-        going &= good & (
-            (step[:, 0] ** 2 > CONVERGED**2 * np.maximum(inverse[:, 0, 0], 1e-8)) | (np.abs(step[:, 2]) > 1e-3)
-        )
-        centre, log_scale = np.where(good, centre, 0.0), np.clip(log_scale, expected - 1.5, expected + 1.5)
+        step = np.einsum("mpq,mq->mp", inverse, right) * began[:, None]
+        now[:, 0] += np.clip(step[:, 0], -limit, limit)
+        now[:, 1] = np.clip(now[:, 1] + step[:, 1], 0.2 * now[:, 1], 5 * now[:, 1] + 1e-6)
+        now[:, 2] += np.clip(step[:, 2], -LARGEST_SCALE_STEP, LARGEST_SCALE_STEP)
+        now[:, 3:] += step[:, 3:]
+        good[left] &= np.abs(now[:, 0]) < half
+        far = (step[:, 0] ** 2 > CONVERGED**2 * np.maximum(inverse[:, 0, 0], 1e-8)) | (np.abs(step[:, 2]) > 1e-3)
+        now[~good[left], 0] = 0.0
+        now[:, 2] = np.clip(now[:, 2], middle - 1.5, middle + 1.5)
+        found[left], inverses[left], going[left] = now, inverse, began & good[left] & far
+        left = left[began]
         if not going.any():
             break
-    stripe, jacobian, mean = _model(offset, centre, log_scale, amplitude, level, slope, shape, ramp, albedo)
+    centre, amplitude, log_scale, level, slope = found.T
+    stripe, jacobian, mean = _model(offset, found, shape, ramp, albedo)
     variance = noise.floor + noise.gain * np.maximum(mean + shade, 0.0) + speckle * stripe**2
     weight = usable / variance
     residual = np.where(usable, value - mean, 0.0)
-    influence = np.einsum("mp,mpk->mk", inverse[:, 0], jacobian * weight[:, None, :])
+    influence = np.einsum("mp,mpk->mk", inverses[:, 0], jacobian * weight[:, None, :])
     freedom = np.maximum(usable.sum(axis=1) - PARAMETERS, 1)
     return Fitted(
-        lines, origin + centre, amplitude, np.sqrt(inverse[:, 1, 1]), level, slope / half, log_scale,
-        np.sqrt(inverse[:, 2, 2]), np.sum(weight * residual**2, axis=1) / freedom, np.sqrt(inverse[:, 0, 0]),
+        lines, origin + centre, amplitude, np.sqrt(inverses[:, 1, 1]), level, slope / half, log_scale,
+        np.sqrt(inverses[:, 2, 2]), np.sum(weight * residual**2, axis=1) / freedom, np.sqrt(inverses[:, 0, 0]),
         good & (amplitude > 0), (offset - centre[:, None]) * np.exp(-log_scale)[:, None], residual, stripe,
         np.where(usable, variance, np.inf), influence,
     )  # fmt: skip
 
 
 def _model(
-    offset: NDArray[np.intp], centre: Array, log_scale: Array, amplitude: Array, level: Array, slope: Array,
-    shape: Shape, ramp: Array, albedo: Array | float,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Stripe and mean (m, k) and the derivatives (m, PARAMETERS, k)."""
+    offset: NDArray[np.intp], found: Array, shape: Shape, ramp: Array, albedo: Array
+) -> tuple[Array, Array, Array]:
+    """Stripe and mean (m, k) and the derivatives (m, PARAMETERS, k) by `found` (m, PARAMETERS): centre, amplitude,
+    logarithm of the scale, level and slope."""
+    centre, amplitude, log_scale, level, slope = found.T
     inverse = np.exp(-log_scale)[:, None]
     x = (offset - centre[:, None]) * inverse
     profile, rise = shape.at(x)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.shaped_fit import Fitted, Plane
+from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane
 
 Array = NDArray[np.float64]
 
@@ -114,3 +114,9 @@ def wander(centres: Array, sigma: Array) -> float:
         if seen > 1.1 + 2.0 / np.sqrt(len(ratio)):
             largest = max(largest, seen)
     return largest
+
+
+def surrounded(plane: Plane, rows: NDArray[np.intp], at: Array, reach: float, noise: Noise) -> Noise:
+    """The noise with the floor that the surroundings of the lines show, no less than it has."""
+    variance, _, level = around(plane, rows, at, reach)
+    return Noise(max(noise.floor, float(np.median(variance - noise.gain * level))), noise.gain)

@@ -1,0 +1,92 @@
+"""Which of the stored calibrations holds for the devices and the configuration of now, or why none does."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from cell.calibration.store import CellCalibration, read_calibration
+from drivers.errors import CalibrationStale, NotConnectedError
+
+CLOCK_SLACK_S = 3600.0
+"""How far a calibration's date may lie in the future: clocks of two machines differ."""
+
+
+def find_calibration(
+    folder: Path,
+    identities: dict[str, str],
+    configuration: str,
+    max_age: float,
+    kinematics: str = "",
+    untold: str = "",
+) -> CellCalibration:
+    """The stored calibration of these devices under this configuration, not older than `max_age` s.
+
+    `kinematics` names the arm's table, as of `kinematics_name`; `untold` says why the arm has not told it now, if so.
+
+    Raises `CalibrationStale` that says what is missing or what differs, `NotConnectedError` when the arm has to be
+    asked again before anybody can tell.
+    """
+    found, unreadable = [], []
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        try:
+            found.append(read_calibration(path))
+        except CalibrationStale:
+            unreadable.append(path.name)
+    own = [entry for entry in found if entry.identities == identities]
+    if not own:
+        devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
+        raise CalibrationStale(
+            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
+            + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + _exchanged(found, identities)
+            + "; run `cell calibrate`"
+        )
+    current = [entry for entry in own if entry.configuration == configuration]
+    if not current:
+        raise CalibrationStale(
+            f"the calibration of {own[-1].date} was made under another configuration ({own[-1].configuration}, now "
+            f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
+        )
+    fitting = [entry for entry in current if entry.kinematics == kinematics]
+    if not fitting and untold and current[-1].kinematics:
+        raise NotConnectedError(
+            "arm",
+            f"its port 30001 was not read now: {untold}; the calibration of {current[-1].date} was made with the "
+            f"table that it told then ({current[-1].kinematics}), and whether it fits is not known. See that the arm "
+            "is on and that port open, then connect anew",
+        )
+    if not fitting:
+        raise CalibrationStale(
+            f"the calibration of {current[-1].date} was made with another kinematics of the arm "
+            f"({current[-1].kinematics or 'it does not say which'}; the arm now has "
+            f"{kinematics or 'none that is known'}): the arm or its controller was exchanged, or the arm was "
+            "calibrated anew, or its port 30001 could be read then and not now; run `cell calibrate`"
+        )
+    newest = max(fitting, key=lambda entry: entry.made)
+    age = time.time() - newest.made
+    if age > max_age:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} is {age / 86400:.1f} days old, allowed are {max_age / 86400:.1f}; run "
+            "`cell calibrate`"
+        )
+    if age < -CLOCK_SLACK_S:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} lies {-age / 3600:.1f} hours in the future, so its age is not known; "
+            "set this machine's clock, or run `cell calibrate`"
+        )
+    return newest
+
+
+def _exchanged(found: list[CellCalibration], identities: dict[str, str]) -> str:
+    """Which devices the calibration that is nearest to these was made with instead, in words."""
+
+    def others(entry: CellCalibration) -> list[str]:
+        names = sorted(entry.identities.keys() | identities.keys())
+        return [name for name in names if entry.identities.get(name) != identities.get(name)]
+
+    if not found:
+        return ""
+    nearest = min(found, key=lambda entry: (len(others(entry)), -entry.made))
+    instead = ", ".join(f"{name} {nearest.identities.get(name, 'none')}" for name in others(nearest))
+    return f". That of {nearest.date} was made with another one: {instead}"

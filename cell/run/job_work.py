@@ -1,0 +1,72 @@
+"""What a job's run does around the steps: a calibration first where there is none, and the sweep of a run before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cell.calibration import sessions
+from cell.calibration.store import CellCalibration
+from cell.opened import Opened
+from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.ready_job import ReadyJob
+from cell.run.resumption import UnfinishedRun
+from cell.run.run import Run
+from statemachine.runner import Event
+
+
+@dataclass(frozen=True, eq=False)
+class JobWork:
+    """A job, read as `ready` from `file`, for a run of this cell; `info` goes into the journal and the report.
+
+    `stored` is its calibration; without one it is calibrated first. `before` is the run that this one resumes,
+    `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone.
+    """
+
+    cell: Opened
+    file: str | Path
+    ready: ReadyJob
+    info: Mapping[str, Any]
+    stored: CellCalibration | None
+    before: UnfinishedRun | None
+    inline: tuple[Observer, ...]
+    at_start: bool
+
+    def perform(self, run: Run[RunOutcome]) -> RunOutcome:
+        """Do it; raises what `JobRun.perform` and the calibration raise."""
+        cell, ready = self.cell, self.ready
+
+        def note(text: str) -> None:
+            run.tell(Event("note", None, {"text": text}))
+
+        if self.at_start:
+            cell.whereabouts.say_at_start()
+        calibration = self.stored
+        if calibration is None:
+            note("this simulated cell has no calibration yet: calibrating first")
+            calibration = sessions.calibrate(cell, run, self.file)
+        earlier = None
+        if self.before is not None:
+            earlier, why = self.before.sweep(ready.job, cell.config, calibration)
+            note(why if earlier is not None else f"{why}: sweeping again")
+        job_run = JobRun(
+            run,
+            cell.config,
+            cell.devices,
+            ready.job,
+            ready.nominal,
+            calibration,
+            self.info,
+            ready.kind,
+            ready.script,
+            self.inline,
+            earlier,
+            cell.truth,
+        )
+        try:
+            return job_run.perform(cell.runs_folder, cell.whereabouts)
+        finally:
+            if self.at_start:
+                cell.whereabouts.forget_word()

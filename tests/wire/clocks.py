@@ -1,0 +1,15 @@
+"""How far a test's clock is ahead of its simulated world's, though the test may not be run between two readings."""
+
+from __future__ import annotations
+
+from drivers.clock import Clock
+from sim_backends.clock import WorldClock
+
+COMPARISONS = 20
+
+
+def ahead(clock: Clock, world: WorldClock) -> float:
+    """Seconds by which `clock` is ahead of `world`: by the comparison that took the shortest of some."""
+    tried = [(clock.now(), world.now(), clock.now()) for _ in range(COMPARISONS)]
+    before, there, after = min(tried, key=lambda times: times[2] - times[0])
+    return 0.5 * (before + after) - there
