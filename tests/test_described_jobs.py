@@ -66,20 +66,21 @@ CELLS: dict[str, tuple[int, Changes, Changes]] = {
         },
         FAST,
     ),
-    "a UR5e, with boards and station in its reach": (4,
+    "a UR5e, with boards and station in its reach": (
+        4,
         {
             "arm": {"model": '"UR5e"'},
             "calibration.fine": {"base_from_board": pose((-415, 112, 20), (180, 0, 0))},
-            "calibration.large": {"base_from_board": pose((-380, -120, 20), (180, 0, 0))},
+            "calibration.large": {"base_from_board": pose((-280, -190, 20), (180, 0, 0))},
         },
         {
             **FAST,
             "approach": {
-                "start": pose((-1630, 0, -600), (0, 0, 0)), "staging": pose((-1110, 0, -600), (0, 0, 0)),
-                "target": pose((-930, 0, -600), (0, 0, 0)),
+                "start": pose((-1690, 0, -600), (0, 0, 0)), "staging": pose((-1170, 0, -600), (0, 0, 0)),
+                "target": pose((-990, 0, -600), (0, 0, 0)),
             },
-            "photo": {"stand_off": '"750 mm"', "look_down": '"44 deg"'},
-            "board": {"place_from_board": pose((60, 380, 140), (-135, 0, -90))},
+            "photo": {"stand_off": '"700 mm"', "look_down": '"44 deg"'},
+            "board": {"place_from_board": pose((-80, 330, 140), (-135, 0, -90))},
         },
     ),
     "a surface that is moved, turned and leans": (4,
