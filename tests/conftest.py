@@ -31,6 +31,8 @@ GROUPS = (
         "test_direct_devices.py",
         "test_described_jobs.py",
         "test_verify_job.py",
+        "test_touch.py",
+        "test_confirmed_turn.py",
     ),
     # One device at a time.
     (

@@ -19,6 +19,7 @@ from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies,
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
+from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.steps.arm_sweep import RUN_UP_S
 from cell.steps.camera_poses import (
     base_from_place_at_target,
@@ -46,7 +47,7 @@ def reach_problems(
     """
     kinematics = arm_kinematics(config.arm.model, None)
     arm = arm_bodies(config.arm.model)
-    deck = vehicle_bodies(deck_plates(config))
+    deck = [*vehicle_bodies(deck_plates(config)), *vehicle_obstacles(config.obstacle)]
     part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))
     tool = part if calibrates else tool_bodies(None, None, mounted(config))
     yield from _unreached(Planner(kinematics, CollisionModel(kinematics, [*arm, *tool, *deck])), _views(config))
@@ -56,6 +57,7 @@ def reach_problems(
         base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
+    station += station_obstacles(job.obstacle, base_from_place_at_target(config, job))
     held = Planner(kinematics, CollisionModel(kinematics, [*arm, *part, *deck, *station]))
     try:
         held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")

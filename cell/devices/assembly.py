@@ -114,6 +114,7 @@ def behind_gate(
         ways.forward,
         {"HOME": HOME},
         config.calibration_hash(),
+        slowed=ways.slowed,
         clock=clock,
     )
     gate = Gate(Interlocks(situation, RULES))

@@ -173,13 +173,16 @@ def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
 
 def endpoint_toml(config: dict[str, Any], endpoints: dict[str, Any]) -> str:
     """A configuration's tables as TOML, with the addresses of a served simulated cell in it."""
-    tables = {name: dict(table) for name, table in config.items()}
+    tables: dict[str, Any] = {name: table if isinstance(table, list) else dict(table) for name, table in config.items()}
     tables["cell"] |= {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
     for name in DEVICES:
         tables[name] |= endpoints.get(name, {})
     lines = ["# A simulated cell that is served: the configuration with its addresses."]
     for name, table in tables.items():
-        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
+        several = isinstance(table, list)
+        for one in table if several else [table]:
+            lines += ["", f"[[{name}]]" if several else f"[{name}]"]
+            lines += [f"{key} = {_toml(value)}" for key, value in one.items()]
     return "\n".join(lines) + "\n"
 
 
