@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cell.config import Confirm, beside, config_to_open
 from cell.devices.assembly import connect, connected_for
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.opened import Opened
 from cell.run.lock import CellLock
 from drivers.errors import ConfigError
@@ -51,7 +51,9 @@ def open_devices(
     if sim == "all":
         from cell.devices.described import Described
 
-        simulated = SimulatedCell(loaded, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED)
+        simulated = SimulatedCell(
+            loaded, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
+        )
         undo.callback(simulated.close)
         loaded = with_endpoints(loaded, simulated.endpoints)
     needed = connected_for(loaded, only)

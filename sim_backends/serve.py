@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -33,6 +33,7 @@ from sim_backends.faults import (
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
+from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
@@ -72,24 +73,33 @@ def picture(world: World, camera: str, t_mid: float, exposure: float) -> NDArray
     return world.render(camera, t_mid, exposure)
 
 
+CAMERAS = ("scan", "target")
+
+
 class ServedCell:
     """A world and its peers; use it as a context manager, or call `start` and `stop`."""
 
-    def __init__(self, world: World) -> None:
-        """Bind every endpoint of `world`. Raises OSError when no loopback address is free."""
+    def __init__(self, world: World, gige: Collection[str] = ()) -> None:
+        """Bind every endpoint of `world`. Raises OSError when no loopback address is free.
+
+        The cameras in `gige`, "scan" or "target", are on GigE Vision, the others on the frame stream protocol.
+        """
         self.world = world
         clock = world.clock
         with contextlib.ExitStack() as bound:
             self._arm = _bound(bound, RtdePeer(world.arm, clock))
             self._rail = _bound(bound, TmclPeer(world.rail, clock))
             self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
-            self._cameras = {
+            self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
                     bound,
-                    FramePeer(f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)),
+                    (GigePeer if name in gige else FramePeer)(
+                        f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)
+                    ),
                 )
-                for name in ("scan", "target")
+                for name in CAMERAS
             }
+            self._gige = frozenset(gige)
             self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
         self._faults: dict[str, Callable[[], None]] = {
@@ -128,8 +138,13 @@ class ServedCell:
             "arm": {"address": self._arm.address},
             "rail": {"url": self._rail.url},
             "vehicle": {"interface": self._vehicle.interface, "channel": self._vehicle.channel},
-            "scan_camera": {"address": self._cameras["scan"].address},
-            "target_camera": {"address": self._cameras["target"].address},
+            **{
+                f"{name}_camera": {
+                    "address": camera.address,
+                    "driver": "gige" if name in self._gige else "stream",
+                }
+                for name, camera in self._cameras.items()
+            },
             "truth": {"address": self._truth.address},
             "seed": scene.seed,
             "level": scene.level,
@@ -182,7 +197,7 @@ def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], No
     try:
         drawing = read(options.drawing) if options.drawing else STOCK.with_surface(options.surface)
         drawing = drawing if options.arm is None else drawing.with_arm(options.arm)
-        cell = ServedCell(World(options.seed, options.level, options.speed, drawing))
+        cell = ServedCell(World(options.seed, options.level, options.speed, drawing), options.gige)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
@@ -206,6 +221,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--surface", choices=sorted(SURFACES), default="pot", help="what lies at the placement area")
     parser.add_argument("--arm", choices=sorted(TABLES), help="which arm, instead of the one that is drawn")
     parser.add_argument("--drawing", help="the cell and its station, as JSON, instead of the stock cell")
+    parser.add_argument("--gige", choices=CAMERAS, action="append", default=[], help="this camera on GigE Vision")
     parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
     parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")
     options = parser.parse_args(argv)

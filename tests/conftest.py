@@ -41,6 +41,8 @@ GROUPS = (
         "wire/test_rail_driver.py",
         "wire/test_vehicle_driver.py",
         "wire/test_camera_driver.py",
+        "wire/test_gige_camera.py",
+        "wire/test_aravis_fake_camera.py",
         "wire/test_sim_arm.py",
         "wire/test_sim_rail.py",
         "wire/test_sim_vehicle.py",

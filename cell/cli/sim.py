@@ -24,6 +24,9 @@ def serve(
     speed: SpeedOption = 1.0,
     config: ConfigOption = None,
     job: JobOption = "pot",
+    gige: Annotated[
+        list[str] | None, typer.Option(help="This camera on GigE Vision: scan or target; may be given twice.")
+    ] = None,
     json: JsonOption = False,
     config_out: Annotated[
         Path | None, typer.Option(help="Also write a configuration that names the simulated endpoints.")
@@ -54,6 +57,7 @@ def serve(
             config_out.write_text(endpoint_toml(tables_of(path), endpoints), encoding="utf-8")
 
     arguments = ["--seed", str(seed), "--level", level.value, "--speed", repr(speed), "--drawing", drawing.as_json()]
+    arguments += [word for name in gige or () for word in ("--gige", name)]
     sys.exit(server.main([*arguments, *(["--json"] if json else [])], ready=ready))
 
 

@@ -22,6 +22,7 @@ from cell.device_config import (
     VehicleConfig,
     real_path,
 )
+from cell.devices.camera_makes import FOLDER, GIGE, OPTICS, USB3, V4L2
 from cell.devices.make import AnyMake, Make, Surroundings
 from cell.units import quantity, whole
 
@@ -254,8 +255,6 @@ def _with(*keys: str) -> Callable[[Record, Mapping[str, Any]], Record]:
     return simulated
 
 
-_OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
-
 BUILT_IN: tuple[AnyMake, ...] = (
     Make(
         "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
@@ -264,10 +263,11 @@ BUILT_IN: tuple[AnyMake, ...] = (
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
     Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle),
-    Make("camera", "stream", StreamCameraConfig, _camera, _OPTICS, simulated=_with("address")),
+    Make("camera", "stream", StreamCameraConfig, _camera, OPTICS, simulated=_with("address")),
     Make(
         "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),
         simulated=_with(), on_arm=True,
     ),
     Make("claw", "arm_output", ArmOutputClawConfig, _claw, simulated=_with(), on_arm=True),
+    GIGE, USB3, V4L2, FOLDER,
 )  # fmt: skip

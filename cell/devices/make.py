@@ -72,7 +72,8 @@ class Make(Generic[Record, Connected]):
     `calibrated_since` more of them, which count where they are not at their default, so that what was stored before
     there were such keys still fits. `identity` tells one device from another of the same make.
     `simulated(record, endpoint)` is the record with the address of the peer that `cell sim serve` has for it; None
-    where it has none. `on_arm`: it hangs on the arm's connectors.
+    where it has none. `on_arm`: it hangs on the arm's connectors. `missing()` says what has to be installed before it
+    can be connected, empty when nothing has. `replays`: what it delivers is of another day, so nothing may move by it.
     """
 
     kind: str
@@ -84,6 +85,8 @@ class Make(Generic[Record, Connected]):
     identity: Callable[[Connected], str] = serial_number
     simulated: Callable[[Record, Mapping[str, Any]], Record] | None = None
     on_arm: bool = False
+    missing: Callable[[], str] = lambda: ""
+    replays: bool = False
 
 
 AnyMake = Make[Any, Any]

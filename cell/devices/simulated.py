@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, Protocol
 
 from cell.config import DEVICES, CellConfig
@@ -54,14 +55,24 @@ class Simulation(Protocol):
 
 
 class SimulatedCell:
-    """A served simulated cell; `endpoints` is the JSON object that it printed."""
+    """A served simulated cell, the cameras in `gige` on GigE Vision; `endpoints` is the JSON object that it printed."""
 
-    def __init__(self, config: CellConfig, described: Described, *, seed: int, level: str, speed: float) -> None:
+    def __init__(
+        self,
+        config: CellConfig,
+        described: Described,
+        *,
+        seed: int,
+        level: str,
+        speed: float,
+        gige: Collection[str] = (),
+    ) -> None:
         """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so."""
         self._config = config
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
         command += ["--seed", str(seed), "--level", level, "--speed", repr(speed)]
         command += ["--drawing", described.drawing(config).as_json()]
+        command += [word for name in gige for word in ("--gige", name.removesuffix("_camera"))]
         # A file, because a pipe that nobody reads would block the writer; closed with the process.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
@@ -151,6 +162,11 @@ class SimulatedCell:
         if self._process.stdout is not None:
             self._process.stdout.close()
         self._messages.close()
+
+
+def on_gige(config: CellConfig) -> list[str]:
+    """The cameras that the configuration wants on GigE Vision: so their peers are served."""
+    return [name for name in DEVICES if DEVICES[name] == "camera" and config.make(name).name == "gige"]
 
 
 def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
