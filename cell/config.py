@@ -30,6 +30,7 @@ from cell.device_config import (
 from cell.devices.built_in import BUILT_IN
 from cell.devices.make import AnyMake
 from cell.devices.makes import make_of, record_of
+from cell.obstacles import VehicleObstacle, once_each
 from cell.toml_file import Table, read_toml, validate
 from cell.units import number, shown
 from drivers.errors import ConfigError
@@ -99,6 +100,12 @@ class CellConfig(Table):
     laser: Annotated[SerializeAsAny[LaserConfig], WrapValidator(record_of("laser"))]
     claw: Annotated[SerializeAsAny[ClawConfig], WrapValidator(record_of("claw"))]
     calibration: CalibrationConfig
+    obstacle: tuple[VehicleObstacle, ...] = ()
+
+    @model_validator(mode="after")
+    def _distinct_obstacles(self) -> Self:
+        once_each(self.obstacle)
+        return self
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
@@ -125,7 +132,9 @@ class CellConfig(Table):
         for name, kind in DEVICES.items():
             make = self.make(name)
             if make.calibrated:
-                parts[name] = self.device(name).model_dump(include=set(make.calibrated))
+                record = self.device(name)
+                since = record.model_dump(include=set(make.calibrated_since), exclude_defaults=True)
+                parts[name] = {**record.model_dump(include=set(make.calibrated)), **since}
             if make not in BUILT_IN:
                 parts[name] = {**parts.get(name, {}), "driver": f"{kind}.{make.name}"}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

@@ -150,7 +150,9 @@ class ArmConfig(DeviceConfig):
 
 
 class VehicleConfig(DeviceConfig):
-    """The carrier."""
+    """The carrier. One that does not drive (`DRIVES`) stands at the target of every job."""
+
+    DRIVES: ClassVar[bool] = True
 
     track: Annotated[float, quantity("mm", 100, 3000)]
     max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cell.addresses import Name
 from cell.device_config import Exposure, Mounting, Pose, checked_board
+from cell.obstacles import StationObstacle, once_each
 from cell.toml_file import Table, read_toml, validate
 from cell.units import number, quantity, shown, whole
 from drivers.errors import ConfigError
@@ -177,6 +178,12 @@ class Job(Table):
     scan: ScanSection
     grasp: GraspSection
     place: PlaceSection
+    obstacle: tuple[StationObstacle, ...] = ()
+
+    @model_validator(mode="after")
+    def _distinct_obstacles(self) -> Self:
+        once_each(self.obstacle)
+        return self
 
     @property
     def place_from_board(self) -> pin.SE3:

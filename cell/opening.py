@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cell.config import Confirm, beside, config_to_open
 from cell.devices.assembly import connect, connected_for
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.opened import Opened
 from cell.run.lock import CellLock
 from drivers.errors import ConfigError
@@ -48,7 +48,9 @@ def open_devices(
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
     simulated = None
     if sim == "all":
-        simulated = SimulatedCell(seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface)
+        simulated = SimulatedCell(
+            seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface, gige=on_gige(loaded)
+        )
         undo.callback(simulated.close)
         loaded = with_endpoints(loaded, simulated.endpoints)
     needed = connected_for(loaded, only)

@@ -374,13 +374,28 @@ class Cell:
         """Look at the deck boards again and say how good the stored calibration is today.
 
         Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
-        seen. `job` names the part that may be in the claw and what the place error is reckoned for.
+        seen. `job` names the part that may be in the claw and what the place error is reckoned for. A turn of the laser
+        that the board confirms is kept with the calibration, for jobs.
         """
         stops = self.stops
         loaded, _ = load_job(job)
         calibration = self.calibration()
         return self.begin(
             "verification", lambda run: sessions.verify(self._here, run, calibration, loaded), observer, stops
+        ).result()
+
+    def time_stamps(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
+        """Measure how late the scan camera's time stamps come, by sweeps to and fro over the fine board; kept with the
+        stored calibration, which is returned with it, and reckoned with by every sweep of the rail from then on.
+
+        Raises `CalibrationStale` when there is no calibration, `RefusedError` for a rolling shutter, for stamps that no
+        correction mends, and when the sweeps do not tell. `job` names the part that may be in the claw.
+        """
+        stops = self.stops
+        loaded, _ = load_job(job)
+        calibration = self.calibration()
+        return self.begin(
+            "timing", lambda run: sessions.time_stamps(self._here, run, calibration, loaded), observer, stops
         ).result()
 
     def home(self, device: str | None = None) -> None:

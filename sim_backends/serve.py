@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -32,6 +32,7 @@ from sim_backends.faults import (
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
+from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
@@ -70,24 +71,33 @@ def picture(world: World, camera: str, t_mid: float, exposure: float) -> NDArray
     return world.render(camera, t_mid, exposure)
 
 
+CAMERAS = ("scan", "target")
+
+
 class ServedCell:
     """A world and its peers; use it as a context manager, or call `start` and `stop`."""
 
-    def __init__(self, world: World) -> None:
-        """Bind every endpoint of `world`. Raises OSError when no loopback address is free."""
+    def __init__(self, world: World, gige: Collection[str] = ()) -> None:
+        """Bind every endpoint of `world`. Raises OSError when no loopback address is free.
+
+        The cameras in `gige`, "scan" or "target", are on GigE Vision, the others on the frame stream protocol.
+        """
         self.world = world
         clock = world.clock
         with contextlib.ExitStack() as bound:
             self._arm = _bound(bound, RtdePeer(world.arm, clock))
             self._rail = _bound(bound, TmclPeer(world.rail, clock))
             self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
-            self._cameras = {
+            self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
                     bound,
-                    FramePeer(f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)),
+                    (GigePeer if name in gige else FramePeer)(
+                        f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)
+                    ),
                 )
-                for name in ("scan", "target")
+                for name in CAMERAS
             }
+            self._gige = frozenset(gige)
             self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset))
             self._peers = bound.pop_all()
         self._faults: dict[str, Callable[[], None]] = {
@@ -126,8 +136,13 @@ class ServedCell:
             "arm": {"address": self._arm.address},
             "rail": {"url": self._rail.url},
             "vehicle": {"interface": self._vehicle.interface, "channel": self._vehicle.channel},
-            "scan_camera": {"address": self._cameras["scan"].address},
-            "target_camera": {"address": self._cameras["target"].address},
+            **{
+                f"{name}_camera": {
+                    "address": camera.address,
+                    "driver": "gige" if name in self._gige else "stream",
+                }
+                for name, camera in self._cameras.items()
+            },
             "truth": {"address": self._truth.address},
             "seed": scene.seed,
             "level": scene.level,
@@ -171,7 +186,9 @@ def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], No
     if options.exit_with_stdin:
         threading.Thread(target=_watch_stdin, args=(ended,), name="stdin", daemon=True).start()
     try:
-        cell = ServedCell(World(options.seed, options.level, options.speed, options.surface, arm=options.arm))
+        cell = ServedCell(
+            World(options.seed, options.level, options.speed, options.surface, arm=options.arm), options.gige
+        )
     except OSError as error:
         print(f"no free loopback endpoint: {error}; end other simulated cells and try again", file=sys.stderr)
         return 1
@@ -191,6 +208,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second (default: %(default)s)")
     parser.add_argument("--surface", choices=sorted(SURFACES), default="pot", help="what lies at the placement area")
     parser.add_argument("--arm", choices=sorted(TABLES), default="UR10e", help="which arm (default: %(default)s)")
+    parser.add_argument("--gige", choices=CAMERAS, action="append", default=[], help="this camera on GigE Vision")
     parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
     parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")
     options = parser.parse_args(argv)

@@ -30,6 +30,8 @@ GROUPS = (
         "test_end_screen.py",
         "test_direct_devices.py",
         "test_verify_job.py",
+        "test_touch.py",
+        "test_confirmed_turn.py",
     ),
     # One device at a time.
     (
@@ -38,6 +40,8 @@ GROUPS = (
         "wire/test_rail_driver.py",
         "wire/test_vehicle_driver.py",
         "wire/test_camera_driver.py",
+        "wire/test_gige_camera.py",
+        "wire/test_aravis_fake_camera.py",
         "wire/test_sim_arm.py",
         "wire/test_sim_rail.py",
         "wire/test_sim_vehicle.py",

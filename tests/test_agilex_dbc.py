@@ -23,7 +23,7 @@ def test_every_identifier_of_the_protocol_is_there(database: Database) -> None:
     identifiers = {message.frame_id for message in database.messages}
     motors = {0x250 + i for i in range(1, 9)} | {0x260 + i for i in range(1, 9)}
     commands = {0x421, 0x111, 0x131, 0x141, 0x441, 0x411}
-    assert identifiers == motors | commands | {0x4A1, 0x211, 0x221, 0x311, 0x361}
+    assert identifiers == motors | commands | {0x41A, 0x4A1, 0x211, 0x221, 0x311, 0x361}
     assert not any(message.is_extended_frame for message in database.messages)
 
 
@@ -60,12 +60,13 @@ def test_feedback_is_read_at_its_places(database: Database) -> None:
     assert decoded(0x361, struct.pack(">BBhhh", 87, 99, 264, -15, 253)) == pytest.approx(
         {"StateOfCharge": 87, "StateOfHealth": 99, "Voltage": 26.4, "Current": -1.5, "Temperature": 25.3}
     )
-    assert decoded(0x4A1, struct.pack(">4H", 2, 1, 204, 110)) == {
-        "ControllerHardware": 2,
-        "DriverHardware": 1,
-        "ControllerSoftware": 204,
-        "DriverSoftware": 110,
-    }
+    for answer in (0x41A, 0x4A1):
+        assert decoded(answer, struct.pack(">4H", 2, 1, 204, 110)) == {
+            "ControllerHardware": 2,
+            "DriverHardware": 1,
+            "ControllerSoftware": 204,
+            "DriverSoftware": 110,
+        }
 
 
 def test_odometry_follows_a_circle_back_to_its_start() -> None:

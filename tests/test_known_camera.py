@@ -7,8 +7,10 @@ import pytest
 
 from cell.calibration.recorded.known_camera import read_camera
 from cell.calibration.recorded.solution import camera_of
+from cell.calibration.solve.intrinsics import choose_lens
 from cell.geometry.camera import CameraModel
 from drivers.errors import ConfigError, RefusedError
+from tests import recorded_scenes
 from tests.recorded_scenes import LENS, MATRIX, SIZE, scene
 from tests.test_no_confident_wrong_answer import right, solved
 
@@ -88,3 +90,21 @@ def test_what_a_given_camera_is_off_by_is_stated_or_refused(off):
     if off == 1.0:
         assert not result["refused"]
         assert np.linalg.norm(result["hand_eye"]["sigma_mm"]) < 1.0
+
+
+def test_a_given_camera_that_nothing_checks_is_doubted_and_has_a_deviation():
+    result = solved(scene(seed=3, count=3), given(fx=1.01))
+    assert result["intrinsics"]["sigma_px"]["fx"] > 0.009 * MATRIX[0, 0]
+    assert any("not checked" in note and "3 stops" in note for note in result["notes"])
+    assert right(result)
+    assert result["light_plane"]["sigma_place_mm"] > 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_lens_off_its_axis_counts_in_a_camera_of_few_views(monkeypatch, seed):
+    """Eight views cannot tell tangential terms for certain; held at 0 they move the centre by ten deviations."""
+    monkeypatch.setattr(recorded_scenes, "LENS", np.array([-0.1, 0.05, 0.003, -0.002, 0.0]))
+    found, _ = choose_lens([frame.view for frame in scene(seed, count=8, laser=False)])
+    truth = np.array([MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2]])
+    assert np.all(np.abs(found.camera.parameters[:4] - truth) < 3 * found.sigma[:4])
+    assert np.all(found.sigma[:4] < 0.012 * MATRIX[0, 0])

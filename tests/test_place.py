@@ -15,12 +15,14 @@ from cell.geometry.poses import from_matrix, from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import load_job
 from cell.lab.bench.whole_job import NoFrames
+from cell.motion.collision import CollisionError
 from cell.run.resumption import UnfinishedRun
 from cell.steps import drive_to_target
 from cell.steps.kinds import PLACE
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.place import PlaceResult, place
+from cell.steps.touch import Touch
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from cell.vision import parse_board
@@ -33,6 +35,8 @@ from statemachine.runner import StepContext
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
+STATED = Touch(0.0, 0.06e-3)
+"""Where the part is to touch first: as sure as a job that knows its grasp well is of it."""
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
 
 
@@ -79,6 +83,7 @@ class Site:
         return place(
             JOB,
             self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
+            STATED,
             self.mover,
             self.arm,
             given["claw"],
@@ -120,6 +125,8 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     assert site.cell.world.collisions.found == ()
     where = site.part.where
     assert where is not None
+    with pytest.raises(CollisionError, match="claw and placed part"):
+        site.mover.plan_to(where * JOB.grasp.flange_from_part.se3().inverse(), "where the part stands now")
     true = pin.SE3(site.base_from_surface * JOB.place.surface_from_part.se3())
     assert np.linalg.norm(where.translation - true.translation) < 1e-3
 
@@ -136,6 +143,31 @@ def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not
     # 40 mm/s until 24 N is felt: far below the 150 N of a protective stop.
     assert 10.0 < max(site.forces) < 100.0
     assert site.part.told("touched") == "touched"
+
+
+@pytest.mark.parametrize(("too_low", "side"), [(0.4e-3, "higher"), (-0.4e-3, "lower")])
+def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lifted(too_low: float, side: str) -> None:
+    """Within the way in which contact is looked for: only what is stated of the place tells that it is wrong."""
+    site = Site()
+    with pytest.raises(RefusedError, match=rf"touched 0\.\d+ mm {side} than the scan says.*verify") as caught:
+        site.place(too_low=too_low)
+    (number,) = caught.value.numbers
+    assert number.value == pytest.approx(1e3 * too_low, abs=0.03)
+    assert number.most == pytest.approx(3.5 * np.hypot(0.06, 0.03), abs=0.01)
+    assert site.held
+    assert site.noted == []
+    assert site.part.state is PartState.HELD
+    assert site.height_above() > 0.5 * JOB.place.approach
+
+
+@pytest.mark.parametrize("too_low", [0.1e-3, -0.1e-3])
+def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> None:
+    result = Site().place(too_low=too_low)
+    assert result.touch is not None
+    assert result.touch.off == pytest.approx(too_low, abs=0.02e-3)
+    # Pressed on until the force that lets go: the surface gives way by half a millimetre.
+    assert result.depth_error < result.touch.felt.height - 0.3e-3
+    assert result.notes == ()
 
 
 def test_a_part_that_meets_nothing_is_not_released() -> None:

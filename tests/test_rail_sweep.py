@@ -40,7 +40,7 @@ def nothing(cell: VirtualCell) -> None:
     """Nobody meddles."""
 
 
-def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> Swath:
+def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0, errors: SweepErrors = ERRORS) -> Swath:
     """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     devices = cell.devices
@@ -60,7 +60,7 @@ def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0)
             meddle(cell)
 
     collector = Collector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
-    return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, ERRORS, collector)
+    return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
 
 
 def refused(code: str, meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> str:

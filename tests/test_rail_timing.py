@@ -61,3 +61,17 @@ def test_readings_that_contradict_an_even_motion_say_so_and_late_ones_do_not() -
     assert stepped.unevenness > 0.00003
     for share in (0.0, 0.3, 0.6, 1.0):
         assert EvenMotion.of(*readings(300, 0.2, share, 2)).unevenness < 1e-9
+
+
+@pytest.mark.parametrize("speed", [SPEED, -SPEED])
+@pytest.mark.parametrize("late", [0.0, 0.02])
+def test_what_no_even_motion_explains_is_found_beside_prompt_and_late_replies(speed: float, late: float) -> None:
+    """A parabola is off the best line by an eighth of its rise, at most; one that round trips explain is not off."""
+    times, positions, trips = readings(300, late, 0.5, 3, speed)
+    assert EvenMotion.of(times, positions, trips).residual == 0.0
+    held = positions / speed
+    bend = 0.002 * np.square(held / DURATION) * np.sign(speed)
+    bent = EvenMotion.of(times, positions + bend, trips)
+    assert 0.002 / 8 - SPEED * 0.0012 <= bent.residual <= 0.002 / 8
+    slight = EvenMotion.of(times, positions + 1e-3 * bend, trips)
+    assert slight.residual <= 1e-6

@@ -18,6 +18,7 @@ from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
+from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
 from cell.vision.pictures import read_picture
@@ -213,6 +214,36 @@ def remarks_in_some_rows(folder: Path) -> None:
     (folder / "robot.csv").write_text("image,x,y,z,qx,qy,qz,qw,comment\n" + "\n".join(reversed(said)))
 
 
+def position_rotation_and_picture_below_each_other(folder: Path) -> None:
+    """As a driver's script prints them, a line for each."""
+    lines = [
+        f"{p[:3, 3].tolist()}\n{quaternion(p)}\nframe{k + 3:02d}.png\n" for k, p in reversed(list(enumerate(POSES)))
+    ]
+    (folder / "data.txt").write_text("".join(lines))
+
+
+def titles_above_rotation_and_position(folder: Path) -> None:
+    turns = [Rotation.from_matrix(p[:3, :3]).as_rotvec().tolist() for p in POSES]
+    blocks = [
+        f"{k + 3}:\nRotation:\n{turn}\nTranslation:\n{p[:3, 3].tolist()}\n"
+        for k, (p, turn) in enumerate(zip(POSES, turns, strict=True))
+    ]
+    (folder / "info.txt").write_text("\n".join(blocks))
+
+
+def as_ros_echoes_a_transform(folder: Path) -> None:
+    blocks = []
+    for k, p in enumerate(POSES):
+        turn = Rotation.from_matrix(p[:3, :3])
+        angles = "\n".join(
+            f"            in RPY ({u}) {turn.as_euler('xyz', degrees=u == 'degree').round(3).tolist()}"
+            for u in ("radian", "degree")
+        )
+        place = p[:3, 3].round(9).tolist()
+        blocks.append(f"At time {k}.5\n- Translation: {place}\n- Rotation: in Quaternion {quaternion(p)}\n{angles}")
+    (folder / "tf.txt").write_text("\n".join(blocks))
+
+
 SPELLINGS = {
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
     rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
@@ -229,6 +260,9 @@ SPELLINGS = {
     titles_above_matrices: ("matrix-4x4", "m", "name"),
     times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
     remarks_in_some_rows: ("xyz+quaternion-xyzw", "m", "number"),
+    position_rotation_and_picture_below_each_other: ("xyz+quaternion-xyzw", "m", "name"),
+    titles_above_rotation_and_position: ("rotvec-rad+xyz", "m", "name"),
+    as_ros_echoes_a_transform: ("xyz+quaternion-xyzw", "m", "order"),
 }
 
 
@@ -288,6 +322,42 @@ def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):
         (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
     _, understood, _ = understand(recording, seen)
     assert "are they the poses of these pictures" in understood.refused
+
+
+@pytest.mark.parametrize(("a", "b"), [(0, 3), (2, 6)])
+def test_two_exchanged_poses_of_seven_do_not_hide_the_reading(recording, seen, a, b):
+    """The frames that are left give the reading; the two are named by what compares the turns."""
+    for k in range(7, len(POSES)):
+        (recording / f"frame{k + 3:02d}.png").unlink()
+    for k in range(7):
+        pose = POSES[{a: b, b: a}.get(k, k)]
+        (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
+    frames, understood, _ = understand(recording, seen)
+    assert not understood.refused, understood.refused
+    kept = agreeing(frames, CAMERA)
+    assert len(kept) == 5
+    assert {f.name for f in frames if f not in kept} == {f"frame{k + 3:02d}.png" for k in (a, b)}
+
+
+def test_one_pose_in_another_unit_is_named(recording, seen):
+    one_file_each(recording, lambda p: row([*p[:3, 3], *quaternion(p)]))
+    p = POSES[4]
+    (recording / "pose07.txt").write_text(row([*(1e3 * p[:3, 3]), *quaternion(p)]))
+    frames, understood, _ = understand(recording, seen)
+    assert not understood.refused, understood.refused
+    assert "pose07.txt" in frames[4].text
+    assert "another unit" in frames[4].text
+    others = [f for f in frames if f is not frames[4]]
+    assert all(f.reason is None and f.base_from_flange is not None for f in others)
+
+
+def test_poses_that_are_shifted_by_one_picture_are_named(recording, seen):
+    for k, pose in enumerate([*POSES[1:], POSES[0]]):
+        (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
+    frames, understood, _ = understand(recording, seen)
+    assert "previous picture" in understood.refused
+    assert "shifted by one" in understood.refused
+    assert all(f.base_from_flange is None for f in frames)
 
 
 def test_times_match_poses_to_pictures(tmp_path, pictures, seen):

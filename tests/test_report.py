@@ -148,7 +148,13 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
     report = ends(report_runs.real).report
     assert report["truth"] is None
     names = [row["name"] for row in report["measured"]]
-    assert names[:4] == ["place error, stated 95 % bound", "contact depth", "fit, χ²/dof", "surface covered"]
+    assert names[:5] == [
+        "place error, stated 95 % bound",
+        "contact depth",
+        "first touch, off what the scan says",
+        "fit, χ²/dof",
+        "surface covered",
+    ]
 
 
 def test_the_stated_bound_is_the_closed_form_for_a_round_error(placed_pot: JobRecord) -> None:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.timing import collect_timing
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.finding import find_calibration
 from cell.calibration.store import (
     CellCalibration,
     gathered,
+    save_calibration,
     save_with_observations,
     solve_observations,
 )
+from cell.calibration.verify.confirm import keep_confirmed
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
 from cell.config import CellConfig
@@ -85,7 +89,10 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
 
 
 def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> Verification:
-    """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`."""
+    """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
+
+    What it finds out about the laser is kept with the stored calibration.
+    """
 
     def tell(fraction: float, text: str) -> None:
         run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
@@ -98,5 +105,27 @@ def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) 
         return Verification.of(calibration, job, seen)
 
     made = cell.recorded(run, "verification", work)
+    keep_confirmed(cell.calibrations_folder, calibration, made)
     tell(1.0, "done")
+    return made
+
+
+def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> CellCalibration:
+    """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
+    time stamps come. `job` names the part that may be in the claw.
+    """
+
+    def tell(fraction: float, text: str) -> None:
+        run.tell(Event("progress", "timing", {"fraction": fraction, "text": text}))
+
+    def work(hands: Hands) -> CellCalibration:
+        mover = cell.mover(job, hands.safe_point)
+        cell.devices.interlocks.work_with(calibration.configuration)
+        cell.devices.vehicle.recover()
+        timing = collect_timing(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
+        return replace(calibration, scan=replace(calibration.scan, timing=timing))
+
+    made = cell.recorded(run, "timing", work)
+    save_calibration(made, cell.calibrations_folder / f"{made.name}.json")
+    tell(1.0, "stored")
     return made

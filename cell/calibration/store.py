@@ -128,6 +128,8 @@ class CellCalibration:
                 "sigma_mm": [round(1e3 * sigma[f"hand-eye {axis}"], 4) for axis in "xyz"],
                 "sigma_mrad": [round(1e3 * sigma[f"hand-eye r{axis}"], 4) for axis in "xyz"],
             },
+            "laser_since": None if scan.confirmed is None else scan.confirmed.summary(),
+            "timing": None if scan.timing is None else scan.timing.summary(),
             "scan_quality": _quality(scan.quality),
             "target_camera": _lens(target.camera),
             "target_hand_eye": {

@@ -8,7 +8,8 @@ depths, so the turn is right for both. docs/theory.md, section 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,38 +66,102 @@ class Witness:
 class Pointing:
     """How far the light plane has turned since the calibration, rad, and one standard deviation of it.
 
-    Beyond `NOTED_RAD` the deviation in `stated` has the turn itself in it: it may as well be the plate that has moved.
+    `confirmed` is how much of the turn a verification has seen on its board. Where the rest is beyond `NOTED_RAD`, the
+    deviation in `stated` has it in it: it may as well be the plate that has moved.
     """
 
     turn: float
     sigma: float
+    confirmed: float = 0.0
+
+    @property
+    def open(self) -> float:
+        """The turn that only the plate tells of, rad; 0 where it is too small for a word."""
+        rest = self.turn - self.confirmed
+        return rest if abs(rest) > NOTED_RAD else 0.0
 
     @property
     def stated(self) -> Pointing:
         """With the deviation that a job has to reckon with, which has nothing but the plate to go by."""
-        return Pointing(self.turn, float(np.hypot(self.sigma, self.turn if abs(self.turn) > NOTED_RAD else 0.0)))
+        return replace(self, sigma=float(np.hypot(self.sigma, self.open)))
 
     @property
     def words(self) -> str:
         """For people."""
+        known = f", of which {1e3 * self.confirmed:+.3f} mrad were seen on a board," if self.confirmed else ""
         return (
             f"the laser points {1e3 * self.turn:+.3f} ± {1e3 * self.sigma:.3f} mrad from where it pointed at the "
-            "calibration, if the plate that shows it has not moved; the measurements allow for either, and "
-            "`cell calibrate verify` tells them apart"
+            f"calibration{known} if the plate that shows it has not moved; the measurements allow for either, and "
+            "`cell calibrate verify` tells them apart and keeps what it finds for the next jobs"
         )
 
 
-def pointing(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
-    """What a job reckons with: `turn_seen`, refused with `RefusedError` where no warmth takes the line."""
+@dataclass(frozen=True)
+class ConfirmedTurn:
+    """A turn of the laser since the calibration that the board of a verification has shown: `turn` ± `sigma`, rad.
+
+    `plate` is the turn that the plate on the claw told at the same time, rad, right or wrong: from then on the plate
+    tells only how much further the laser has turned. `made` is in seconds since the epoch.
+    """
+
+    plate: float
+    turn: float
+    sigma: float
+    made: float
+
+    def since(self, seen: Pointing) -> Pointing:
+        """The turn since the calibration, from what the plate tells now."""
+        turn = self.turn + seen.turn - self.plate
+        return Pointing(turn, float(np.hypot(seen.sigma, self.sigma)), self.turn)
+
+    def as_dict(self) -> dict[str, float]:
+        """For storage."""
+        return dict(vars(self))
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> ConfirmedTurn | None:
+        """From storage; KeyError, TypeError or ValueError when it is none."""
+        if data is None:
+            return None
+        plate, turn, sigma, made = (float(data[name]) for name in ("plate", "turn", "sigma", "made"))
+        if not (np.isfinite([plate, turn, sigma, made]).all() and sigma > 0):
+            raise ValueError(f"a confirmed turn of {turn} ± {sigma} rad")
+        return cls(plate, turn, sigma, made)
+
+    def summary(self) -> dict[str, Any]:
+        """For reports and people, units in the names."""
+        return {
+            "turned_mrad": round(1e3 * self.turn, 4),
+            "sigma_mrad": round(1e3 * self.sigma, 4),
+            "plate_mrad": round(1e3 * self.plate, 4),
+            "date": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made)),
+        }
+
+
+def pointing(
+    before: Witness,
+    now: Witness,
+    camera: CameraModel,
+    plane: LightPlane,
+    exit_point: Array,
+    confirmed: ConfirmedTurn | None = None,
+) -> Pointing:
+    """What a job reckons with: `turn_seen`, refused with `RefusedError` where no warmth takes the line.
+
+    With a turn that was `confirmed`, the plate is held against what it told then, or against the calibration, whichever
+    leaves less open: a laser that is cold again points where it did at the calibration.
+    """
     found = turn_seen(before, now, camera, plane, exit_point)
     if abs(found.turn) > LARGEST_RAD:
         raise RefusedError(
             f"the laser points {1e3 * found.turn:+.2f} mrad from where it pointed at the calibration, allowed are "
             f"±{1e3 * LARGEST_RAD:g} mrad, or the plate on the claw that shows it has moved: look at the plate and at "
-            "the laser's and the camera's mounts, and run `cell calibrate verify`, which tells which it was",
+            "the laser's and the camera's mounts, run `cell calibrate verify`, which tells which it was, then "
+            "`cell calibrate`",
             Measured("the laser's pointing has moved by", 1e3 * found.turn, "mrad", most=1e3 * LARGEST_RAD),
         )
-    return found.stated
+    ways = [found.stated] if confirmed is None else [found.stated, confirmed.since(found).stated]
+    return min(ways, key=lambda way: way.sigma)
 
 
 def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:

@@ -19,6 +19,7 @@ from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies,
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
+from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.steps.arm_sweep import RUN_UP_S
 from cell.steps.camera_poses import (
     base_from_place_at_target,
@@ -41,7 +42,7 @@ def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) 
     """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m."""
     kinematics = arm_kinematics(config.arm.model, None)
     arm = arm_bodies(config.arm.model)
-    deck = vehicle_bodies(deck_plates(config))
+    deck = [*vehicle_bodies(deck_plates(config)), *vehicle_obstacles(config.obstacle)]
     empty = Planner(kinematics, CollisionModel(kinematics, [*arm, *tool_bodies(), *deck]))
     yield from _unreached(empty, _views(config))
     part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3())
@@ -51,6 +52,7 @@ def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) 
         base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
+    station += station_obstacles(job.obstacle, base_from_place_at_target(config, job))
     held = Planner(kinematics, CollisionModel(kinematics, [*arm, *part, *deck, *station]))
     try:
         held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")

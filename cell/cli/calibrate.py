@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.cli import calibrate_solve, verify
+from cell.cli import calibrate_solve, calibrate_timing, calibration_list, verify
 from cell.cli.options import (
     ConfigOption,
     JobOption,
@@ -30,6 +30,8 @@ def register(app: typer.Typer) -> None:
     group.callback()(calibrate)
     calibrate_solve.register(group)
     verify.register(group)
+    calibrate_timing.register(group)
+    calibration_list.register(group)
     app.add_typer(group, name="calibrate")
 
 

@@ -163,6 +163,12 @@ def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
         values.add_row(f"flange to scan camera {axis}", f"{value:.4f}", f"{sigma:.4f}", "mm")
     for axis, sigma in zip("xyz", hand["sigma_mrad"], strict=True):
         values.add_row(f"turn about flange {axis}", "", f"{sigma:.4f}", "mrad")
+    if (since := summary["laser_since"]) is not None:
+        turned = f"laser turned since, verified {since['date']}"
+        values.add_row(turned, f"{since['turned_mrad']:+.4f}", f"{since['sigma_mrad']:.4f}", "mrad")
+    if (timing := summary["timing"]) is not None:
+        late = f"time stamps late, measured {timing['date']}"
+        values.add_row(late, f"{timing['late_ms']:+.4f}", f"{timing['sigma_ms']:.4f}", "ms")
     console.print(values)
     fit = Table(title="residuals; held-out views are predicted from the others")
     for name in ("camera", "views", "chi²/dof", "dots px", "held-out px", "stripe mm", "held-out mm"):

@@ -15,7 +15,12 @@ def print_recorded(result: Mapping[str, Any]) -> None:
     console = Console()
     if result["board"] is not None:
         console.print(_frames(result["frames"]))
-        _print_understood(console, result)
+        _print_stripes(console, result)
+    else:
+        for pair in result["frames"]:
+            if not pair["used"]:
+                console.print(f"{pair['name']} not used: {pair['text']}", markup=False, soft_wrap=True)
+    _print_poses(console, result)
     values = _table("calibration", ("quantity", "value", "unit"), right=1)
     camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
     if camera is not None:
@@ -53,7 +58,7 @@ def print_recorded(result: Mapping[str, Any]) -> None:
         console.print(note, markup=False, soft_wrap=True)
 
 
-def _print_understood(console: Console, result: Mapping[str, Any]) -> None:
+def _print_stripes(console: Console, result: Mapping[str, Any]) -> None:
     laser = result["laser"]
     if laser is not None and any(frame["stripe"] or frame["stripe_text"] for frame in result["frames"]):
         text = f"laser: read in {laser['channel']}"
@@ -67,6 +72,9 @@ def _print_understood(console: Console, result: Mapping[str, Any]) -> None:
         if any(counts.values()):
             parts = ", ".join(f"{count} in {frame}" for frame, count in counts.items() if count)
             console.print(f"points not used for {name} beside them: {parts}", markup=False, soft_wrap=True)
+
+
+def _print_poses(console: Console, result: Mapping[str, Any]) -> None:
     poses = result["poses"]
     if poses is not None and poses.get("reading") is not None:
         chosen = "as given" if "poses" in poses["given"] else "chosen by the pictures"

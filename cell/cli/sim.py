@@ -24,6 +24,9 @@ def serve(
     speed: SpeedOption = 1.0,
     surface: Annotated[str, typer.Option(help="What stands on the place: pot, seat or panel.")] = "pot",
     arm: Annotated[str, typer.Option(help="Which arm, by the maker's name.")] = "UR10e",
+    gige: Annotated[
+        list[str] | None, typer.Option(help="This camera on GigE Vision: scan or target; may be given twice.")
+    ] = None,
     json: JsonOption = False,
     config_out: Annotated[
         Path | None, typer.Option(help="Also write a configuration that names the simulated endpoints.")
@@ -51,5 +54,5 @@ def serve(
             config_out.write_text(endpoint_toml(endpoints), encoding="utf-8")
 
     arguments = ["--seed", str(seed), "--level", level.value, "--speed", repr(speed), "--surface", surface]
-    arguments += ["--arm", arm]
+    arguments += ["--arm", arm, *(word for name in gige or () for word in ("--gige", name))]
     sys.exit(server.main([*arguments, *(["--json"] if json else [])], ready=ready))

@@ -39,13 +39,26 @@ def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devic
     """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on."""
     clock = Clock(config.cell.time_scale)
     made: dict[str, Any] = {}
+    needed = connected_for(config, only)
+    refuse_replays(config, needed)
     with ExitStack() as opened:
-        for name in connected_for(config, only):
+        for name in needed:
             made[name] = connect_one(config, name, clock, arm=made.get("arm"))
             if not config.make(name).on_arm:
                 opened.callback(made[name].close)
         opened.pop_all()
     return behind_gate(config, clock, **made)
+
+
+def refuse_replays(config: CellConfig, needed: Collection[str]) -> None:
+    """`ConfigError` when something that moves would be connected beside a camera that shows another day."""
+    replaying = [name for name in needed if config.make(name).replays]
+    moving = [name for name in needed if DEVICES[name] in ("arm", "rail", "vehicle", "claw")]
+    if replaying and moving:
+        raise ConfigError(
+            f'{replaying[0]}.driver = "{config.make(replaying[0]).name}" plays recorded pictures, by which nothing may '
+            f"move: {', '.join(moving)} cannot be opened beside it. Name a camera that is there, or open it alone"
+        )
 
 
 def connected_for(config: CellConfig, wanted: Collection[str]) -> list[str]:
@@ -114,6 +127,7 @@ def behind_gate(
         ways.forward,
         {"HOME": HOME},
         config.calibration_hash(),
+        slowed=ways.slowed,
         clock=clock,
     )
     gate = Gate(Interlocks(situation, RULES))

@@ -22,6 +22,7 @@ from cell.device_config import (
     VehicleConfig,
     real_path,
 )
+from cell.devices.camera_makes import FOLDER, GIGE, OPTICS, USB3, V4L2
 from cell.devices.make import AnyMake, Make, Surroundings
 from cell.units import quantity, whole
 
@@ -31,9 +32,20 @@ if TYPE_CHECKING:
     from drivers.rail.tmcl import TmclRail
     from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
     from drivers.vehicle.agilex import AgilexVehicle
+    from drivers.vehicle.fixed import FixedVehicle
 
 MODULE_COUNTS = 2**31 - 1
 """Microsteps to which the rail's module counts, positions and microsteps per second alike."""
+
+BAUDS = (9600, 14400, 19200, 28800, 38400, 57600, 76800, 115200, 230400, 250000, 500000, 1_000_000)
+"""What the rail's module can be set to (its global parameter 65); over USB none of them matters."""
+REFERENCE_MODES = (*range(1, 9), *range(65, 69), *range(133, 137))
+"""Axis parameter 193 of the rail's module; +64 swaps left and right, +128 is for a home switch that opens."""
+MODES_TOLD = (
+    ": 1 left limit switch, 2 right then left, 3 right then both sides of the left, 4 both sides of the left, 5 home "
+    "switch in negative direction turning at the left switch, 6 in positive direction turning at the right, 7 and 8 "
+    "the same without the limit switches; 64 more swaps the sides of 1-4, 128 more for a home switch 5-8 that opens"
+)
 
 Connector = Annotated[int, whole(0, 17, meaning=": 0-7 standard, 8-15 configurable, 16-17 tool")]
 
@@ -49,6 +61,8 @@ class TmclRailConfig(RailConfig):
     motor: Annotated[int, whole(0, 5)] = 0
     steps_per_turn: Annotated[int, whole(20, 2000)]
     microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
+    baud: Annotated[int, whole(9600, 1_000_000, *BAUDS)] = 9600
+    reference_mode: Annotated[int, whole(1, 255, *REFERENCE_MODES, meaning=MODES_TOLD)] = 5
 
     @model_validator(mode="after")
     def _countable(self) -> Self:
@@ -100,6 +114,19 @@ class AgilexVehicleConfig(VehicleConfig):
         return f"{self.interface}:{real_path(self.place)}"
 
 
+class FixedVehicleConfig(VehicleConfig):
+    """No vehicle: the arm stands on a fixed frame. What is said of driving is not asked for."""
+
+    ADDRESS: ClassVar[str] = "driver"
+    DRIVES: ClassVar[bool] = False
+
+    driver: Literal["fixed"] = "fixed"
+    track: Annotated[float, quantity("mm", 100, 3000)] = 1.0
+    max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)] = 1.5
+    max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)] = 1.0
+    lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0
+
+
 class StreamCameraConfig(CameraConfig):
     """A camera on the frame stream protocol."""
 
@@ -147,6 +174,8 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
         acceleration=config.acceleration,
         address=config.address,
         motor=config.motor,
+        baud=config.baud,
+        reference_mode=config.reference_mode,
         control=not around.look,
         clock=around.clock,
     )
@@ -190,6 +219,12 @@ def _vehicle(name: str, config: AgilexVehicleConfig, around: Surroundings) -> Ag
     )
 
 
+def _no_vehicle(name: str, config: FixedVehicleConfig, around: Surroundings) -> FixedVehicle:
+    from drivers.vehicle.fixed import FixedVehicle
+
+    return FixedVehicle(name, around.clock)
+
+
 def _camera(name: str, config: StreamCameraConfig, around: Surroundings) -> StreamCamera:
     from drivers.camera.stream import StreamCamera
 
@@ -220,19 +255,19 @@ def _with(*keys: str) -> Callable[[Record, Mapping[str, Any]], Record]:
     return simulated
 
 
-_OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
-
 BUILT_IN: tuple[AnyMake, ...] = (
     Make(
         "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
-        simulated=_with("url"),
+        calibrated_since=frozenset(("reference_mode",)), simulated=_with("url"),
     ),
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
-    Make("camera", "stream", StreamCameraConfig, _camera, _OPTICS, simulated=_with("address")),
+    Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle),
+    Make("camera", "stream", StreamCameraConfig, _camera, OPTICS, simulated=_with("address")),
     Make(
         "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),
         simulated=_with(), on_arm=True,
     ),
     Make("claw", "arm_output", ArmOutputClawConfig, _claw, simulated=_with(), on_arm=True),
+    GIGE, USB3, V4L2, FOLDER,
 )  # fmt: skip

@@ -14,10 +14,10 @@ import numpy as np
 
 from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
-from cell.devices.simulated import SimulatedCell, with_endpoints
+from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
-from drivers.errors import CellError, ConfigError
+from drivers.errors import CellError, ConfigError, InterlockError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle, why_untold
 
 PINGS = 100
@@ -72,7 +72,7 @@ def diagnose(
     _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
         return _diagnose(config, only)
-    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot")
+    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot", gige=on_gige(config))
     try:
         return _diagnose(with_endpoints(config, simulated.endpoints), only)
     finally:
@@ -150,7 +150,11 @@ def _vehicle_state(vehicle: Vehicle) -> str:
 
 
 def _camera_state(camera: Camera) -> str:
-    frame = camera.grab()
+    try:
+        frame = camera.grab()
+    except InterlockError:
+        # To take a picture, some have to be held and set.
+        return f"{camera.shape[1]}×{camera.shape[0]} configured; no picture, because it is only looked at"
     return f"frame {frame.frame_id}, {camera.shape[1]}×{camera.shape[0]}, mean {frame.image.mean():.0f} DN"
 
 

@@ -30,6 +30,9 @@ from drivers.interfaces import (
 )
 from drivers.link_table import LinkTable
 
+PATIENCE_S = 1.0
+"""How old the arm's state may be that a speed rests on: the arm stands."""
+
 
 class GatedArm(Gated[Arm]):
     """The arm, its motions and its recovery begun through a gate."""
@@ -56,9 +59,15 @@ class GatedArm(Gated[Arm]):
         return self.bare.latch_clock()
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
-        """See `Arm.move_joints`."""
-        command = Command("arm", "move_joints", {"joints": checked_joints(self.name, joints)})
-        return self._move(command, lambda: self.bare.move_joints(joints, speed, acceleration))
+        """See `Arm.move_joints`; slower where the tool, or the part in it, would exceed the arm's tool speed."""
+        goal = checked_joints(self.name, joints)
+        situation = self.gate.interlocks.situation
+
+        def start() -> ArmMotion:
+            slowed = situation.slowed(self.bare.state(PATIENCE_S).joints, goal, speed, situation.held)
+            return self.bare.move_joints(joints, slowed, acceleration)
+
+        return self._move(Command("arm", "move_joints", {"joints": goal}), start)
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_linear`."""

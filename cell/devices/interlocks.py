@@ -45,7 +45,8 @@ class Situation:
     as a run has told. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by
     name. `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is
     the newest motion of the arm, None when it is not known how that went; `purposes` what this thread lights the laser
-    for. `clock` is the one that the devices share.
+    for. `slowed(start, goal, speed, carried)` is the speed of a joint move that the tool speed allows. `clock` is the
+    one that the devices share.
     """
 
     arm: Arm | None
@@ -63,7 +64,14 @@ class Situation:
     part: tuple[Body, ...] = ()
     station: tuple[Body, ...] = ()
     purposes: threading.local = field(default_factory=threading.local)
+    slowed: Callable[[Vector, Vector, float, Sequence[Body]], float] = lambda start, goal, speed, carried: speed
     clock: Clock = field(default_factory=Clock)
+
+    @property
+    def held(self) -> tuple[Body, ...]:
+        """What the claw holds, as far as a run has told; nothing when its switch shows no part."""
+        empty = bool(self.part) and self.claw is not None and not self.claw.holding
+        return () if empty else self.part
 
     @property
     def purpose(self) -> str | None:

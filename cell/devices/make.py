@@ -68,9 +68,12 @@ class Make(Generic[Record, Connected]):
     """One make of a kind of device, found by `driver = "NAME"` in the device's table.
 
     `record` is the table as a typed record; `connect(name, record, surroundings)` gives the device or raises a
-    `CellError` that names it. `calibrated` are the record's keys that a calibration depends on, `identity` tells one
-    device from another of the same make. `simulated(record, endpoint)` is the record with the address of the peer that
-    `cell sim serve` has for it; None where it has none. `on_arm`: it hangs on the arm's connectors.
+    `CellError` that names it. `calibrated` are the record's keys that a calibration depends on;
+    `calibrated_since` more of them, which count where they are not at their default, so that what was stored before
+    there were such keys still fits. `identity` tells one device from another of the same make.
+    `simulated(record, endpoint)` is the record with the address of the peer that `cell sim serve` has for it; None
+    where it has none. `on_arm`: it hangs on the arm's connectors. `missing()` says what has to be installed before it
+    can be connected, empty when nothing has. `replays`: what it delivers is of another day, so nothing may move by it.
     """
 
     kind: str
@@ -78,9 +81,12 @@ class Make(Generic[Record, Connected]):
     record: type[Record]
     connect: Callable[[str, Record, Surroundings], Connected]
     calibrated: frozenset[str] = frozenset()
+    calibrated_since: frozenset[str] = frozenset()
     identity: Callable[[Connected], str] = serial_number
     simulated: Callable[[Record, Mapping[str, Any]], Record] | None = None
     on_arm: bool = False
+    missing: Callable[[], str] = lambda: ""
+    replays: bool = False
 
 
 AnyMake = Make[Any, Any]

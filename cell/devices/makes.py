@@ -44,12 +44,11 @@ class Installed:
 
 def installed() -> list[Installed]:
     """Every make there is, with those that cannot be used and why."""
-    rows = [Installed(make.kind, make.name, "built in", "ok") for make in BUILT_IN]
+    rows = [Installed(make.kind, make.name, "built in", _state(make)) for make in BUILT_IN]
     for entry in _entries():
         kind, _, name = entry.name.partition(".")
         try:
-            _load(entry)
-            state = "ok"
+            state = _state(_load(entry))
         except _Unusable as problem:
             state = str(problem)
         rows.append(Installed(kind, name, _source(entry), state))
@@ -96,6 +95,11 @@ def record_of(kind: str) -> Callable[[Any, Any], DeviceConfig]:
         return record
 
     return read
+
+
+def _state(make: AnyMake) -> str:
+    missing = make.missing()
+    return f"not installed: {missing}" if missing else "ok"
 
 
 class _Unusable(Exception):

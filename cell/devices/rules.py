@@ -171,9 +171,7 @@ def _calibrated(now: Situation, command: Command) -> str | None:
 def _clear(now: Situation, command: Command) -> str | None:
     if now.arm is None:
         return None
-    empty = bool(now.part) and now.claw is not None and not now.claw.holding
-    others = (*(() if empty else now.part), *now.station)
-    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, others)
+    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, (*now.held, *now.station))
     if not pairs:
         return None
     return f"{', '.join(f'{a} and {b}' for a, b in pairs)} would collide on the way. Go another way, or plan it"

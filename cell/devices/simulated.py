@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Collection
 from typing import Any, Protocol
 
 from cell.config import DEVICES, CellConfig, default_toml
@@ -44,11 +45,12 @@ class Simulation(Protocol):
 
 
 class SimulatedCell:
-    """A served simulated cell; `endpoints` is the JSON object that it printed."""
+    """A served simulated cell, the cameras in `gige` on GigE Vision; `endpoints` is the JSON object that it printed."""
 
-    def __init__(self, *, seed: int, level: str, speed: float, surface: str) -> None:
+    def __init__(self, *, seed: int, level: str, speed: float, surface: str, gige: Collection[str] = ()) -> None:
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
         command += ["--seed", str(seed), "--level", level, "--speed", repr(speed), "--surface", surface]
+        command += [word for name in gige for word in ("--gige", name.removesuffix("_camera"))]
         # A file, because a pipe that nobody reads would block the writer; closed with the process.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         self._process = subprocess.Popen(
@@ -136,6 +138,11 @@ class SimulatedCell:
         self._messages.close()
 
 
+def on_gige(config: CellConfig) -> list[str]:
+    """The cameras that the configuration wants on GigE Vision: so their peers are served."""
+    return [name for name in DEVICES if DEVICES[name] == "camera" and config.make(name).name == "gige"]
+
+
 def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
     """The configuration with every device's address replaced by that of its simulated peer.
 
@@ -163,9 +170,9 @@ def endpoint_toml(endpoints: dict[str, Any]) -> str:
         ("arm", "address"): json.dumps(endpoints["arm"]["address"]),
         ("vehicle", "interface"): json.dumps(endpoints["vehicle"]["interface"]),
         ("vehicle", "channel"): json.dumps(endpoints["vehicle"]["channel"]),
-        ("scan_camera", "address"): json.dumps(endpoints["scan_camera"]["address"]),
-        ("target_camera", "address"): json.dumps(endpoints["target_camera"]["address"]),
     }
+    for camera in ("scan_camera", "target_camera"):
+        values |= {(camera, key): json.dumps(endpoints[camera][key]) for key in ("driver", "address")}
     table, lines = "", []
     for line in default_toml().splitlines():
         if line.startswith("["):

@@ -1,7 +1,7 @@
 """Which bodies the arm would bring together on the way that a command asks for, whoever asks, planned or not.
 
-Known here are the arm, its tool, the vehicle and the boards on its deck. The part in the claw and the station are among
-them where a run has told of them.
+Known here are the arm, its tool, the vehicle, the boards on its deck and the obstacles of the configuration. The part
+in the claw or where it was put, and the station with the job's obstacles are among them where a run has told of them.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from cell.motion.bodies import TOUCHES, Body, arm_bodies, tool_bodies, vehicle_b
 from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import Joints
+from cell.motion.point_speed import PointSpeed, carried_points
+from cell.obstacles import vehicle_obstacles
 from cell.steps.moves import deck_plates
 from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
@@ -34,6 +36,7 @@ class Ways:
 
     def __init__(self, config: CellConfig, table: LinkTable | None = None) -> None:
         self._config = config
+        self._obstacles = vehicle_obstacles(config.obstacle)
         self._one_at_a_time = threading.Lock()
         self.kinematics = arm_kinematics(config.arm.model, table)
         # One of its own: where the arm stands is asked while a way is reckoned.
@@ -44,7 +47,7 @@ class Ways:
     def _among(self, others: tuple[Body, ...]) -> CollisionModel:
         if self._known is None or self._known[0] != others:
             own = [*arm_bodies(self._config.arm.model), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
-            self._known = others, CollisionModel(self.kinematics, [*own, *others], MARGIN_M)
+            self._known = others, CollisionModel(self.kinematics, [*own, *self._obstacles, *others], MARGIN_M)
         return self._known[1]
 
     def forward(self, joints: Vector) -> pin.SE3:
@@ -63,6 +66,18 @@ class Ways:
             way = np.array([start, *self._way(start, command)])
             touch = first_touch(self._among(tuple(others)), way, allowed, opening=True)
             return [] if touch is None else touch.pairs
+
+    def slowed(self, start: Vector, goal: Vector, speed: float, carried: Sequence[Body] = ()) -> float:
+        """`speed`, rad/s of the joint that turns most from `start` to `goal` (6,), or less: as much as keeps every
+        point of the tool, and of what is `carried`, within `arm.max_tool_speed`. One out of range is left to the arm.
+        """
+        way = float(np.abs(np.asarray(goal) - start).max())
+        if not 0.0 < speed <= self._config.arm.max_joint_speed or way == 0.0:
+            return speed
+        with self._one_at_a_time:
+            points = carried_points(self._among(tuple(carried)).bodies)
+            bound = PointSpeed(self.kinematics, points, self._config.arm.max_tool_speed)
+            return min(speed, way * bound.fraction_speed(np.asarray(start), np.asarray(goal)))
 
     def _way(self, start: Joints, command: Command) -> Iterator[Joints]:
         arguments = command.arguments

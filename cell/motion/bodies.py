@@ -20,8 +20,10 @@ FLANGE = 7
 """Parent of what the flange carries: poses are in the flange frame. 1 … 6 are the frames that turn with a joint."""
 
 
-TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"))
-"""What comes near on purpose while the part is set down."""
+PLACED = "placed part"
+"""The part once it was let go: it stands still."""
+TOUCHES = (("part", "surface"), ("part", "table"), ("claw", "surface"), ("claw", PLACED))
+"""What comes near on purpose while the part is set down and left."""
 
 
 @dataclass(frozen=True)

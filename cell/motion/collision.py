@@ -7,6 +7,7 @@ left out, and a caller may allow named pairs, such as the part and the surface i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from operator import attrgetter
 
@@ -122,6 +123,14 @@ class CollisionModel:
         """Smallest distance in m between two bodies and their names; about 10 ms, for reports."""
         index = pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, _array(joints))
         return float(self._geometry_data.distanceResults[index].min_distance), self._pairs[index]
+
+    def placed(self, joints: Joints) -> list[Body]:
+        """All bodies where they are at the joint angles (6,) rad: the same ones, fixed to the base."""
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data, _array(joints))
+        return [
+            replace(body, parent=BASE, placement=pin.SE3(pose))
+            for body, pose in zip(self.bodies, self._geometry_data.oMg, strict=True)
+        ]
 
     def require_free(self, joints: Joints, what: str, allowed: Sequence[Pair] = ()) -> None:
         """Raise `CollisionError`, naming the bodies, when they touch at `joints`; `what` names the pose."""

@@ -75,6 +75,8 @@ def measured(
     if isinstance(placed, PlaceResult):
         travel = 1e3 * job.place.contact_travel
         found.append(Measured("contact depth", 1e3 * placed.depth_error, "mm", most=travel))
+        if placed.touch is not None:
+            found.append(placed.touch.measured)
     if isinstance(pose, PlacePose):
         found += fit_figures(pose.coverage, pose.share, pose.rms, pose.chi2_per_dof)
     if isinstance(fix, BoardFix):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pinocchio as pin
 
 from cell.job import Job
+from cell.motion.bodies import Body
 from cell.steps.approach import Planar, drive_line, turn_to
 from cell.steps.camera_poses import look_pose
 from cell.steps.moves import HOME
@@ -60,17 +61,19 @@ def drive_to_target(
     progress: Callable[[float, str], None],
     note: Callable[[str], None],
     hold: Callable[[], None] = lambda: None,
+    carried: Sequence[Body] = (),
 ) -> Arrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
     The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than the
     staging pose, and only when `whereabouts` knows where it stands. `photograph` gives the board in the base; `check`
     raises when the run is to end; `note` takes what is worth keeping; `hold` is called before
-    each way, with the vehicle at rest: a paused run waits in it.
+    each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and part as they stand, in the
+    arm base, which are kept off the station as the vehicle itself is.
     Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
     close to the station, and when the tolerance is not met after five tries.
     """
-    way = Way(job, vehicle_from_base, whereabouts)
+    way = Way(job, vehicle_from_base, whereabouts, carried)
 
     def place_from_vehicle(fix: BoardFix) -> Planar:
         return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
@@ -132,17 +135,40 @@ def drive_to_target(
         else:
             go(target)
     vehicle.brake()
-    raise RefusedError(
-        f"the vehicle stands {1e3 * error.x:.1f} mm along, {1e3 * error.y:.1f} mm across and "
-        f"{math.degrees(error.yaw):.2f} deg from its target after {count} photographs, allowed "
-        f"{1e3 * approach.tolerance:.0f} mm and {math.degrees(approach.tolerance_angle):.1f} deg; "
-        "check the floor and the wheels",
-        Measured("vehicle off its target, along", 1e3 * error.x, "mm", most=1e3 * approach.tolerance),
-        Measured("vehicle off its target, across", 1e3 * error.y, "mm", most=1e3 * approach.tolerance),
-        Measured(
-            "vehicle turned off its target", math.degrees(error.yaw), "deg", most=math.degrees(approach.tolerance_angle)
-        ),
-    ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]})
+    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", "check the floor and the wheels")
+
+
+def stand_at_target(
+    job: Job, vehicle_from_base: pin.SE3, vehicle: Vehicle, whereabouts: Whereabouts, photograph: Callable[[], BoardFix]
+) -> Arrival:
+    """What `drive_to_target` is for an arm on a fixed frame: look whether the station stands where the job has it.
+
+    Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
+    """
+    fix = photograph()
+    base_from_place = fix.base_from_board * job.place_from_board.inverse()
+    stands = Planar.of((vehicle_from_base * base_from_place).inverse())
+    whereabouts.see(stands)
+    error = Planar.of(job.approach.target.se3()).inverse() * stands
+    most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
+    if max(abs(error.x), abs(error.y)) > most or abs(error.yaw) > most_angle:
+        raise _off_target(
+            error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
+        )
+    vehicle.brake()
+    return Arrival(base_from_place, fix, error.x, error.y, error.yaw, 1)
+
+
+def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
+    most, most_angle = 1e3 * job.approach.tolerance, math.degrees(job.approach.tolerance_angle)
+    along, across, turned = 1e3 * error.x, 1e3 * error.y, math.degrees(error.yaw)
+    return RefusedError(
+        f"{who} stands {along:.1f} mm along, {across:.1f} mm across and {turned:.2f} deg from its target{after}, "
+        f"allowed {most:.0f} mm and {most_angle:.1f} deg; {remedy}",
+        Measured("vehicle off its target, along", along, "mm", most=most),
+        Measured("vehicle off its target, across", across, "mm", most=most),
+        Measured("vehicle turned off its target", turned, "deg", most=most_angle),
+    ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]} if fix.frames else None)
 
 
 def _at(here: Workplace, context: StepContext) -> Arrival:
@@ -156,6 +182,8 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     vehicle = here.devices.vehicle
     if trouble := vehicle.state().trouble:
         context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
+    if warnings := vehicle.state().warnings:
+        context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
     if not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
@@ -165,6 +193,9 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     here.mover.to(look, "the looking pose")
     here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    if not here.config.vehicle.DRIVES:
+        stand = here.config.arm.vehicle_from_base.se3()
+        return stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
     vehicle.enable()
     return drive_to_target(
         here.job,
@@ -177,6 +208,7 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
         context.progress,
         lambda text: context.note(text=text),
         context.safe_point,
+        here.mover.solids(),
     )
 
 

@@ -129,6 +129,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
             here.config.scan_camera.late,
+            head.timing,
         ),
         here.mover,
         devices,
@@ -149,7 +150,8 @@ def _pointing(here: Workplace, context: StepContext) -> Pointing | None:
         return None
     context.progress(0.0, "looking where the laser points")
     seen = require_witness(here.config, here.devices, here.frames.keep)
-    return pointing_since(head.witness, seen, head.camera, head.light_plane, here.config.laser.exit_point)
+    exit_point = here.config.laser.exit_point
+    return pointing_since(head.witness, seen, head.camera, head.light_plane, exit_point, head.confirmed)
 
 
 STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _at, SweepRecord, needs=(BoardFix,))

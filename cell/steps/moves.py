@@ -12,11 +12,21 @@ from cell.devices.interlocks import Interlocks
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.motion.arm_models import arm_kinematics
-from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.bodies import (
+    BASE,
+    PLACED,
+    Body,
+    arm_bodies,
+    box,
+    station_bodies,
+    tool_bodies,
+    vehicle_bodies,
+)
 from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
+from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.steps.camera_poses import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
@@ -55,6 +65,8 @@ class Mover:
         self._clock = clock
         self._settle_time = config.arm.settle_time
         self._tool_speed = config.arm.max_tool_speed
+        self._obstacles = vehicle_obstacles(config.obstacle)
+        self._station: list[Body] = []
         self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
         grasp = None if job is None else job.grasp
         part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
@@ -75,19 +87,41 @@ class Mover:
         on_place = job.surface.place_from_surface.se3()
         low, (x, y, z) = (corner.tolist() for corner in surface_extent)
         station = station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
+        self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place)])
+
+    def leave_part(self, base_from_part: pin.SE3) -> None:
+        """From now on the claw is empty, and the part stands where it was put: it is not to be met again."""
+        part = [body for body in self._moving if body.name == "part"]
+        self._moving = [body for body in self._moving if body.name != "part"]
+        middle = (pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5 * body.size[2]])) for body in part)
+        self._stand_before(
+            [
+                *self._station,
+                *(
+                    box(PLACED, BASE, base_from_part * shift, body.size)
+                    for body, shift in zip(part, middle, strict=True)
+                ),
+            ]
+        )
+
+    def solids(self) -> list[Body]:
+        """All that goes with the vehicle, where it is with the arm as it stands now, fixed to the base."""
+        station = {body.name for body in self._station}
+        return [body for body in self._planner.collisions.placed(self.joints) if body.name not in station]
+
+    def _stand_before(self, station: list[Body]) -> None:
+        self._station = station
         self._planner = self._plan_among(station)
         if self._interlocks is not None:
             self._interlocks.stand_before(station)
 
-    def leave_part(self) -> None:
-        """From now on the claw is empty; the part is where it was put, among the bodies that may be near the claw."""
-        self._moving = [body for body in self._moving if body.name != "part"]
-        still = [body for body in self._planner.collisions.bodies if body.name in _STATION]
-        self._planner = self._plan_among(still)
-
     def _plan_among(self, still: Sequence[Body]) -> Planner:
-        bodies = CollisionModel(self.kinematics, [*self._moving, *still])
+        bodies = CollisionModel(self.kinematics, [*self._moving, *self._obstacles, *still])
         return Planner(self.kinematics, bodies, tool_speed=self._tool_speed)
+
+    def _leaving(self, start: Joints) -> tuple[Pair, ...]:
+        """What may be near the part that was just put down: only what is so already."""
+        return tuple(pair for pair in self._planner.collisions.touching(start) if PLACED in pair)
 
     @property
     def joints(self) -> Joints:
@@ -107,7 +141,8 @@ class Mover:
     def to_joints(self, joints: Joints) -> None:
         """Move freely to joint angles and settle."""
         self.hold()
-        self.follow(self._planner.free(self.joints, joints))
+        start = self.joints
+        self.follow(self._planner.free(start, joints, self._leaving(start)))
 
     def line(
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None
@@ -135,9 +170,6 @@ class Mover:
         motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
         self._clock.sleep(self._settle_time)
         return motion.contact
-
-
-_STATION = ("table", "surface", "board post", "board")
 
 
 def _joint_limits(config: ArmConfig) -> JointLimits:

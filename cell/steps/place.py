@@ -15,6 +15,7 @@ from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.step import JobStep
+from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
 from cell.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw
@@ -27,17 +28,25 @@ FAST_FORCE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PlaceResult:
-    """Where the flange was when the part was let go, and how far contact was from where it was expected, in m."""
+    """Where the flange was when the part was let go, how far that was from where it was expected, in m, pressed on as
+    it was, and where the part had touched first; None from an arm that tells too few states."""
 
     base_from_flange: pin.SE3
     contact: bool
     depth_error: float
+    touch: TouchCheck | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not as usual, for people."""
+        return () if self.touch is None else self.touch.notes
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
+            "touch": None if self.touch is None else self.touch.as_dict(),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
             "base_from_flange_units": {"translation": "m", "rotation_vector": "rad"},
         }
@@ -46,6 +55,7 @@ class PlaceResult:
 def place(
     job: Job,
     base_from_surface: pin.SE3,
+    expected: Touch,
     mover: Mover,
     arm: Arm,
     claw: Claw,
@@ -57,11 +67,12 @@ def place(
     """Put the part onto the surface whose pose was measured.
 
     Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
-    `contact_force`; afterwards the arm folds. `part` follows what becomes of the part; `note` is called before the claw
-    is told to release it, and again as soon as it has, before anything else is done.
+    `contact_force`; afterwards the arm folds. `expected` is where the part is to touch first. `part` follows what
+    becomes of the part; `note` is called before the claw is told to release it, and again as soon as it has, before
+    anything else is done.
     Raises `RefusedError` before anything moves when the part is not held any more; with the part still held and lifted
     when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was expected,
-    or does not come at all.
+    does not come at all, or begins where the stated uncertainty of the place does not allow it.
     """
     if part.state is not PartState.HELD:
         raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
@@ -98,7 +109,8 @@ def place(
             Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
         )
     progress(0.6, "feeling for contact")
-    contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
+    with arm.record() as states:
+        contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
     reached = from_ur(arm.state().flange)
     off = depth()
     if not contact:
@@ -109,6 +121,14 @@ def place(
             "Is the part the right one, and whole?",
             Measured("reached without contact", 1e3 * off, "mm"),
         )
+    touched = felt_touch(states, flange_at(0.0).translation, base_from_part.rotation[:, 2])
+    touch = None if touched is None else TouchCheck(touched, expected)
+    if touch is not None:
+        try:
+            touch.require()
+        except RefusedError:
+            mover.line(above, plan.speed, TOUCHES)
+            raise
     progress(0.8, "releasing")
     part.state, part.where = PartState.UNKNOWN, reached * job.grasp.flange_from_part.se3()
     # Whoever finds this run cut short here must not take the part as still held.
@@ -116,19 +136,21 @@ def place(
     claw.release()
     part.state = PartState.RELEASED
     note(part)
-    mover.leave_part()
+    mover.leave_part(part.where)
     progress(0.9, "retreating")
     mover.line(above, plan.speed, TOUCHES)
     progress(0.95, "folding the arm")
     mover.to_joints(HOME)
     part.left = True
-    return PlaceResult(reached, contact, off)
+    return PlaceResult(reached, contact, off, touch)
 
 
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
-    return place(
+    pose = context.made(PlacePose)
+    done = place(
         here.job,
-        context.made(PlacePose).base_from_surface,
+        pose.base_from_surface,
+        expected_touch(here.job, here.nominal, pose, here.repeatability),
         here.mover,
         here.devices.arm,
         here.devices.claw,
@@ -137,6 +159,9 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         context.progress,
         lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )
+    for note in done.notes:
+        context.note(text=note)
+    return done
 
 
 # A part that may have touched the surface is not placed a second time by itself.

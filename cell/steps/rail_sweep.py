@@ -41,7 +41,9 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
 
         collector.take(frames, ended)
     begin, end = sweep.window
-    times = np.array(collector.times)
+    # Stamps that come late are put back to when the exposures were.
+    late = 0.0 if errors.timing is None else errors.timing.late
+    times = np.array(collector.times) - late
     lines = np.flatnonzero((times >= begin) & (times <= end))
     middle = collector.require_frames(devices.scan_camera.name, lines)
     moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
@@ -64,7 +66,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
             hint="See whether the carriage jams and what else commands this module.",
         )
     times_known = [TimeBound(rail.name, "rail", sweep.time_bound), TimeBound.of(devices.scan_camera)]
-    shift, variance = shift_by_times(times_known, scan.speed, errors)
+    shift, variance = shift_by_times(times_known, scan.speed, errors.by_rail)
     samples = sweep.samples
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
     deviations = [abs(position - sweep.position_at(time)) for time, position in moving]

@@ -48,7 +48,7 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
         "board_covariance": fix.covariance,
     }
     if sweep.pointing is not None:
-        data["pointing"] = np.array([sweep.pointing.turn, sweep.pointing.sigma])
+        data["pointing"] = np.array([sweep.pointing.turn, sweep.pointing.sigma, sweep.pointing.confirmed])
     for k, swath in enumerate(sweep.swaths):
         data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
         data[f"figures_{k}"] = np.array([swath.lost, swath.residual, swath.shift])

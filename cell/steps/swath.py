@@ -6,12 +6,13 @@ A frame is let go as soon as its profile has been triangulated, so memory does n
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from cell.calibration.timing import Timing
 from cell.geometry.poses import from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
@@ -28,13 +29,20 @@ class SweepErrors:
     """What a sweep's pose may be off by: `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m²
     and rad²; `rail` one standard deviation of a rail position in m; `shift` the farthest, in m, that a sweep may lie
     off as a whole because its times are not known better; `rate` seconds of the clock per wall second; `late` the most,
-    in s, that a device may hold a reading back before it puts its time on it."""
+    in s, that a device may hold a reading back before it puts its time on it; `timing` how late the camera's stamps
+    come against the rail's readings, where that was measured: then it stands for `late` in a sweep by the rail."""
 
     repeatability: Vector
     rail: float
     shift: float
     rate: float = 1.0
     late: float = 0.0
+    timing: Timing | None = None
+
+    @property
+    def by_rail(self) -> SweepErrors:
+        """For a sweep by the rail: `late` with the variance of what was measured."""
+        return self if self.timing is None else replace(self, late=float(np.sqrt(3.0)) * self.timing.sigma)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from cell.calibration.witness import NOTED_RAD, Pointing
+from cell.calibration.witness import Pointing
 from cell.steps.swath import Swath
 from cell.vision import StripeProfile
 from drivers.interfaces import Frame
@@ -37,8 +37,7 @@ class SweepRecord:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
-        moved = self.pointing is not None and abs(self.pointing.turn) > NOTED_RAD
-        return (self.pointing.words,) if moved and self.pointing is not None else ()
+        return (self.pointing.words,) if self.pointing is not None and self.pointing.open else ()
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -49,5 +48,6 @@ class SweepRecord:
             "points": sum(swath.points for swath in self.swaths),
             "residual_um": [round(1e6 * swath.residual, 2) for swath in self.swaths],
             "laser_turned_mrad": None if self.pointing is None else round(1e3 * self.pointing.turn, 4),
+            "laser_confirmed_mrad": None if self.pointing is None else round(1e3 * self.pointing.confirmed, 4),
             "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
         }

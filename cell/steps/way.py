@@ -7,6 +7,8 @@ room that it needs grows with how far the vehicle has gone, and turned on the sp
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +16,7 @@ import pinocchio as pin
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
+from cell.obstacles import station_obstacles
 from cell.steps.approach import Planar, line_command, wrap
 from cell.steps.camera_poses import centre_of
 from cell.steps.whereabouts import Whereabouts
@@ -32,23 +35,62 @@ ROOM_BEYOND = 0.25
 """How much further than the job's way to its staging pose the vehicle may go on odometry alone, m."""
 BACK_UP = 0.45
 """The run that a second try needs to work off an error to the side, m."""
+ROOM_ABOVE = 0.03
+"""What passes above or below something by more than this, m, does not meet it: floors are that even."""
 _STEP_S = 0.05
 _STEP_TURN = math.radians(2)
 _LONGEST_S = 120.0
 
 
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """The upright box around a body: `corners` (4, 2) seen from above and its height from `low` to `high`, m."""
+
+    name: str
+    corners: Vector
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, body: Body, frame_from_parent: pin.SE3) -> Upright:
+        """Around a body whose parent is at `frame_from_parent`."""
+        pose = frame_from_parent * body.placement
+        radius = body.radius or 0.0
+        dx, dy, dz = np.abs(pose.rotation) @ (0.5 * np.array(body.size)) + radius
+        x, y, z = pose.translation
+        corners = np.array([[x + dx, y + dy], [x - dx, y + dy], [x - dx, y - dy], [x + dx, y - dy]])
+        return cls(body.name, corners, float(z - dz), float(z + dz))
+
+    @property
+    def reach(self) -> float:
+        """The farthest corner from the origin, m."""
+        return float(np.linalg.norm(self.corners, axis=1).max())
+
+    def beside(self, other: Upright) -> bool:
+        """Whether the two could meet if one were moved over the floor."""
+        return self.low - ROOM_ABOVE < other.high and other.low - ROOM_ABOVE < self.high
+
+
 class Way:
     """The ways that the vehicle of one job may go."""
 
-    def __init__(self, job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts) -> None:
+    def __init__(
+        self, job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts, carried: Sequence[Body] = ()
+    ) -> None:
+        """`carried` is what goes with the vehicle besides its deck, in the arm base: arm, tool and part as they are."""
         self._job = job
         self._whereabouts = whereabouts
         board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
-        self._station = {
-            body.name: _outline(body, pin.SE3.Identity()) for body in station_bodies(pin.SE3.Identity(), board)
-        }
-        self._vehicle = _outline(vehicle_bodies()[0], vehicle_from_base)
-        self._reach = float(np.linalg.norm(self._vehicle, axis=1).max())
+        here = pin.SE3.Identity()
+        self._station = [
+            Upright.of(body, here) for body in (*station_bodies(here, board), *station_obstacles(job.obstacle, here))
+        ]
+        # Over the floor the deck's own height does not matter: nothing of a station hangs there.
+        deck = replace(Upright.of(vehicle_bodies()[0], vehicle_from_base), low=-math.inf, high=math.inf)
+        lifted = from_parts((0.0, 0.0, job.approach.target.se3().translation[2]))
+        others = [Upright.of(body, lifted * vehicle_from_base) for body in carried if body.name != "deck"]
+        self._vehicle = [deck, *others]
+        self._pairs = [(ours, theirs) for ours in self._vehicle for theirs in self._station if ours.beside(theirs)]
         start, staging = Planar.of(job.approach.start.se3()), Planar.of(job.approach.staging.se3())
         self.longest = max(math.hypot(staging.x - start.x, staging.y - start.y), 2 * BACK_UP) + ROOM_BEYOND
 
@@ -79,16 +121,17 @@ class Way:
 
     def _require_room(self, pose: Planar, length: float, turned: float) -> None:
         c, s = math.cos(pose.yaw), math.sin(pose.yaw)
-        corners = self._vehicle @ np.array([[c, s], [-s, c]]) + np.array([pose.x, pose.y])
+        turn, shift = np.array([[c, s], [-s, c]]), np.array([pose.x, pose.y])
         # A wrong heading swings the corners, and leads aside on the way after it.
-        needed = MARGIN + DRIFT * length + TURN_DRIFT * turned * (self._reach + length)
-        for name, outline in self._station.items():
-            room = distance(corners, outline)
+        for ours, theirs in self._pairs:
+            needed = MARGIN + DRIFT * length + TURN_DRIFT * turned * (ours.reach + length)
+            room = distance(ours.corners @ turn + shift, theirs.corners)
             if room < needed:
+                what = "" if ours is self._vehicle[0] else f"with the arm's {ours.name} "
                 raise RefusedError(
-                    f"the vehicle's way comes within {1e3 * room:.0f} mm of the {name} at x {pose.x:.2f} m, y "
-                    f"{pose.y:.2f} m in the place frame, allowed {1e3 * needed:.0f} mm; it was not driven. Jog it "
-                    "away from the station with `cell jog vehicle`, to before its staging pose"
+                    f"the vehicle's way comes {what}within {1e3 * room:.0f} mm of the {theirs.name} at x {pose.x:.2f} "
+                    f"m, y {pose.y:.2f} m in the place frame, allowed {1e3 * needed:.0f} mm; it was not driven. Jog "
+                    "it away from the station with `cell jog vehicle`, to before its staging pose"
                 )
 
 
@@ -114,12 +157,3 @@ def _to_edges(points: Vector, corners: Vector) -> float:
     offsets = points[:, None] - corners[None]
     share = np.clip((offsets * edges).sum(axis=2) / (edges**2).sum(axis=1), 0.0, 1.0)
     return float(np.linalg.norm(offsets - share[:, :, None] * edges, axis=2).min())
-
-
-def _outline(body: Body, frame_from_parent: pin.SE3) -> Vector:
-    """Corners (4, 2) of the upright box around a box, seen from above, m."""
-    pose = frame_from_parent * body.placement
-    half = np.abs(pose.rotation[:2]) @ (0.5 * np.array(body.size))
-    x, y = pose.translation[:2]
-    dx, dy = half
-    return np.array([[x + dx, y + dy], [x - dx, y + dy], [x - dx, y - dy], [x + dx, y - dy]])

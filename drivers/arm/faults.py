@@ -35,6 +35,14 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "the arm is not the one that is configured", False,
         "See that its address and model are right and that nobody has set another tool at the pendant.",
     ),
+    "arm.wrong_payload": (
+        "the controller reckons with another payload than this driver has set", True,
+        "Somebody has set it at the pendant or by a program: see what the arm carries, then recover() sets it again.",
+    ),
+    "arm.local_control": (
+        "the arm is in local control", False,
+        "Switch it to remote control at the pendant (top right corner of its screen), then go on.",
+    ),
     "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
 }  # fmt: skip
 
@@ -45,13 +53,19 @@ def fault(device: str, code: str, text: str = "") -> DeviceFault:
     return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 
+def require_remote(device: str, dashboard: Dashboard) -> None:
+    """Raise `DeviceFault` (arm.local_control) when the arm says so; controllers that know of no such mode do not."""
+    if dashboard.ask("is in remote control").lower() == "false":
+        raise fault(device, "arm.local_control", "it takes nothing but questions from others")
+
+
 def unlock(
     device: str, dashboard: Dashboard, clock: Clock, confirmed: bool, require_wanted: Callable[[], None]
 ) -> None:
     """Release a protective stop that a person has `confirmed`; the controller allows it only some seconds after it.
 
-    Raises `DeviceFault` when nobody has, or when the stop is one that only the operator can clear, and whatever
-    `require_wanted` raises, which is asked before each try.
+    Raises `DeviceFault` when nobody has, when the stop is one that only the operator can clear or when the arm is in
+    local control, and whatever `require_wanted` raises, which is asked before each try.
     """
     deadline = time.monotonic() + _UNLOCK_S
     while (status := dashboard.ask("safetystatus").rpartition(":")[2].strip()) not in ("NORMAL", "REDUCED"):
@@ -63,6 +77,7 @@ def unlock(
         require_wanted()
         dashboard.ask("close safety popup")
         reply = dashboard.ask("unlock protective stop")
+        require_remote(device, dashboard)
         if time.monotonic() > deadline:
             raise fault(device, "arm.protective_stop", f"it could not be unlocked: {reply}")
         clock.sleep(0.1 * clock.rate)

@@ -55,7 +55,7 @@ class Snapshot:
     the controller's own clock.
 
     `safety_bits`, `mode` and `runtime`, the state of the program, as the controller reports them; `wrench` at the
-    flange in base axes.
+    flange in base axes; `payload` is what the controller reckons with, kg and centre of gravity in the flange in m.
     """
 
     stamp: float
@@ -69,6 +69,7 @@ class Snapshot:
     inputs: int
     outputs: int
     device_time: float = 0.0
+    payload: tuple[float, Six] = (0.0, (0.0, 0.0, 0.0))
 
     @property
     def program_running(self) -> bool:

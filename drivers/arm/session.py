@@ -5,15 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.faults import fault, unlock
+from drivers.arm.faults import fault, require_remote, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.link import ArmLink
 from drivers.arm.messages import MODE_RUNNING, PLAYING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.safing import Safing
-from drivers.arm.wrong_arm import Forward, flange_agrees, require_same_flange
+from drivers.arm.wrong_arm import Forward, flange_agrees, require_same_flange, require_same_payload, same_payload
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import LinkStatistics
@@ -46,7 +47,7 @@ class ArmSession:
         on_ended: Callable[[Ended], None],
         on_broken: Callable[[Exception], None],
     ) -> None:
-        """Connect. Raises `NotConnectedError`, or `DeviceFault` when the arm is another one than `forward` says.
+        """Connect. Raises `NotConnectedError`; `DeviceFault` in local control or for another arm than `forward` says.
 
         `unknown` says why the controller's own table is not known, if it is not.
         """
@@ -63,6 +64,8 @@ class ArmSession:
         self._closed = False
         self._stops = 0
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
+        if setup.control:
+            self._require_remote()
         self.link = self._connect(lambda: True)
         try:
             self._require_model()
@@ -96,10 +99,13 @@ class ArmSession:
             raise fault(self._name, "arm.program_stopped")
 
     def require_same_arm(self) -> None:
-        """Raise `DeviceFault` (arm.wrong_kinematics) unless the flange is where the caller's model has it."""
+        """Raise `DeviceFault` unless flange and payload are what the caller's model and this driver have them for."""
         if self._forward is not None:
             with self._comparing:
                 require_same_flange(self._name, self._forward, self.feed.fresh(0.1)[0], self._unknown)
+        # What was just set may not be shown yet.
+        if not self.feed.wait_for(lambda snapshot: same_payload(snapshot, self.setup.payload), _TOOL_S):
+            require_same_payload(self._name, self.feed.fresh(0.1)[0], self.setup.payload)
 
     # --- asking ---
 
@@ -142,6 +148,7 @@ class ArmSession:
             stops = self._stops
         with self._recovering:
             self._require_open()
+            require_remote(self._name, self.dashboard)
             self.dashboard.ask("stop")
             unlock(self._name, self.dashboard, self._clock, confirmed, lambda: self._require_no_stop_since(stops))
             if self._begin_anew(stops):
@@ -203,6 +210,11 @@ class ArmSession:
         return ArmLink(
             self._name, self.setup, self._connect_timeout, self.feed.take, self._on_ended, self._on_lost, wanted
         )
+
+    def _require_remote(self) -> None:
+        """As `require_remote`; an arm that does not answer is left to the connection, which says more."""
+        with suppress(DeadlineError, NotConnectedError):
+            require_remote(self._name, self.dashboard)
 
     def _on_lost(self, error: DeviceFault) -> None:
         self.statistics.count("link lost")

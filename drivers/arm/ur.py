@@ -37,6 +37,8 @@ _WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45
 
 Only simulated arms are driven faster than the wall, and they share a busy machine with everything else.
 """
+_TOLD_S = 2.0
+"""What the controller has for telling its table, wall seconds; it does so ten times a second if the port is open."""
 _OUTPUTS = 18
 _SAFETY = {
     "": ArmSafety.NORMAL,
@@ -92,7 +94,7 @@ class UrArm:
             check_positive(name, "braking", braking, 20.0, "rad/s^2"),
             control,
         )
-        self.factory = read_factory_kinematics(address, connect_timeout)
+        self.factory = read_factory_kinematics(address, min(connect_timeout, _TOLD_S))
         if forward_of is not None:
             forward = forward_of(self.factory.table)
         self._session = ArmSession(

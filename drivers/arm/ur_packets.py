@@ -11,6 +11,7 @@ from drivers.arm.messages import Snapshot
 _VARIABLES = [
     "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
     "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
+    "payload", "payload_cog",
 ]  # fmt: skip
 
 
@@ -48,6 +49,7 @@ class Packets:
                 inputs=receive.getActualDigitalInputBits(),
                 outputs=receive.getActualDigitalOutputBits(),
                 device_time=self._newest,
+                payload=(receive.getPayload(), tuple(receive.getPayloadCog())),
             )
             if receive.getTimestamp() == self._newest:
                 return snapshot

@@ -1,7 +1,8 @@
-"""Whether the arm is the one that its user computes with: the flange as reported and as the user's own model has it."""
+"""Whether the arm is the one that its user computes with: flange and payload as reported and as they should be."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +18,9 @@ Forward = Callable[[Vector], Vector]
 MOST_WAY, MOST_TURN = 0.05e-3, 0.1e-3
 """How far the two may be apart, m and rad. With the same table they agree to the last digits; with the maker's table
 instead of the factory's it is 2 to 4 mm and 7 to 15 mrad (docs/protocols.md, section 1)."""
+
+MOST_MASS, MOST_OFFSET = 1e-3, 1e-4
+"""How far the payloads may be apart, kg and m: a controller shows what it was given."""
 
 
 def require_same_flange(device: str, forward: Forward, snapshot: Snapshot, unknown: str = "") -> None:
@@ -37,6 +41,23 @@ def require_same_flange(device: str, forward: Forward, snapshot: Snapshot, unkno
             "between this computer and the controller"
         )
     raise fault(device, "arm.wrong_kinematics", text)
+
+
+def same_payload(snapshot: Snapshot, payload: tuple[float, Six]) -> bool:
+    """True when the controller reckons with `payload`, kg and centre of gravity (3,) in m.
+
+    A centre of zeros is none: the controller keeps the one that it had.
+    """
+    (mass, centre), (set_mass, set_centre) = snapshot.payload, payload
+    near = abs(mass - set_mass) <= MOST_MASS
+    return near and (not any(set_centre) or math.dist(centre, set_centre) <= MOST_OFFSET)
+
+
+def require_same_payload(device: str, snapshot: Snapshot, payload: tuple[float, Six]) -> None:
+    """Raise `DeviceFault` (arm.wrong_payload) unless the controller reckons with `payload`."""
+    if not same_payload(snapshot, payload):
+        shown, wanted = (f"{m:.3f} kg at {[round(1e3 * x, 1) for x in c]} mm" for m, c in (snapshot.payload, payload))
+        raise fault(device, "arm.wrong_payload", f"{shown}, set was {wanted}; nothing was moved")
 
 
 def flange_agrees(forward: Forward, snapshot: Snapshot) -> bool:

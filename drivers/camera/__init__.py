@@ -1,1 +1,1 @@
-"""Cameras: the frame stream over TCP, and a folder of recorded pictures."""
+"""Cameras: GigE Vision, USB3 Vision, V4L2, the frame stream over TCP, and folders of recorded pictures."""

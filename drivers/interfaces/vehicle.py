@@ -15,8 +15,8 @@ class VehicleState:
     Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
     frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None as long as this
     driver has not commanded the brake, and when somebody else may have released it since. `trouble` says in words what
-    ends motion. `interruptions` counts how often odometry lost its connection to where the vehicle was before, and
-    `interruption` says why it did last.
+    ends motion, `warnings` what does not. `interruptions` counts how often odometry lost its connection to where the
+    vehicle was before, and `interruption` says why it did last.
     """
 
     stamp: float
@@ -31,6 +31,7 @@ class VehicleState:
     error_bits: int
     battery_volts: float
     trouble: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     interruptions: int = 0
     interruption: str = ""
 

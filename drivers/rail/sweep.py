@@ -18,10 +18,14 @@ from drivers.rail.timing import EvenMotion
 
 _MIN_SAMPLES = 5
 _SPEED_TOLERANCE = 0.05
+LATCH_S = 0.001
+"""A module may answer with a count that it read up to this long before: one turn of its program."""
+_LEAST_ROUNDING = 2.0
+"""Counts by which a reading may be off besides: its own rounding, and the ramp's."""
 
 
 class RailSweep(RailMotion):
-    """A running sweep that is constant between `start` and `stop` (m) at `speed` (m/s)."""
+    """A running sweep, constant between `start` and `stop` (m) at `speed` (m/s); `resolution` is a count in m."""
 
     def __init__(
         self,
@@ -31,6 +35,7 @@ class RailSweep(RailMotion):
         start: float,
         stop: float,
         speed: float,
+        resolution: float,
         record: list[tuple[float, float, float]],
         arrived: Callable[[], bool],
         halt: Callable[[], None],
@@ -39,6 +44,7 @@ class RailSweep(RailMotion):
         self._start = start
         self._stop = stop
         self._speed = speed
+        self._resolution = resolution
         self._record = record
         self._motion: EvenMotion | None = None
         super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration)
@@ -52,8 +58,9 @@ class RailSweep(RailMotion):
     def window(self) -> tuple[float, float]:
         """Host times in s at which the rail was at `start` and at `stop`.
 
-        Raises `InterlockError` while the sweep runs, its own error if it failed, and `DeviceFault` (rail.velocity)
-        when the samples are too few or show another velocity than the commanded one.
+        Raises `InterlockError` while the sweep runs, its own error if it failed, and `DeviceFault`: rail.velocity when
+        the samples are too few or show another velocity than the commanded one, rail.uneven when no even motion
+        explains all of them.
         """
         motion = self._even()
         return motion.time_at(self._start), motion.time_at(self._stop)
@@ -103,6 +110,18 @@ class RailSweep(RailMotion):
             raise self._fault(
                 f"the rail ran at {motion.velocity * 1e3:.3f} mm/s instead of {expected * 1e3:.3f} mm/s "
                 f"(allowed ±{_SPEED_TOLERANCE:.0%})"
+            )
+        allowed = _LEAST_ROUNDING * self._resolution + LATCH_S * self._speed
+        if motion.residual > allowed:
+            raise DeviceFault(
+                self._name,
+                "rail.uneven",
+                f"the readings of the sweep lie up to {motion.residual * 1e3:.3f} mm off every even motion, more than "
+                f"their round trips explain (allowed {allowed * 1e3:.3f} mm: {_LEAST_ROUNDING:.0f} counts, and "
+                f"{LATCH_S * 1e3:.0f} ms at {self._speed * 1e3:.3g} mm/s)",
+                recoverable=True,
+                hint="Look whether the carriage jams, whether another program set the module's ramp (axis parameters "
+                "5 and 15 to 20) or stops the motor, then sweep again.",
             )
         return motion
 

@@ -16,6 +16,8 @@ from drivers.interfaces import Vector
 _PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
 _MOST = 400
 """So many of the shortest round trips are looked at; pairs are formed of them."""
+_SLOWEST, _FASTEST, _STEPS = 0.5, 1.5, 80
+"""Where the speed is looked for, as a share of that of the fitted line, and in how many thirds."""
 
 
 def passing_times(place: float, positions: Vector, before: Vector, after: Vector) -> tuple[float, float]:
@@ -33,6 +35,30 @@ def passing_times(place: float, positions: Vector, before: Vector, after: Vector
     return float(earliest.max()), float(latest.min())
 
 
+def least_residual(positions: Vector, before: Vector, after: Vector, velocity: float) -> float:
+    """By how many m the readings differ, at least, from every even motion of about `velocity` (m/s); 0 if one fits.
+
+    Each was at `positions` (n,), m, at some host time between `before` and `after` (n,), s. The best motion leaves the
+    worst reading that far off: late replies explain what they can, and nothing else is explained.
+    """
+    middle = 0.5 * (before + after).mean()
+    begin, end = before - middle, after - middle
+
+    def worst(speed: float) -> float:
+        reached = np.stack([speed * begin, speed * end])
+        return float((positions - reached.max(axis=0)).max() - (positions - reached.min(axis=0)).min()) / 2.0
+
+    low, high = sorted((_SLOWEST * velocity, _FASTEST * velocity))
+    for _ in range(_STEPS):
+        third = (high - low) / 3.0
+        # The worst reading's distance is a convex function of the speed.
+        if worst(low + third) < worst(high - third):
+            high -= third
+        else:
+            low += third
+    return max(0.0, worst(0.5 * (low + high)))
+
+
 @dataclass(frozen=True)
 class EvenMotion:
     """The line through the readings of an even motion: `origin` is the position in m at time 0 s, `velocity` in m/s.
@@ -40,13 +66,15 @@ class EvenMotion:
     `time_bound` in s is the largest error that the line's times may have, as far as round trips confine it: the larger
     distance to the ends of what they leave open, at the worst of several places. `unevenness` in m is the median
     distance of the readings from the line beyond what their round trips explain; a motion in which it is not next to
-    nothing was not even, and its bound says nothing.
+    nothing was not even, and its bound says nothing. `residual` in m is by how much the worst reading is off the even
+    motion that fits best, again beyond what round trips explain: see `least_residual`.
     """
 
     origin: float
     velocity: float
     time_bound: float
     unevenness: float
+    residual: float
 
     @classmethod
     def of(cls, times: Vector, positions: Vector, round_trips: Vector) -> EvenMotion:
@@ -67,7 +95,8 @@ class EvenMotion:
         passed = [(place - origin) / velocity for place in places]
         bound = max(max(abs(span[1] - t), abs(t - span[0])) for t, span in zip(passed, spans, strict=True))
         beyond = np.abs(positions - origin - velocity * times) - 0.5 * round_trips * abs(velocity)
-        return cls(origin, velocity, bound, float(np.median(np.maximum(beyond, 0.0))))
+        residual = least_residual(positions, times - 0.5 * round_trips, times + 0.5 * round_trips, velocity)
+        return cls(origin, velocity, bound, float(np.median(np.maximum(beyond, 0.0))), residual)
 
     def position_at(self, time: float) -> float:
         """Position in m at a host time in s."""

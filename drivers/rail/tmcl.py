@@ -15,6 +15,7 @@ from drivers.errors import Aborted, CellError, ConfigError, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, RailState
 from drivers.quantities import check_positive, check_range, shown
 from drivers.rail.arrival import Arrival, Samples
+from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_ramp
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
 from drivers.rail.tmcl_codec import Axis, Reference
@@ -30,12 +31,14 @@ class TmclRail:
     `lead` in m per turn, `travel` (low, high) in m, `max_speed` in m/s, `acceleration` in m/s²; `microsteps` per full
     step, a power of two up to 256. `reference_mode` is the module's axis parameter 193 (5: home switch in negative
     direction, turning round at the left limit switch). The module's serial number, if any, is its user variable 0.
+    Every setting is read back; `DeviceFault` (rail.setting) when the module keeps another.
     A module that was homed under the same settings, and not reset since, stays homed.
 
     With `control=False` the module is only looked at: nothing on it is set, started or ended, by `close` neither, and a
     motion that runs on it runs on. Everything but reading is then an `InterlockError`.
 
-    Raises `NotConnectedError` or `DeadlineError` when no module answers, `ConfigError` on impossible parameters.
+    Raises `NotConnectedError` or `DeadlineError` when no module answers, `ConfigError` on impossible parameters and for
+    a module that is not in `drivers.rail.module.SUPPORTED`.
     """
 
     def __init__(
@@ -77,11 +80,11 @@ class TmclRail:
         )
         self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode))
         try:
-            self._link.firmware()
+            require_supported(name, self._link.firmware())
             self._zero.meet(microsteps.bit_length() - 1, reference_mode, mark=control)
             if control:
                 self._set_up()
-        except CellError:
+        except BaseException:
             self._link.close()
             raise
 
@@ -176,6 +179,7 @@ class TmclRail:
                 start=start,
                 stop=stop,
                 speed=speed,
+                resolution=1.0 / self._counts,
                 record=record,
                 arrived=self._arrival(end, issued, record),
                 halt=self._halt(issued),
@@ -243,11 +247,11 @@ class TmclRail:
 
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""
-        self._link.set(Axis.MICROSTEP_RESOLUTION, self._microsteps.bit_length() - 1)
-        self._link.set(Axis.MAX_ACCELERATION, self._pulses(self._acceleration))
-        self._link.set(Axis.REFERENCE_MODE, self._reference_mode)
-        self._link.set(Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * self._max_speed))
-        self._link.set(Axis.REFERENCE_SWITCH_SPEED, self._pulses(0.1 * self._max_speed))
+        set_checked(self._link, Axis.MICROSTEP_RESOLUTION, self._microsteps.bit_length() - 1, EXACT)
+        set_ramp(self._link, self._pulses(self._acceleration))
+        set_checked(self._link, Axis.REFERENCE_MODE, self._reference_mode, EXACT)
+        set_checked(self._link, Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * self._max_speed), SPEED)
+        set_checked(self._link, Axis.REFERENCE_SWITCH_SPEED, self._pulses(0.1 * self._max_speed), SPEED)
 
     def _start(self, position: float, speed: float, issued: int) -> float:
         """Send it there; the seconds that it should take."""

@@ -35,11 +35,27 @@ REPLY_TIMEOUT_S = 0.5
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
 WRITE_TIMEOUT_S = 2.0
 """Wall seconds after which a port that takes no bytes counts as stuck."""
+WRONG_CHECKSUM, NO_SUCH_TYPE, WRONG_VALUE = 1, 3, 4
+"""Some of the status codes of a reply."""
 _QUIET_S = 0.05
 _ATTEMPTS = 2
 _USER_BANK = 2
 
 Answer = TypeVar("Answer")
+
+
+class CommandRefused(DeviceFault):
+    """The module refused a command with the status code `status`."""
+
+    def __init__(self, device: str, status: int, message: str) -> None:
+        super().__init__(
+            device,
+            "tmcl.refused",
+            message,
+            recoverable=False,
+            hint="Check that the value is in the module's range (pulses per second) and that it has this axis.",
+        )
+        self.status = status
 
 
 class TmclLink:
@@ -55,6 +71,7 @@ class TmclLink:
         self.url = url
         self._address = address
         self._motor = motor
+        self._baud = baud
         self._clock = clock
         self._statistics = statistics
         self._lock = threading.Lock()
@@ -152,14 +169,14 @@ class TmclLink:
 
     def _checked(self, data: bytes, request: Request) -> Reply:
         reply = decode_reply(data, request)
+        if reply.status == WRONG_CHECKSUM:
+            raise TelegramError("the module says that the request came with a wrong checksum")
         if reply.status != STATUS_OK:
             reason = STATUS_TEXT.get(reply.status, f"status {reply.status}")
-            raise DeviceFault(
+            raise CommandRefused(
                 self.name,
-                "tmcl.refused",
+                reply.status,
                 f"the module refused command {request.command}, type {request.type}, value {request.value}: {reason}",
-                recoverable=False,
-                hint="Check that the value is in the module's range (pulses per second) and that it has this axis.",
             )
         return reply
 
@@ -196,7 +213,8 @@ class TmclLink:
         raise DeadlineError(
             self.name,
             f"no valid reply to command {request.command} type {request.type} within {REPLY_TIMEOUT_S} s, "
-            f"{_ATTEMPTS} attempts ({failure}). Check module address {self._address} and the wiring",
+            f"{_ATTEMPTS} attempts ({failure}). Check module address {self._address} (rail.address), "
+            f"rail.baud ({self._baud}; RS-485 and RS-232 of a new module have 9600) and the wiring",
         ) from failure
 
     def _once(self, request: Request, decode: Callable[[bytes], Answer]) -> tuple[Answer, float, float]:
@@ -204,12 +222,20 @@ class TmclLink:
             self._statistics.count("stale_input")
             self._drain()
         before = self._clock.now()
-        self._port.write(request.encode())
+        sent = request.encode()
+        self._port.write(sent)
         data = self._port.read(TELEGRAM_BYTES)
+        echoed = data == sent
+        if echoed:
+            # Many adapters to a two-wire line hear themselves. No reply looks like its request: a status of 100 is no
+            # type of a command that is sent here.
+            self._statistics.count("echoes")
+            data = self._port.read(TELEGRAM_BYTES)
         after = self._clock.now()
         if len(data) < TELEGRAM_BYTES:
             self._statistics.count("timeouts")
-            raise TelegramError(f"{len(data)} of {TELEGRAM_BYTES} bytes came")
+            echo = " after the adapter's echo of the request" if echoed else ""
+            raise TelegramError(f"{len(data)} of {TELEGRAM_BYTES} bytes came{echo}")
         try:
             answer = decode(data)
         except TelegramError:

@@ -20,6 +20,8 @@ MARK_VARIABLE = 200
 _NONE, _SEARCHING = 0, 1
 _STALL_FLAG = 1
 _HOME_SWITCH_MODES = range(5, 9)
+_MODE_BITS = 0x3F
+"""Without the bits that swap the sides (64) and turn the home switch's polarity round (128)."""
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +48,9 @@ class ZeroMark:
         """
         link = self._link
         if link.user_variable(MARK_VARIABLE) == self._value:
-            switches = (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH) if reference_mode in _HOME_SWITCH_MODES else ()
+            switches = (
+                (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH) if reference_mode & _MODE_BITS in _HOME_SWITCH_MODES else ()
+            )
             self._seen = not (
                 link.get(Axis.MICROSTEP_RESOLUTION) != microstep_resolution
                 or link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG

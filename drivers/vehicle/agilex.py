@@ -7,6 +7,7 @@ None before this driver has commanded it, or when somebody else may have changed
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable, Mapping
@@ -20,7 +21,8 @@ from drivers.interfaces import Identity, LinkStatistics, VehicleState
 from drivers.quantities import check_range
 from drivers.vehicle.can_link import CanLink, load_database
 from drivers.vehicle.faults import OUT_OF_COMMAND
-from drivers.vehicle.feedback import CAN_MODE, WANTED, Feedback, patience
+from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, Feedback, patience
+from drivers.vehicle.version import TEXT_REQUEST, UNKNOWN
 
 KEEP_ALIVE_S = 0.020
 DEAD_MAN_S = 0.5
@@ -31,6 +33,8 @@ REPLY_TIMEOUT_S = 0.5
 FIRST_FEEDBACK_S = 1.0
 _ENABLE_RETRY_S = 0.3
 _KEEP_ALIVE_WALL_S = 0.005
+
+_log = logging.getLogger(__name__)
 
 
 class AgilexVehicle:
@@ -87,27 +91,40 @@ class AgilexVehicle:
         self._link = self._open()
         if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
             self._link.close()
+            missing, malformed = self._feedback.missing(), self.statistics.errors.get("malformed", 0)
+            heard = f" completely: {', '.join(missing)} did not come" if len(missing) < len(CYCLIC) else ""
+            if malformed:
+                heard += f"; {malformed} frames had another length than in the protocol"
             raise NotConnectedError(
-                name, f"no vehicle reports on {self._address}. Check that it is on, and the bit rate"
+                name, f"no vehicle reports on {self._address}{heard}. Check that it is on, and the bit rate"
             )
         self._keeper = threading.Thread(target=self._keep_alive, name=f"{name} keep-alive", daemon=True)
         self._keeper.start()
 
     def identity(self) -> Identity:
-        """Versions from the version request; the protocol has no serial number."""
-        versions = {name: round(value) for name, value in self._versions().items()}
-        return Identity(
-            f"AgileX v2, hardware {versions['ControllerHardware']}/{versions['DriverHardware']}",
-            "",
-            f"controller {versions['ControllerSoftware']}, drivers {versions['DriverSoftware']}",
-            self._address,
-        )
+        """The protocol has no serial number; a version that is not told is "unknown" (`drivers.vehicle.version`)."""
+        for ask in (self._ask_text, self._ask_numbers):
+            answer = self._feedback.ask_version()
+            ask()
+            if self._wait_for(answer.is_complete, REPLY_TIMEOUT_S):
+                return Identity("AgileX v2", "", answer.describe(), self._address)
+        self._link.check()
+        _log.info("%s: answers no version request; its version is unknown, which is no fault", self.name)
+        return Identity("AgileX v2", "", UNKNOWN, self._address)
 
     def ping(self) -> float:
-        """One version request and its answer, in wall seconds."""
+        """How long, in wall seconds, until it tells its motion next, which it does every 20 ms.
+
+        Nothing on the bus is answered by every model. Raises `DeadlineError` when nothing comes.
+        """
         before = self._clock.now()
-        self._versions()
-        return self._clock.wall(self._clock.now() - before)
+        if not self._wait_for(partial(self._feedback.newer, "MotionState", before), REPLY_TIMEOUT_S):
+            self._link.check()
+            self.statistics.count("timeouts")
+            raise DeadlineError(self.name, f"tells nothing for {REPLY_TIMEOUT_S} s. Check the CAN bus")
+        taken = self._clock.wall(self._feedback.get("MotionState")[0] - before)
+        self.statistics.add_round_trip(taken)
+        return taken
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old (see `Feedback.state`), else `DeadlineError`."""
@@ -266,17 +283,11 @@ class AgilexVehicle:
             self._feedback.commanded_to_move()
         self._link.send("MotionCommand", Speed=speed, YawRate=yaw_rate, LateralSpeed=0.0, Steering=0.0)
 
-    def _versions(self) -> dict[str, float]:
-        for _ in range(2):
-            asked = self._clock.now()
-            self._link.send("VersionRequest", Request=1)
-            if self._wait_for(partial(self._feedback.newer, "VersionResponse", asked), REPLY_TIMEOUT_S):
-                answered, versions = self._feedback.get("VersionResponse")
-                self.statistics.add_round_trip(self._clock.wall(answered - asked))
-                return versions
-            self.statistics.count("timeouts")
-        self._link.check()
-        raise DeadlineError(self.name, "does not answer the version request. Check the CAN bus")
+    def _ask_text(self) -> None:
+        self._link.send_data(*TEXT_REQUEST)
+
+    def _ask_numbers(self) -> None:
+        self._link.send("VersionRequest", Request=1)
 
     def _wait_for(self, happened: Callable[[], bool], timeout: float) -> bool:
         return self._feedback.wait_for(happened, timeout, lambda: self._link.alive)

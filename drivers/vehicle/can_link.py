@@ -98,8 +98,14 @@ class CanLink:
 
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
+        self._send(name, self._frame(name, **signals))
+
+    def send_data(self, identifier: int, data: bytes) -> None:
+        """Send a frame that is not in the message table. Raises as `check` does."""
+        self._send(f"0x{identifier:03X}", can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def _send(self, name: str, frame: can.Message) -> None:
         self.check()
-        frame = self._frame(name, **signals)
         if name == "ControlModeCommand" and self._last_words is None:
             # Who never commanded it has nothing to end.
             self._last_words = self._stop_after_death(self._interface)

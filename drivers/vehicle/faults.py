@@ -20,8 +20,9 @@ _SYSTEM = {
 }
 UNCOMMANDED = 0x0200
 """No fault of a vehicle that nobody commands."""
+_WARNED = {0x0002: "the battery is low", 0x0004: "no signal of the remote control"}
 WARNINGS = 0x0002 | 0x0004
-"""Battery low, and no signal of the remote control: worth knowing, but the vehicle drives."""
+"""Worth knowing, but the vehicle drives."""
 _DRIVER = {
     0x01: "input voltage too low",
     0x02: "motor too hot",
@@ -42,6 +43,11 @@ def system_trouble(bits: int, *, commanded: bool) -> tuple[str, ...]:
     `commanded` says whether this program is in command by now.
     """
     return _words(bits & ~WARNINGS & ~(0 if commanded else UNCOMMANDED) & 0xFFFF, _SYSTEM, 4)
+
+
+def system_warnings(bits: int) -> tuple[str, ...]:
+    """What the error bits of the system state (0x211) say that does not end motion."""
+    return _words(bits & WARNINGS, _WARNED, 4)
 
 
 def driver_trouble(motor: int, status: int) -> tuple[str, ...]:

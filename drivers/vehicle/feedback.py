@@ -9,8 +9,16 @@ from collections.abc import Callable
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
-from drivers.vehicle.faults import command_lost, disturbed, driver_trouble, system_trouble, vehicle_error
+from drivers.vehicle.faults import (
+    command_lost,
+    disturbed,
+    driver_trouble,
+    system_trouble,
+    system_warnings,
+    vehicle_error,
+)
 from drivers.vehicle.odometry import PlanarOdometry
+from drivers.vehicle.version import ANSWERS, VersionAnswer
 
 CAN_MODE = 1
 SILENCE_S = 0.5
@@ -27,15 +35,15 @@ STANDS_MM = 5
 CYCLIC = ("MotionState", "Odometry", "SystemState")
 _DRIVERS = {f"MotorDriver{motor}": motor for motor in range(1, 9)}
 _COMMANDS = ("MotionCommand", "BrakeCommand")
-WANTED = frozenset({*CYCLIC, *_DRIVERS, *_COMMANDS, "VersionResponse"})
+WANTED = frozenset({*CYCLIC, *_DRIVERS, *_COMMANDS, *ANSWERS})
 """The vehicle's messages, and the commands of others on the bus; one's own do not come back."""
 _FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
 _JUMP_M = 0.05
 """What a side may count from one reading to the next besides what it can have driven: readings come in bursts."""
-_STILL = 0.002
-"""Reported speeds up to this, m/s and rad/s, count as standstill: two steps of the protocol."""
+STILL = 0.0035
+"""Reported speeds up to this, m/s and rad/s, count as standstill: at rest they waver by three steps of the protocol."""
 
 
 def patience(clock: Clock, seconds: float) -> float:
@@ -66,6 +74,7 @@ class Feedback:
         self._commanded = -math.inf
         self._rest: tuple[int, int] | None = None
         self._quiet = 0.0
+        self._version = VersionAnswer()
         self._disturbed = ""
         self._interruptions = 0
         self._interruption = ""
@@ -84,6 +93,8 @@ class Feedback:
                 self._disturb("somebody else on the CAN bus commands it to move")
             elif message == "BrakeCommand" and not signals["Locked"]:
                 self._disturb("somebody else on the CAN bus released its brake")
+            elif message in ANSWERS:
+                self._version.take(message, signals)
             self._newest[message] = (now, signals)
             self._news.notify_all()
 
@@ -154,6 +165,16 @@ class Feedback:
         """True once every cyclic message has come."""
         return all(message in self._newest for message in CYCLIC)
 
+    def missing(self) -> tuple[str, ...]:
+        """The cyclic messages that have not come yet."""
+        return tuple(message for message in CYCLIC if message not in self._newest)
+
+    def ask_version(self) -> VersionAnswer:
+        """A new answer to be filled by what comes from now on."""
+        with self._news:
+            self._version = VersionAnswer()
+            return self._version
+
     def newer(self, message: str, time: float) -> bool:
         """True when `message` came after host time `time`."""
         return message in self._newest and self._newest[message][0] > time
@@ -171,7 +192,7 @@ class Feedback:
     def stands(self, since: float) -> bool:
         """True when the vehicle has reported standstill after host time `since`."""
         motion = self._newest["MotionState"][1]
-        return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= _STILL
+        return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= STILL
 
     def state(self, max_age: float, braked: bool | None) -> VehicleState:
         """All as one record; `DeadlineError` when it is older than `max_age` s.
@@ -207,6 +228,7 @@ class Feedback:
             error_bits=int(system["ErrorBits"]),
             battery_volts=round(system["BatteryVoltage"], 1),
             trouble=trouble,
+            warnings=system_warnings(int(system["ErrorBits"])),
             interruptions=interruptions,
             interruption=interruption,
         )
@@ -219,7 +241,7 @@ class Feedback:
         receiver does not wait in vain: a program that computes reads late.
         """
         with self._news:
-            oldest = min(self._newest["SystemState"][0], self._newest["MotionState"][0])
+            oldest, which = min((self._newest[message][0], message) for message in CYCLIC)
             system, disturbance = self._newest["SystemState"][1], self._disturbed
             trouble = self._trouble(commanded=in_command)
             quiet = self._quiet
@@ -228,7 +250,7 @@ class Feedback:
             raise DeviceFault(
                 self._name,
                 "vehicle.silent",
-                f"no feedback for {silent:.2f} s",
+                f"no feedback for {silent:.2f} s ({which} came last before that)",
                 recoverable=True,
                 hint="Check that the vehicle is on and the CAN bus is connected.",
             )

@@ -26,6 +26,7 @@ from sim_backends.models.arm_truth import TruePose
 Contact = Callable[[Matrix], Vector]
 """Wrench (6,) on the arm at the flange, base axes, N and N·m, for a true base_from_flange (4, 4)."""
 
+FAULTS = ("protective_stop", "safeguard_stop", "emergency_stop", "reduced_mode", "local_control")
 _BRAKE = 20.0
 _REST_SPEED = 1e-4
 _FINE_STEP = 0.004
@@ -95,6 +96,10 @@ class ArmModel:
         self.drive = Drive(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
         self.power = Power.RUNNING
         self.safety = Safety.NORMAL
+        self.reduced = False
+        """Whether the safety system's tighter limits hold: the arm works on as in normal mode."""
+        self.remote = True
+        """Remote control, as against local control at the pendant, in which others only look."""
         self.fault_text = ""
         self.contact: Contact | None = None
         self.digital_outputs = 0
@@ -169,7 +174,7 @@ class ArmModel:
             self.digital_inputs = self.digital_inputs & ~(1 << index) | int(value) << index
 
     def fault(self, name: str) -> None:
-        """Bring about a "protective_stop", "safeguard_stop" or "emergency_stop"; ValueError for any other name."""
+        """Bring about one of `FAULTS`; ValueError for any other name."""
         if name == "protective_stop":
             self.protective_stop("triggered from outside")
         elif name == "safeguard_stop":
@@ -184,14 +189,17 @@ class ArmModel:
                 self.fault_text = "emergency stop pressed"
                 self._suspended = []
                 self._replace(Stop(_BRAKE))
+        elif name == "reduced_mode":
+            self.reduced = True
+        elif name == "local_control":
+            self.remote = False
         else:
-            raise ValueError(
-                f"arm fault {name!r} is unknown: use 'protective_stop', 'safeguard_stop' or 'emergency_stop'"
-            )
+            raise ValueError(f"arm fault {name!r} is unknown: use {', '.join(FAULTS)}")
 
     def clear(self) -> None:
         """Take away the cause: a protective or safeguard stop ends at once, an emergency stop leaves the power off."""
         with self._lock:
+            self.reduced, self.remote = False, True
             if self.safety is Safety.EMERGENCY_STOP:
                 self.power = Power.OFF
             self.safety = Safety.NORMAL
@@ -205,6 +213,11 @@ class ArmModel:
         return self.power is Power.RUNNING and self.safety is Safety.NORMAL
 
     @property
+    def safety_mode(self) -> int:
+        """The controller's number for the state of the safety system: 2 is normal with reduced limits."""
+        return 2 if self.reduced and self.safety is Safety.NORMAL else self.safety.value
+
+    @property
     def motion(self) -> Motion | None:
         """The motion under way."""
         return self._queue[0] if self._queue else None
@@ -213,6 +226,10 @@ class ArmModel:
     def idle(self) -> bool:
         """True when no motion is under way."""
         return not self._queue
+
+    def pending(self, motion: Motion) -> bool:
+        """True until `motion` has ended or something else has taken its place."""
+        return any(one is motion for one in self._queue)
 
     @property
     def moving(self) -> bool:

@@ -131,7 +131,7 @@ class RailModel:
             if speed == 0.0:
                 self._follow(ramp.to_velocity(t, x, v, 0.0, self._acceleration()))
             else:
-                self._follow(ramp.to_position(t, x, v, goal, speed, self._acceleration()))
+                self._follow(ramp.to_position(t, x, v, goal, speed, self._slopes()))
 
     def rotate(self, t: float, velocity: int) -> None:
         """Turn at `velocity` (microsteps per second, sign is direction) until told otherwise; 0 stops on the ramp."""
@@ -177,15 +177,15 @@ class RailModel:
             legs = ramp.to_velocity(t, x, v, 0.0, self._acceleration())
             mode = self.settings.search_mode
             right = self._motor(self.params.switches[1], +1)
-            if mode == 2:
+            if mode in (2, 3, 6):
                 legs = self._run(legs, right, self.settings.search_speed)
-            edge = self.params.switches[0] if mode in (1, 2) else 0.0
+            edge = self.params.switches[0] if mode <= 4 else 0.0
             zero = self._motor(edge, -1)
             if legs[-1].x > zero:
                 legs = self._run(legs, zero, self.settings.search_speed)
             legs = self._run(legs, self._motor(edge + _BACK_OFF, +1), self.settings.search_speed)
             legs = self._run(legs, zero, self.settings.switch_speed)
-            self._switch_distance = round((right - zero) * self._steps()) if mode == 2 else 0
+            self._switch_distance = round((right - zero) * self._steps()) if mode in (2, 3) else 0
             self._append(legs[:-1], searching=True)
             self._zero = zero
             self._append(legs[-1:], searching=False)
@@ -202,6 +202,15 @@ class RailModel:
 
     def _acceleration(self) -> float:
         return max(1, self.settings.max_acceleration) / self._steps()
+
+    def _slopes(self) -> ramp.Slopes:
+        settings, steps = self.settings, self._steps()
+        up = self._acceleration()
+        down = up if settings.max_deceleration is None else max(1, settings.max_deceleration) / steps
+        if not settings.first_speed:
+            return ramp.Slopes(up, down)
+        first, last = max(1, settings.first_acceleration), max(1, settings.last_deceleration)
+        return ramp.Slopes(up, down, settings.first_speed / steps, first / steps, last / steps)
 
     def _motor(self, travel: float, direction: int) -> float:
         return self.params.screw.motor(travel + self._edge, direction)

@@ -29,10 +29,17 @@ class RailSettings:
 
     max_velocity: int = 512_000
     max_acceleration: int = 2_000_000
+    max_deceleration: int | None = None
+    """Of positioning; None: the acceleration."""
+    first_acceleration: int = 2_000_000
+    last_deceleration: int = 2_000_000
+    first_speed: int = 0
+    """Below this speed (pps) positioning uses the two above instead; 0 switches that off."""
     microsteps: int = 8
     """Microsteps per full step as a power of two."""
     search_mode: int = 1
-    """1 left switch; 2 right, then left switch; 5 or 7 home switch in negative direction."""
+    """1 left switch; 2 right, then left switch; 3, 4 the same; 5 or 7 home switch in negative direction; 6 the same
+    from the right switch."""
     search_speed: int = 256_000
     switch_speed: int = 51_200
     left_stop: bool = True

@@ -39,27 +39,95 @@ def to_velocity(t: float, x: float, v: float, target: float, acceleration: float
     return [*pieces, Piece(t, x, target, 0.0)]
 
 
-def to_position(t: float, x: float, v: float, target: float, speed: float, acceleration: float) -> list[Piece]:
-    """The fastest way from (`x`, `v`) to rest at `target` within `speed` > 0 and `acceleration` > 0.
+@dataclass(frozen=True)
+class Slopes:
+    """How velocity changes in positioning: `up` and `down` per s², below `first_speed` `first_up` and `last_down`."""
+
+    up: float
+    down: float
+    first_speed: float = 0.0
+    first_up: float = 0.0
+    last_down: float = 0.0
+
+    def rise(self, low: float, high: float) -> float:
+        """Way on which the speed goes up from `low` to `high`."""
+        return _way(low, high, self.first_speed, self.first_up, self.up)
+
+    def fall(self, speed: float) -> float:
+        """Way from `speed` to rest."""
+        return _way(0.0, speed, self.first_speed, self.last_down, self.down)
+
+
+def to_position(t: float, x: float, v: float, target: float, speed: float, slopes: Slopes | float) -> list[Piece]:
+    """The fastest way from (`x`, `v`) to rest at `target` within `speed` > 0 and `slopes`, one number for all of them.
 
     A start that cannot stop before `target` overshoots and comes back, as the controller does.
     """
+    if not isinstance(slopes, Slopes):
+        slopes = Slopes(slopes, slopes)
     pieces: list[Piece] = []
-    standstill = x + v * abs(v) / (2.0 * acceleration)
+    standstill = x + math.copysign(slopes.fall(abs(v)), v)
     direction = math.copysign(1.0, target - standstill)
     if direction * v < 0.0:
-        t, x = _change(pieces, t, x, v, 0.0, acceleration)
+        t, x = _brake(pieces, t, x, v, 0.0, slopes)
         v = 0.0
-    distance = (target - x) * direction
-    start = v * direction
-    peak = min(math.sqrt(max(0.0, acceleration * distance + 0.5 * start * start)), speed)
-    t, x = _change(pieces, t, x, v, direction * peak, acceleration)
-    cruise = (target - x) * direction - peak * peak / (2.0 * acceleration)
+    distance, start = (target - x) * direction, v * direction
+    if start > speed:
+        t, x = _brake(pieces, t, x, v, direction * speed, slopes)
+        distance, start = (target - x) * direction, speed
+    peak = _peak(distance, start, speed, slopes)
+    for end in _corners(start, peak, slopes.first_speed):
+        up = slopes.first_up if end <= slopes.first_speed else slopes.up
+        t, x = _change(pieces, t, x, direction * start, direction * end, up)
+        start = end
+    cruise = (target - x) * direction - slopes.fall(peak)
     if cruise > 0.0 and peak > 0.0:
         pieces.append(Piece(t, x, direction * peak, 0.0))
         t, x = t + cruise / peak, x + direction * cruise
-    t, _ = _change(pieces, t, x, direction * peak, 0.0, acceleration)
+    t, _ = _brake(pieces, t, x, direction * peak, 0.0, slopes)
     return pieces + rest(t, target)
+
+
+def _peak(distance: float, start: float, speed: float, slopes: Slopes) -> float:
+    """The highest speed on a way of `distance` that begins at `start` and ends at rest; at most `speed`."""
+    if slopes.rise(start, speed) + slopes.fall(speed) <= distance:
+        return speed
+    if not slopes.first_speed:
+        top = 2.0 * slopes.up * slopes.down * distance + slopes.down * start * start
+        return max(start, math.sqrt(max(0.0, top / (slopes.up + slopes.down))))
+    low, high = start, speed
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if slopes.rise(start, middle) + slopes.fall(middle) <= distance:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _way(low: float, high: float, bend: float, below: float, above: float) -> float:
+    """Way between two speeds, with one slope below `bend` and another above."""
+    way = 0.0
+    if low < min(high, bend):
+        way += (min(high, bend) ** 2 - low * low) / (2.0 * below)
+    if high > max(low, bend):
+        way += (high * high - max(low, bend) ** 2) / (2.0 * above)
+    return way
+
+
+def _corners(start: float, end: float, bend: float) -> list[float]:
+    """Speeds at which a change from `start` to `end` ends a slope."""
+    return [bend, end] if min(start, end) < bend < max(start, end) else [end]
+
+
+def _brake(pieces: list[Piece], t: float, x: float, v: float, end: float, slopes: Slopes) -> tuple[float, float]:
+    """Append the way from velocity `v` down to `end` of the same sign or 0; returns its end (time, position)."""
+    for speed in _corners(abs(v), abs(end), slopes.first_speed):
+        slope = slopes.down if abs(v) > slopes.first_speed else slopes.last_down
+        goal = math.copysign(speed, v)
+        t, x = _change(pieces, t, x, v, goal, slope)
+        v = goal
+    return t, x
 
 
 def clip(pieces: list[Piece], limit: float, direction: int) -> tuple[list[Piece], float | None]:

@@ -21,7 +21,8 @@ from sim_backends.peers.slcan import CanFrame, SlcanBus
 FAULTS = ("can.bus_off", *VEHICLE_FAULTS)
 
 MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
-SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY, VERSION = 0x211, 0x221, 0x291, 0x311, 0x361, 0x4A1
+SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY = 0x211, 0x221, 0x291, 0x311, 0x361
+VERSION_NUMBERS, VERSION_TEXT = 0x41A, 0x4A1
 MOTOR_MOTION, MOTOR_DRIVER = 0x251, 0x261
 
 _TICK = 0.005
@@ -110,7 +111,16 @@ class AgilexPeer:
         elif frame.id == CLEAR:
             model.clear_errors(t)
         elif frame.id == VERSION_REQUEST and first == 1:
-            self._bus.send([CanFrame(VERSION, struct.pack(">4H", *model.params.versions))])
+            self._bus.send([CanFrame(VERSION_NUMBERS, struct.pack(">4H", *model.params.versions))])
+        elif frame.id == VERSION_TEXT and frame.data == b"\x01":
+            self._bus.send([CanFrame(VERSION_TEXT, part) for part in _version_text(model.params.versions)])
+
+
+def _version_text(versions: tuple[int, int, int, int]) -> list[bytes]:
+    """Ten frames of eight characters, as the maker's SDK reads them."""
+    controller, driver, software, drivers = versions
+    text = f"SIMULATED HW{controller}.{driver} CONTROLLER {software} DRIVERS {drivers}".encode("ascii").ljust(80)
+    return [text[k : k + 8] for k in range(0, 80, 8)]
 
 
 class _Cyclic:

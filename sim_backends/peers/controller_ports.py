@@ -47,6 +47,13 @@ class Client:
             if len(self._backlog) > _BACKLOG_LIMIT:
                 self.close()
 
+    def offer(self, data: bytes) -> None:
+        """Send `data` whole, or not at all while the client has not taken what was sent before."""
+        if self._backlog:
+            self.send(b"")
+        if not self._backlog:
+            self.send(data)
+
     def receive(self) -> bytes | None:
         """What has arrived, empty if nothing; None once the connection has ended."""
         if not self.open:

@@ -1,6 +1,12 @@
-"""The dashboard server's language: one line in, one line out. Texts as the maker's dashboard reference gives them."""
+"""The dashboard server's language: one line in, one line out. Texts as the maker's dashboard reference gives them.
+
+In local control it refuses whatever changes the arm, as a controller does.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
 
 from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.peers.script import ControlProgram, RuntimeState
@@ -24,84 +30,132 @@ _STATES = {
     RuntimeState.RESUMING: "PLAYING",
 }
 _FIXED = {
-    "is in remote control": "true",
-    "get loaded program": "No program loaded",
-    "isprogramsaved": "false <unnamed>",
-    "close popup": "closing popup",
     "close safety popup": "closing safety popup",
     "restart safety": "Restarting safety",
-    "get operational mode": "NONE",
     "quit": "Disconnected",
     "shutdown": "Shutting down",
+    "savelog": "Log saved to disk",
 }
+_FOR_REMOTE_ONLY = frozenset(["play", "pause", "stop", "shutdown", "load", "power", "brake", "unlock", "restart"])
+"""First words of what is refused in local control."""
+_LOCAL = (
+    "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and reconnect to port "
+    "29999"
+)
+_UNNAMED = "<unnamed>"
 
 
 class Dashboard:
-    """Answers dashboard commands for one arm and its program."""
+    """Answers dashboard commands for one arm and its program; `programs` is where `load` finds its programs.
 
-    def __init__(self, model: ArmModel, program: ControlProgram) -> None:
+    A program NAME.urp is the URScript text of the file NAME.script there.
+    """
+
+    def __init__(self, model: ArmModel, program: ControlProgram, programs: Path | None = None) -> None:
         self._model = model
         self._program = program
+        self._programs = programs
+        self._loaded = ""
+        self._text = ""
+        self._mode = "NONE"
+        self._reports = 0
+        self._answers: dict[str, Callable[[], str]] = {
+            "polyscopeversion": lambda: "URSoftware " + ".".join(map(str, VERSION)) + " (Nov 10 2023)",
+            "version": lambda: ".".join(map(str, VERSION[:3])),
+            "get serial number": lambda: model.params.serial,
+            "get robot model": lambda: model.params.model,
+            "robotmode": lambda: f"Robotmode: {_MODES[model.power]}",
+            "safetymode": lambda: f"Safetymode: {self._safety()}",
+            "safetystatus": lambda: f"Safetystatus: {self._safety()}",
+            "is in remote control": lambda: str(model.remote).lower(),
+            "running": lambda: f"Program running: {str(program.runtime_state is RuntimeState.PLAYING).lower()}",
+            "programstate": lambda: f"{_STATES[program.runtime_state]} {self._name()}",
+            "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
+            "isprogramsaved": lambda: f"{str(bool(self._loaded)).lower()} {self._name()}",
+            "get operational mode": lambda: self._mode,
+            "clear operational mode": self._clear_mode,
+            "close popup": self._close_popup,
+            "power on": self._power_on,
+            "power off": self._power_off,
+            "brake release": self._brake_release,
+            "unlock protective stop": self._unlock,
+            "stop": self._stop,
+            "play": self._play,
+            "pause": lambda: "Pausing program" if program.pause() else "Failed to execute: pause",
+        }
 
     def answer(self, command: str) -> str:
         """The reply line to one command line, without its end."""
-        word = command.lower()
+        word = " ".join(command.lower().split())
+        if not self._model.remote and word.split(" ")[0] in _FOR_REMOTE_ONLY:
+            return _LOCAL
         if word in _FIXED:
             return _FIXED[word]
-        action = getattr(self, "_on_" + word.replace(" ", "_"), None)
-        if action is not None:
-            return str(action())
-        for prefix, reply in (
-            ("popup ", "showing popup"),
-            ("addtolog ", "Added log message"),
-            ("load ", f"File not found: {command[5:]}"),
-            ("setuserrole ", f"Setting user role: {command[12:]}"),
-        ):
-            if word.startswith(prefix):
-                return reply
+        if word in self._answers:
+            return self._answers[word]()
+        return self._with_argument(command.strip(), word)
+
+    def _with_argument(self, command: str, word: str) -> str:
+        if word.startswith("load installation"):
+            name = command[18:].strip()
+            return f"Loading installation: {name}" if name == "default.installation" else f"File not found: {name}"
+        if word.startswith("load "):
+            return self._load(command[5:].strip())
+        if word.startswith("popup"):
+            return "showing popup"
+        if word.startswith("addtolog"):
+            return "Added log message" if word != "addtolog" else "No log message to add"
+        if word.startswith("set operational mode "):
+            return self._set_mode(word[21:])
+        if word.startswith("generate flight report"):
+            self._reports += 1
+            return f"Flight Report generated with id: {self._reports}"
+        if word.startswith("generate support file"):
+            return f"Error: {command[22:].strip() or 'no folder'} cannot be written to"
         return f'could not understand: "{command}"'
 
-    def _on_polyscopeversion(self) -> str:
-        return "URSoftware " + ".".join(map(str, VERSION)) + " (Nov 10 2023)"
+    def _name(self) -> str:
+        return self._loaded or _UNNAMED
 
-    def _on_version(self) -> str:
-        return ".".join(map(str, VERSION[:3]))
+    def _safety(self) -> str:
+        return "REDUCED" if self._model.safety_mode == 2 else _SAFETY[self._model.safety]
 
-    def _on_get_serial_number(self) -> str:
-        return self._model.params.serial
+    def _load(self, name: str) -> str:
+        file = None if self._programs is None else self._programs / (Path(name).stem + ".script")
+        if file is None or not file.is_file():
+            return f"File not found: {name}"
+        self._program.stop("another program was loaded")
+        self._loaded, self._text = name, file.read_text()
+        return f"Loading program: {name}"
 
-    def _on_get_robot_model(self) -> str:
-        return self._model.params.model
+    def _set_mode(self, mode: str) -> str:
+        if mode not in ("manual", "automatic"):
+            return f"Failed setting operational mode: {mode}"
+        self._mode = mode.upper()
+        return f"Operational mode '{mode}' is set"
 
-    def _on_robotmode(self) -> str:
-        return f"Robotmode: {_MODES[self._model.power]}"
+    def _clear_mode(self) -> str:
+        self._mode = "NONE"
+        return "No longer controlling the operational mode. Current operational mode: 'NONE'."
 
-    def _on_safetymode(self) -> str:
-        return f"Safetymode: {_SAFETY[self._model.safety]}"
+    def _close_popup(self) -> str:
+        self._program.close_popup()
+        return "closing popup"
 
-    def _on_safetystatus(self) -> str:
-        return f"Safetystatus: {_SAFETY[self._model.safety]}"
-
-    def _on_running(self) -> str:
-        return f"Program running: {str(self._program.runtime_state is RuntimeState.PLAYING).lower()}"
-
-    def _on_programstate(self) -> str:
-        return f"{_STATES[self._program.runtime_state]} <unnamed>"
-
-    def _on_power_on(self) -> str:
+    def _power_on(self) -> str:
         self._model.set_power(max(self._model.power, Power.IDLE))
         return "Powering on"
 
-    def _on_power_off(self) -> str:
+    def _power_off(self) -> str:
         self._program.stop("power off")
         self._model.set_power(Power.OFF)
         return "Powering off"
 
-    def _on_brake_release(self) -> str:
+    def _brake_release(self) -> str:
         self._model.set_power(Power.RUNNING)
         return "Brake releasing"
 
-    def _on_unlock_protective_stop(self) -> str:
+    def _unlock(self) -> str:
         if self._model.unlock():
             return "Protective stop releasing"
         return (
@@ -109,12 +163,12 @@ class Dashboard:
             "Always inspect cause of protective stop before unlocking"
         )
 
-    def _on_stop(self) -> str:
+    def _stop(self) -> str:
         self._program.stop("stopped from the dashboard")
         return "Stopped"
 
-    def _on_play(self) -> str:
-        return "Starting program" if self._program.play() else "Failed to execute: play"
-
-    def _on_pause(self) -> str:
-        return "Pausing program" if self._program.pause() else "Failed to execute: pause"
+    def _play(self) -> str:
+        begun = self._program.play()
+        if not begun and self._text and self._program.runtime_state is RuntimeState.STOPPED:
+            begun = self._program.load(self._text)
+        return "Starting program" if begun else "Failed to execute: play"

@@ -1,4 +1,4 @@
-"""A client's acquisition: one thread exposes on time, another renders what was exposed and sends it.
+"""A camera's acquisition: one thread exposes on time, another renders what was exposed and sends it.
 
 Exposures keep the device's rate in world time, whatever rendering takes. A picture is asked for once its exposure is
 over, because only then the state of the world at its middle is known.
@@ -6,21 +6,18 @@ over, because only then the state of the world at its middle is known.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import socket
 import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraModel
-from sim_backends.peers.frame_wire import Rejected, message
+from sim_backends.peers.frame_wire import Rejected
 
 log = logging.getLogger(__name__)
 
@@ -32,29 +29,33 @@ Render = Callable[[float, float], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
-class _Exposure:
+class Exposure:
+    """An exposure: its number, when it began in s of world time, and its duration in s."""
+
     frame_id: int
     begin: float
     duration: float
 
 
-class FrameSession:
-    """Acquisition for the client at `connection`, from `start()` to `end()` and `join()`."""
+Send = Callable[[Exposure, NDArray[np.uint8]], None]
+"""Sends a picture, unless the camera is silent; OSError when nobody takes it any more."""
 
-    def __init__(
-        self, name: str, camera: CameraModel, clock: WorldClock, render: Render, connection: socket.socket
-    ) -> None:
+
+class FrameSession:
+    """Acquisition from `start()` to `end()` and `join()`; `sending` is held while a picture is sent."""
+
+    def __init__(self, name: str, camera: CameraModel, clock: WorldClock, render: Render, send: Send) -> None:
         self._name = name
         self._camera = camera
         self._clock = clock
         self._render = render
-        self._connection = connection
-        self._sending = threading.Lock()
+        self._send = send
+        self.sending = threading.Lock()
         self._wake = threading.Condition()
         self._ended = threading.Event()
         self._period: float | None = None
         self._next: float | None = None
-        self._exposed: deque[_Exposure] = deque()
+        self._exposed: deque[Exposure] = deque()
         self._generation = 0
         self._threads = [
             threading.Thread(target=self._expose, name=f"{name}-expose", daemon=True),
@@ -67,12 +68,10 @@ class FrameSession:
             thread.start()
 
     def end(self) -> None:
-        """End the acquisition and the connection; pictures that were not sent are forgotten."""
+        """End the acquisition; pictures that were not sent are forgotten."""
         with self._wake:
             self._ended.set()
             self._wake.notify_all()
-        with contextlib.suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RDWR)
 
     def join(self) -> None:
         """Wait for the threads."""
@@ -102,17 +101,11 @@ class FrameSession:
 
     def halt(self) -> None:
         """Stop exposing and forget what has not been sent: no frame follows."""
-        with self._sending, self._wake:
+        with self.sending, self._wake:
             self._period = self._next = None
             self._exposed.clear()
             self._generation += 1
             self._wake.notify_all()
-
-    def send(self, header: dict[str, Any]) -> None:
-        """Send a message without payload, unless the camera is silent."""
-        if not self._camera.silent:
-            with self._sending:
-                self._connection.sendall(message(header))
 
     def _expose(self) -> None:
         with self._wake:
@@ -129,7 +122,7 @@ class FrameSession:
                 self._next = None if self._period is None else begin + self._period
                 frame_id, lost = self._camera.expose()
                 if not lost and len(self._exposed) < BACKLOG:
-                    self._exposed.append(_Exposure(frame_id, begin, duration))
+                    self._exposed.append(Exposure(frame_id, begin, duration))
                     self._wake.notify_all()
 
     def _deliver(self) -> None:
@@ -150,24 +143,14 @@ class FrameSession:
                 # The client has gone: the thread that reads its requests ends the session.
                 return
 
-    def _picture(self, exposure: _Exposure) -> NDArray[np.uint8]:
+    def _picture(self, exposure: Exposure) -> NDArray[np.uint8]:
         image = self._render(exposure.begin + 0.5 * exposure.duration, exposure.duration)
         shape = (self._camera.spec.height, self._camera.spec.width)
         if image.shape != shape or image.dtype != np.uint8:
             raise ValueError(f"a picture must be uint8 of shape {shape}, not {image.dtype} of {image.shape}")
         return image
 
-    def _send_frame(self, exposure: _Exposure, image: NDArray[np.uint8], generation: int) -> None:
-        spec = self._camera.spec
-        header = {
-            "op": "frame",
-            "frame_id": exposure.frame_id,
-            "device_ns": spec.device_ns(exposure.begin + spec.latency),
-            "exposure_s": exposure.duration,
-            "width": spec.width,
-            "height": spec.height,
-        }
-        data = message(header, image.tobytes())
-        with self._sending:
-            if generation == self._generation and not self._camera.silent:
-                self._connection.sendall(data)
+    def _send_frame(self, exposure: Exposure, image: NDArray[np.uint8], generation: int) -> None:
+        with self.sending:
+            if generation == self._generation:
+                self._send(exposure, image)

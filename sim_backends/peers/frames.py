@@ -9,11 +9,15 @@ import contextlib
 import socket
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import FAULTS, CameraModel, CameraSpec
-from sim_backends.peers.frame_session import BACKLOG, FrameSession, Render
+from sim_backends.peers.frame_session import BACKLOG, Exposure, FrameSession, Render
 from sim_backends.peers.frame_wire import Rejected, message, number, receive
 from sim_backends.peers.server import TcpServer
 
@@ -56,18 +60,27 @@ class FramePeer:
         self.camera.clear()
 
     def _serve(self, connection: socket.socket) -> None:
-        session = FrameSession(self.name, self.camera, self._clock, self._render, connection)
+        session = FrameSession(self.name, self.camera, self._clock, self._render, partial(self._send_frame, connection))
         if not self._take(session):
             self._turn_away(connection)
             return
+
+        def send(header: dict[str, Any]) -> None:
+            if not self.camera.silent:
+                with session.sending:
+                    connection.sendall(message(header))
+
         try:
             session.start()
             while (request := receive(connection)) is not None:
-                session.send({"op": request.get("op"), "id": request.get("id"), **self._answer(session, request)})
+                send({"op": request.get("op"), "id": request.get("id"), **self._answer(session, request)})
         except Rejected as error:
-            session.send({"op": "error", "ok": False, "error": str(error)})
+            send({"op": "error", "ok": False, "error": str(error)})
         finally:
             session.end()
+            # Whatever is being sent to a client that takes nothing has to come back.
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
             with self._free:
                 self._session = None
                 self._free.notify_all()
@@ -88,6 +101,19 @@ class FramePeer:
             request = receive(connection) or {}
         error = f"camera {self.camera.spec.serial} is in use by another client: close that one first"
         connection.sendall(message({"op": request.get("op"), "id": request.get("id"), "ok": False, "error": error}))
+
+    def _send_frame(self, connection: socket.socket, exposure: Exposure, image: NDArray[np.uint8]) -> None:
+        spec = self.camera.spec
+        header = {
+            "op": "frame",
+            "frame_id": exposure.frame_id,
+            "device_ns": spec.device_ns(exposure.begin + spec.latency),
+            "exposure_s": exposure.duration,
+            "width": spec.width,
+            "height": spec.height,
+        }
+        if not self.camera.silent:
+            connection.sendall(message(header, image.tobytes()))
 
     # --- requests ---
 

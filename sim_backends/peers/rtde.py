@@ -1,7 +1,7 @@
 """RTDE version 2 over TCP: the simulated arm's controller as a client on the network sees it.
 
-One thread advances the arm and serves the real-time, dashboard, script, primary and secondary ports every 2 ms on the
-wall, on absolute deadlines. Source: the maker's RTDE guide; docs/protocols.md, section 1. Physics is elsewhere.
+One thread advances the arm and serves RTDE, the dashboard and the script ports every 2 ms on the wall, on absolute
+deadlines. Source: the maker's RTDE guide; docs/protocols.md, section 1. Physics is elsewhere.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import select
 import signal
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 
@@ -21,12 +22,12 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.controller_ports import Client, TcpPorts
-from sim_backends.peers.dashboard import BANNER, VERSION, Dashboard
+from sim_backends.peers.dashboard import BANNER, Dashboard
 from sim_backends.peers.rtde_recipes import InputRecipe
 from sim_backends.peers.rtde_registers import Registers, View
 from sim_backends.peers.rtde_session import Session
-from sim_backends.peers.script import ControlProgram, ScriptText
-from sim_backends.peers.script_port import robot_state, version_message
+from sim_backends.peers.script import ControlProgram
+from sim_backends.peers.script_clients import SCRIPT_PORTS, ScriptClients
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
@@ -35,11 +36,9 @@ LATE_S = 0.1
 """Seconds on the wall by which `arm.late_states` delays every state."""
 _CATCH_UP = 100
 """Ticks that are made up for in a burst when the machine was busy; a longer delay is skipped."""
-RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, SECONDARY_PORT = 30004, 29999, 30003, 30001, 30002
+RTDE_PORT, DASHBOARD_PORT = 30004, 29999
 _HELD_UP_S = 0.02
 """A tick that begins later than this, in seconds on the wall, is made up for. A real controller is never held up."""
-_REPORT_EVERY = 50
-"""Ticks between two reports on the primary and the secondary port, which come ten times a second."""
 
 _log = logging.getLogger(__name__)
 
@@ -47,8 +46,10 @@ _log = logging.getLogger(__name__)
 class RtdePeer:
     """The controller of one simulated arm on its own loopback address."""
 
-    def __init__(self, model: ArmModel, clock: WorldClock, host: str | None = None) -> None:
-        """Bind the five ports on `host`, or on the first free address that `TcpPorts` finds.
+    def __init__(
+        self, model: ArmModel, clock: WorldClock, host: str | None = None, programs: Path | None = None
+    ) -> None:
+        """Bind the ports on `host`, or on the first free address that `TcpPorts` finds; `programs` as for `Dashboard`.
 
         Raises OSError when an address or every address is taken.
         """
@@ -57,13 +58,12 @@ class RtdePeer:
         self._registers = Registers()
         self._view = View(model, self._registers)
         self._program = ControlProgram(model, self._registers)
-        self._dashboard = Dashboard(model, self._program)
+        self._dashboard = Dashboard(model, self._program, programs)
         self._owners: dict[str, Session] = {}
         self._sessions: dict[Client, Session] = {}
-        self._scripts: dict[Client, ScriptText] = {}
-        self._listeners: set[Client] = set()
+        self._scripts = ScriptClients(model, self._program, self._view)
         self._lines: dict[Client, bytes] = {}
-        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, SECONDARY_PORT), host)
+        self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, *SCRIPT_PORTS), host)
         self._tick_count = 0
         self._late = 0
         self._stopping = threading.Event()
@@ -138,7 +138,7 @@ class RtdePeer:
             elif port == DASHBOARD_PORT:
                 self._serve_dashboard(client, data)
             else:
-                self._serve_script(client, data, reports=port in (PRIMARY_PORT, SECONDARY_PORT))
+                self._scripts.serve(port, client, data)
         for client in waiting:
             self._sessions[client].feed(b"")
         self._program.tick(held_up)
@@ -147,9 +147,7 @@ class RtdePeer:
         for session in list(self._sessions.values()):
             if session.started:
                 session.send_state(self._view, self._tick_count, self._late)
-        if self._tick_count % _REPORT_EVERY == 0:
-            for client in self._listeners:
-                client.send(robot_state(self._model, self._program.runtime_state))
+        self._scripts.tick(self._tick_count)
 
     def _serve_rtde(self, client: Client, data: bytes | None) -> None:
         if data is None:
@@ -174,17 +172,6 @@ class RtdePeer:
             if command == "quit":
                 client.close()
 
-    def _serve_script(self, client: Client, data: bytes | None, reports: bool) -> None:
-        if data is None:
-            self._scripts.pop(client, None)
-            self._listeners.discard(client)
-            return
-        if reports and client not in self._listeners:
-            self._listeners.add(client)
-            client.send(version_message(VERSION))
-        for text in self._scripts.setdefault(client, ScriptText()).feed(data):
-            self._program.load(text)
-
 
 def main(arguments: list[str] | None = None) -> None:
     """Serve one arm with exact kinematics until SIGINT, SIGTERM or the end of standard input (with --until-eof)."""
@@ -193,13 +180,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--host", default=None, help="loopback address, default: a free one")
     parser.add_argument("--model", choices=sorted(TABLES), default="UR10e", help="which arm")
     parser.add_argument("--unlock-delay", type=float, default=5.0, help="world seconds before a stop can be unlocked")
+    parser.add_argument(
+        "--programs", type=Path, help="folder of NAME.script files that the dashboard loads as NAME.urp"
+    )
     parser.add_argument("--json", action="store_true", help="announce the address as one JSON line")
     parser.add_argument("--until-eof", action="store_true", help="take commands on standard input and end with it")
     options = parser.parse_args(arguments)
     clock = WorldClock(options.speed)
     params = ArmParams.of(options.model, unlock_delay=options.unlock_delay)
     model = ArmModel(params, np.random.default_rng(0), clock)
-    peer = RtdePeer(model, clock, options.host)
+    peer = RtdePeer(model, clock, options.host, options.programs)
     peer.start()
     print(json.dumps({"address": peer.address, "pid": os.getpid()}) if options.json else peer.address, flush=True)
     ended = threading.Event()

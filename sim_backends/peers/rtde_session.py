@@ -1,4 +1,8 @@
-"""One RTDE connection: the handshakes, the recipes and the packets. Source: the maker's RTDE guide, version 2."""
+"""One RTDE connection: the handshakes, the recipes and the packets, in version 1 or 2 of the protocol.
+
+A connection speaks version 1 until it asks for 2: one output recipe without a number in front, sent 500 times a second,
+and an input recipe without one as well. Source: the maker's RTDE guide.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,8 @@ from typing import Protocol
 from sim_backends.peers.controller_ports import Client
 from sim_backends.peers.dashboard import VERSION
 from sim_backends.peers.rtde_recipes import InputRecipe, OutputRecipe
-from sim_backends.peers.rtde_registers import FORMATS, INPUTS, OUTPUTS, View
+from sim_backends.peers.rtde_registers import View
+from sim_backends.peers.rtde_variables import FORMATS, INPUTS, OUTPUTS
 
 _HEADER = struct.Struct(">HB")
 _CATCH_UP = 4
@@ -40,6 +45,7 @@ class Session:
         self._inputs: dict[int, InputRecipe] = {}
         self._outputs: list[OutputRecipe] = []
         self._held: deque[tuple[int, bytes]] = deque()
+        self._version = 1
         self.started = False
 
     def feed(self, data: bytes) -> None:
@@ -68,43 +74,59 @@ class Session:
                 return
 
     def send_state(self, view: View, tick: int, late: int = 0) -> None:
-        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one."""
+        """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one.
+
+        A client that does not keep up misses packets, as it does on a controller.
+        """
         for recipe in self._outputs:
             if tick % recipe.every == 0:
                 self._held.append((tick, recipe.packet(view)))
         while self._held and self._held[0][0] + late <= tick:
-            self._client.send(self._held.popleft()[1])
+            self._client.offer(self._held.popleft()[1])
 
     def _reply(self, kind: str, payload: bytes) -> None:
         self._client.send(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)
 
     def _on_protocol(self, payload: bytes) -> None:
-        self._reply("V", bytes([payload[:2] in (b"\0\1", b"\0\2")]))
+        known = payload[:2] in (b"\0\1", b"\0\2")
+        if known:
+            self._version = payload[1]
+        self._reply("V", bytes([known]))
 
     def _on_version(self, payload: bytes) -> None:
         self._reply("v", struct.pack(">4I", *VERSION))
 
     def _on_outputs(self, payload: bytes) -> None:
-        frequency = struct.unpack(">d", payload[:8])[0] if len(payload) >= 8 else 0.0
-        names = _names(payload[8:])
+        frequency = 0.0
+        if self._version > 1:
+            frequency = struct.unpack(">d", payload[:8])[0] if len(payload) >= 8 else 0.0
+            payload = payload[8:]
+        names = _names(payload)
         kinds = [OUTPUTS[name][0] if name in OUTPUTS else "NOT_FOUND" for name in names]
         number = len(self._outputs) + 1
-        known = "NOT_FOUND" not in kinds and names
-        self._reply("O", bytes([number if known else 0]) + ",".join(kinds).encode())
+        known = bool(names) and "NOT_FOUND" not in kinds and number < 256
+        self._reply_recipe("O", number if known else 0, kinds)
         if known:
             every = max(1, round(500.0 / frequency)) if frequency > 0 else 1
-            code = ">HBB" + "".join(FORMATS[kind] for kind in kinds)
+            code = (">HBB" if self._version > 1 else ">HB") + "".join(FORMATS[kind] for kind in kinds)
             getters = tuple(OUTPUTS[name][1] for name in names)
+            if self._version == 1:
+                self._outputs.clear()
+                number = 0
             self._outputs.append(OutputRecipe(number, every, struct.Struct(code), getters))
 
     def _on_inputs(self, payload: bytes) -> None:
         names = _names(payload)
         kinds = [self._claim(name) for name in names]
-        usable = names and not {"NOT_FOUND", "IN_USE"} & set(kinds)
-        number = len(self._inputs) + 1 if usable else 0
+        number = len(self._inputs) + 1
+        usable = bool(names) and not {"NOT_FOUND", "IN_USE"} & set(kinds) and number < 256
         if usable:
             self._inputs[number] = self._controller.input_recipe(names)
-        self._reply("I", bytes([number & 255]) + ",".join(kinds).encode())
+        self._reply_recipe("I", number if usable else 0, kinds)
+
+    def _reply_recipe(self, kind: str, number: int, kinds: list[str]) -> None:
+        head = bytes([number]) if self._version > 1 else b""
+        self._reply(kind, head + ",".join(kinds).encode())
 
     def _claim(self, name: str) -> str:
         if name not in INPUTS:
@@ -115,14 +137,21 @@ class Session:
         self.started = True
         self._reply("S", b"\1")
 
+    def _on_message(self, payload: bytes) -> None:
+        """A client's words for the controller's log: nobody reads it here."""
+
     def _on_pause(self, payload: bytes) -> None:
         self.started = False
         self._reply("P", b"\1")
 
     def _on_data(self, payload: bytes) -> None:
-        recipe = self._inputs.get(payload[0]) if payload else None
+        if self._version == 1:
+            recipe = self._inputs.get(len(self._inputs))
+        else:
+            recipe = self._inputs.get(payload[0]) if payload else None
+            payload = payload[1:]
         if recipe is not None:
-            recipe.apply(payload[1:])
+            recipe.apply(payload)
 
     _HANDLERS: dict[str, Callable[[Session, bytes], None]] = {  # noqa: RUF012
         "V": _on_protocol,
@@ -132,6 +161,7 @@ class Session:
         "S": _on_start,
         "P": _on_pause,
         "U": _on_data,
+        "M": _on_message,
     }
 
 

@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
 
 from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.peers.rtde_registers import Registers
-from sim_backends.peers.script_context import CYCLE, Context, Job, ProgramError
+from sim_backends.peers.script_context import CYCLE, Context, Job, ProgramError, done
 from sim_backends.peers.script_motion import MOTION_COMMANDS, tool_contact
 from sim_backends.peers.script_outputs import HeldOutputs
 from sim_backends.peers.script_queries import QUERY_COMMANDS
-from sim_backends.peers.script_statements import (
-    path_statements,
-    run_statement,
-    statements,
-    understood,
-)
+from sim_backends.peers.urscript.environment import Environment
+from sim_backends.peers.urscript.machine import Machine
+from sim_backends.peers.urscript.words import ScriptError
 
 COMMANDS: dict[int, Callable[[Context], Job | None]] = {**MOTION_COMMANDS, **QUERY_COMMANDS}
 """Every command that does something; other numbers are answered as done."""
@@ -31,9 +29,14 @@ IMMEDIATE = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70,
 _STOP_SCRIPT, _CONTACT_DETECTED = 255, 254
 
 _log = logging.getLogger(__name__)
-_TEXT_LIMIT = 1 << 20
 _RESUMING_CYCLES = 50
+Announcement = tuple[str, str]
+"""What the clients of the primary port are told: text, popup, started, stopped or failed, and its words."""
+_MOST_ANNOUNCED = 200
 _OFFSET = re.compile(r"reg_offset_int\s*=\s*#[^\n]*\n?\s*(\d+)")
+_NAME = re.compile(r"def\s+(\w+)")
+_PATH = re.compile(r"def exec_move_path\(\):\n.*?\n\s*end\b", re.DOTALL)
+"""Where ur_rtde puts a path of way points into its script."""
 
 
 class RuntimeState(IntEnum):
@@ -46,30 +49,6 @@ class RuntimeState(IntEnum):
     RESUMING = 5
 
 
-class ScriptText:
-    """Collects the bytes of one script connection into complete programs and single-line commands."""
-
-    def __init__(self) -> None:
-        self._buffer = b""
-
-    def feed(self, data: bytes) -> list[str]:
-        """Texts completed by `data`: a `def` runs to its `end` in column 0, anything else to the end of its line."""
-        self._buffer += data
-        texts = []
-        while self._buffer:
-            is_program = self._buffer.lstrip().startswith((b"def ", b"sec "))
-            mark = b"\nend\n" if is_program else b"\n"
-            end = self._buffer.find(mark)
-            if end < 0:
-                break
-            text, self._buffer = self._buffer[: end + len(mark)], self._buffer[end + len(mark) :]
-            if text.strip():
-                texts.append(text.decode("utf-8", "replace"))
-        if len(self._buffer) > _TEXT_LIMIT:
-            self._buffer = b""
-        return texts
-
-
 class ControlProgram:
     """The controller's program memory: at most one program, and what its outputs do while none runs."""
 
@@ -78,43 +57,71 @@ class ControlProgram:
         self.message = ""
         self._model = model
         self._registers = registers
-        self._context = Context(model, registers, 0, [])
+        self._context = Context(model, registers, 0)
         self._outputs = HeldOutputs(model)
         self._resumes_at = 0
         self._by_safeguard = False
         self._cycles = 0
         self._commands, self._commanded_at = 0, 0
         self._job: Job | None = None
+        self._environment = Environment(self._outputs, self._announce, self.pause)
         self._serves_commands = False
         self._executing = False
+        self._name = ""
+        self.announcements: deque[Announcement] = deque(maxlen=_MOST_ANNOUNCED)
 
-    def load(self, text: str) -> None:
+    def load(self, text: str) -> bool:
         """Run `text` in place of any other program; a secondary program (`sec`) runs at once, beside it.
+
+        Whether a program was begun.
 
         Like on the controller, nothing changes while the arm cannot move or when the text does not compile.
         """
         if text.lstrip().startswith("sec "):
-            if line := self._outputs.run_secondary(self._context, text):
-                self._note(f"a secondary program failed at {line!r}")
-            return
+            self._run_secondary(text)
+            return False
         found = _OFFSET.search(text)
         if not self._model.ready:
             self._note("a script was not started: the arm is not ready")
-            return
-        if not found and not all(map(understood, statements(text))):
-            self._note(f"a script was not started: compile error in {text.strip()[:60]!r}")
-            return
-        self._context.end_background()
+            return False
+        context = Context(self._model, self._registers, int(found[1]) if found else 0)
+        environment = Environment(self._outputs, self._announce, self.pause)
+        try:
+            machine = None if found else Machine(text, context, environment)
+            if path := _PATH.search(text) if found else None:
+                context.path = Machine(path[0], context, environment).run
+        except ScriptError as error:
+            self._note(f"a script was not started: compile error in {text.strip()[:60]!r}: {error}")
+            self._announce("failed", str(error))
+            return False
+        self.stop("another program was started")
         self._model.halt()
-        self._serves_commands = found is not None
+        self._serves_commands = machine is None
         self._executing = False
-        self._context = Context(self._model, self._registers, int(found[1]) if found else 0, path_statements(text))
-        self._job = None if self._serves_commands else self._run_text(text)
+        self._context, self._environment = context, environment
+        self._job = None if machine is None else machine.run()
         self.runtime_state = RuntimeState.PLAYING
         self._commanded_at = self._cycles
         self.message = ""
+        name = _NAME.search(text)
+        self._name = name[1] if name else "unnamed"
+        self._announce("started", self._name)
         if self._serves_commands:
             self._context.signal_async(-1)
+        return True
+
+    def _run_secondary(self, text: str) -> None:
+        """A secondary program runs at once, beside the main one; it may only do what takes no time."""
+        environment = Environment(self._outputs, self._announce, self.pause)
+        try:
+            Machine(text, Context(self._model, self._registers, 0), environment).run_at_once()
+        except (ScriptError, ProgramError) as error:
+            self._note(f"a secondary program failed: {error}")
+            self._announce("failed", str(error))
+
+    def close_popup(self) -> None:
+        """Let a program go on that waits for a person to close its message."""
+        self._environment.popup_open = False
 
     def play(self) -> bool:
         """Continue a paused program, a moment from now; False when there is none or the arm is not ready."""
@@ -137,10 +144,13 @@ class ControlProgram:
         if self.runtime_state is RuntimeState.STOPPED:
             return
         self.runtime_state = RuntimeState.STOPPED
+        if self._job is not None:
+            self._job.close()
         self._job = None
         self._context.end_background()
         self._model.halt()
         self._note(f"program stopped: {reason}")
+        self._announce("stopped", self._name)
 
     def tick(self, held_up: bool = False) -> None:
         """One cycle of the controller: follow the safety system, then the program.
@@ -149,12 +159,14 @@ class ControlProgram:
         clients neither. Such a cycle does not count as silence, since a real controller runs in real time.
         """
         self._cycles += not held_up
+        self._environment.held_up = held_up
         self._follow_safety()
         self._change_over()
         if self.runtime_state is RuntimeState.PLAYING:
             try:
                 self._cycle()
             except ProgramError as error:
+                self._announce("failed", str(error))
                 self.stop(str(error))
         self._outputs.hold(self.runtime_state is RuntimeState.PLAYING)
 
@@ -199,7 +211,7 @@ class ControlProgram:
                 self.stop("ended by its client")
                 return
             job = self._process(command)
-            self._continue(iter(()) if job is None else job)
+            self._continue(done() if job is None else job)
 
     def _next_command(self) -> int:
         """The client's command; while there is none, one that the program gives itself."""
@@ -224,10 +236,6 @@ class ControlProgram:
         else:
             self.stop("ended")
 
-    def _run_text(self, text: str) -> Job:
-        for line in statements(text):
-            yield from run_statement(self._context, line)
-
     def _watch_contact(self) -> None:
         context = self._context
         if context.contact_direction is None:
@@ -246,6 +254,9 @@ class ControlProgram:
         silence = CYCLE * (self._cycles - self._commanded_at)
         if limit is not None and silence > limit:
             raise ProgramError(f"watchdog: no input for {silence:.3f} s, at most {limit:.3f} s allowed")
+
+    def _announce(self, kind: str, words: str) -> None:
+        self.announcements.append((kind, words))
 
     def _note(self, message: str) -> None:
         self.message = message

@@ -7,7 +7,7 @@ advanced once per cycle until it ends.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Generator
 
 import numpy as np
 
@@ -16,11 +16,16 @@ from sim_backends.models.arm_kinematics import Matrix, Vector, invert, matrix_fr
 from sim_backends.models.arm_motion import Motion
 from sim_backends.peers.rtde_registers import Registers
 
-Job = Iterator[None]
+Job = Generator[None, None, None]
 
 CYCLE = 0.002
 """Seconds between two cycles of the controller."""
 _HISTORY = 500
+
+
+def done() -> Job:
+    """A job that is done at once."""
+    yield from ()
 
 
 class ProgramError(Exception):
@@ -30,11 +35,12 @@ class ProgramError(Exception):
 class Context:
     """The variables of one program run on one arm; its registers begin at `offset`."""
 
-    def __init__(self, model: ArmModel, registers: Registers, offset: int, path: list[str]) -> None:
+    def __init__(self, model: ArmModel, registers: Registers, offset: int) -> None:
         self.model = model
         self.registers = registers
         self.offset = offset
-        self.path = path
+        self.path: Callable[[], Job] = done
+        """Follows the way points that the client has put into its script."""
         self.watchdog_period: float | None = None
         self.thread: str | None = None
         """Name of the streaming thread that holds the arm."""

@@ -11,7 +11,6 @@ from sim_backends.models.arm_kinematics import Matrix, Vector, matrix_from_pose
 from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 from sim_backends.peers.script_context import Context, Job
-from sim_backends.peers.script_statements import run_statement
 
 _CONTACT_FORCE = 10.0
 """Force in N along the direction of motion that counts as contact."""
@@ -48,13 +47,9 @@ def _move_tool(c: Context, target: Matrix) -> Job | None:
 
 
 def _move_path(c: Context) -> Job | None:
-    def follow() -> Job:
-        for line in c.path:
-            yield from run_statement(c, line)
-
     c.require_free()
     c.end_background()
-    return c.sync_or_async(follow())
+    return c.sync_or_async(c.path())
 
 
 def _stop_move(c: Context) -> Job | None:

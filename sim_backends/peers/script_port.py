@@ -1,8 +1,8 @@
-"""What the primary and the secondary port tell their clients: the version once, then the state ten times a second.
+"""What the primary and the secondary port tell their clients: the version once, the state ten times a second, messages.
 
 Numbers are big-endian: a package is i32 size, u8 type and its content, a part of it u32 size, u8 type and its content.
-Source: the maker's client interface guide and `Universal_Robots_Client_Library`, `src/primary`; other parts of the
-state are not sent.
+Source: the maker's client interface guide and `Universal_Robots_Client_Library`, `src/primary`. Parts and their order
+are those of a recorded controller; the internal ones (9, 10) are empty, currents and temperatures usual values.
 """
 
 from __future__ import annotations
@@ -10,24 +10,65 @@ from __future__ import annotations
 import struct
 import zlib
 
+import numpy as np
+
 from sim_backends.models.arm import ArmModel, Power, Safety
-from sim_backends.models.arm_kinematics import Matrix, pose_from_matrix
+from sim_backends.models.arm_kinematics import TABLES, Matrix, pose_from_matrix
 
 _STATE, _MESSAGE = 16, 20
 _LINEARISED = 2
 """The status of an arm that was calibrated in the factory."""
 _PROJECT, _BUILT = b"URControl", b"10-11-2023, 00:00:00"
+_MODELS = {"UR5e": 1, "UR10e": 2, "UR3e": 3, "UR16e": 4, "UR20": 7, "UR30": 8, "UR15": 9}
+"""The controller's numbers of the models."""
+_RUNNING, _OFF = 253, 239
+"""What joints and tool say of themselves."""
+_TEXT, _POPUP, _VERSION, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 6, 7, 10
+_VIOLATION = 3
+"""The report level of an error that ends what its sender wanted."""
+_READ_ONLY = 210
+"""Error code of a script that came while the arm was not in remote control."""
 
 
 def version_message(version: tuple[int, int, int, int]) -> bytes:
     """The package that greets a client; `version` is major, minor, bug fix, build."""
-    head = struct.pack(">Qbbb", 0, -2, 3, len(_PROJECT)) + _PROJECT
-    return _package(_MESSAGE, head + struct.pack(">BBii", *version) + _BUILT)
+    return _message(_VERSION, struct.pack(">b", len(_PROJECT)) + _PROJECT + struct.pack(">BBii", *version) + _BUILT)
 
 
-def robot_state(model: ArmModel, runtime_state: int) -> bytes:
-    """The state package: the robot's mode, where its tool is, and its kinematics; `runtime_state` is that of RTDE."""
-    return robot_mode(model, runtime_state, _cartesian(model), _kinematics(model.params.dh))
+def message(kind: str, words: str, time: float) -> bytes:
+    """A message of the primary port: text, popup, started or stopped (a program by its name), failed or read-only."""
+    text = words.encode()
+    if kind == "text":
+        return _message(_TEXT, text, time)
+    if kind == "popup":
+        title = b"Popup"
+        return _message(_POPUP, struct.pack(">IB3?B", 0, 0, False, False, False, len(title)) + title + text, time)
+    if kind == "failed":
+        return _message(_EXCEPTION, struct.pack(">ii", 0, 0) + text, time)
+    if kind == "read-only":
+        return _message(_ERROR, struct.pack(">iiiII", _READ_ONLY, 0, _VIOLATION, 0, 0) + text, time)
+    title = f"PROGRAM_XXX_{kind.upper()}".encode()
+    return _message(_KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text, time)
+
+
+def robot_state(model: ArmModel, runtime_state: int, analog_out: list[float]) -> bytes:
+    """The state package with all its parts; `runtime_state` is that of RTDE."""
+    return robot_mode(
+        model,
+        runtime_state,
+        _joints(model),
+        _cartesian(model),
+        _kinematics(model.params.dh),
+        _part(9, bytes(48)),
+        _masterboard(model, analog_out),
+        _part(2, struct.pack(">bbddfBffB", 0, 0, 0.0, 0.0, 48.0, 0, 0.0, 30.0, _mode(model))),
+        _configuration(model),
+        _part(7, struct.pack(">7d", *model.felt, 0.0)),
+        _part(8, bytes(4)),
+        _part(10, bytes(38)),
+        _part(11, struct.pack(">?iiiff", False, 115200, 0, 1, 1.5, 3.5)),
+        _part(12, bytes(3)),
+    )
 
 
 def robot_mode(model: ArmModel, runtime_state: int, *others: bytes) -> bytes:
@@ -39,6 +80,24 @@ def robot_mode(model: ArmModel, runtime_state: int, *others: bytes) -> bytes:
     speed = model.drive.speed_fraction
     content = struct.pack(">Q7?BBdddB", round(1e6 * model.time), *flags, int(model.power), 0, speed, speed, 1.0, 0)
     return _package(_STATE, b"".join([_part(0, content), *others]))
+
+
+def _mode(model: ArmModel) -> int:
+    return _RUNNING if model.power is Power.RUNNING else _OFF
+
+
+def _joints(model: ArmModel) -> bytes:
+    q, qd = model.drive.q.tolist(), model.drive.qd.tolist()
+    each = (struct.pack(">dddffffB", a, a, v, 0.0, 48.0, 30.0, 30.0, _mode(model)) for a, v in zip(q, qd, strict=True))
+    return _part(1, b"".join(each))
+
+
+def _masterboard(model: ArmModel, analog_out: list[float]) -> bytes:
+    digital = struct.pack(">II", model.digital_inputs, model.digital_outputs)
+    analog = struct.pack(">bbddbbdd", 0, 0, 0.0, 0.0, 0, 0, *analog_out)
+    supply = struct.pack(">ffff", 30.0, 48.0 if model.power is not Power.OFF else 0.0, 0.5, 0.0)
+    safety = struct.pack(">BBbIBBB", model.safety_mode, model.safety_mode == 2, 0, 0, 0, 0, 0)
+    return _part(3, digital + analog + supply + safety)
 
 
 def _cartesian(model: ArmModel) -> bytes:
@@ -56,8 +115,22 @@ def _kinematics(table: Matrix) -> bytes:
     return _part(5, struct.pack(">6I24dI", *checksums, *theta, *a, *d, *alpha, _LINEARISED))
 
 
+def _configuration(model: ArmModel) -> bytes:
+    """Limits, defaults of the moves, the maker's own table and which model it is."""
+    params = model.params
+    limits = np.tile([-params.joint_limit, params.joint_limit], 6)
+    motion = np.column_stack((params.speed_limits, np.full(6, 40.0))).ravel()
+    a, d, alpha, theta = TABLES[params.model].T
+    numbers = (*limits, *motion, 1.05, 1.4, 0.25, 1.2, 0.25, *a, *d, *alpha, *theta)
+    return _part(6, struct.pack(">53d4i", *numbers, 3, 0, _MODELS.get(params.model, 0), 1))
+
+
 def _part(kind: int, content: bytes) -> bytes:
     return struct.pack(">IB", 5 + len(content), kind) + content
+
+
+def _message(kind: int, content: bytes, time: float = 0.0) -> bytes:
+    return _package(_MESSAGE, struct.pack(">Qbb", round(1e6 * time), -2, kind) + content)
 
 
 def _package(kind: int, content: bytes) -> bytes:

@@ -10,6 +10,7 @@ import dataclasses
 import struct
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailSettings
@@ -29,6 +30,13 @@ from sim_backends.peers.tmcl_parameters import (
 OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED = 100, 1, 2, 3, 4, 5
 MODEL = 1260
 SERIAL_VARIABLE = 0
+FACTORY_RAMP: dict[str, Any] = {
+    "max_deceleration": 500_000,
+    "first_acceleration": 100_000,
+    "last_deceleration": 100_000,
+    "first_speed": 10_000,
+}
+"""How the ramp is when the module is switched on: no trapezium, as long as nobody makes it one."""
 
 
 class Refused(Exception):
@@ -73,6 +81,8 @@ class TmclModule:
         self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
         self._variables = [self._stored_variables.get(number, 0) for number in range(USER_VARIABLES)]
         self._outputs = [0, 0]
+        now = self._clock.now()
+        self.rail.configure(now, dataclasses.replace(self.rail.settings, **FACTORY_RAMP))
 
     def reset(self) -> None:
         """Lose all that is not in the EEPROM: counter, motion, outputs, settings and variables that were not stored."""
@@ -184,7 +194,9 @@ class TmclModule:
             _check(value, low, high)
             if kind == 193 and value not in SEARCH_MODES:
                 raise Refused(BAD_VALUE)
-            setting = type(getattr(RailSettings, name))(1 - value if kind in (12, 13) else value)
+            setting: Any = 1 - value if kind in (12, 13) else value
+            if isinstance(getattr(RailSettings, name), bool):
+                setting = bool(setting)
             self.rail.configure(t, dataclasses.replace(self.rail.settings, **{name: setting}))
         elif kind in PLAIN:
             _check(value, *PLAIN[kind][1:])

@@ -1,6 +1,6 @@
 """Parameter tables of the simulated stepper module: number → value at power-on and allowed range.
 
-Numbers and meanings are those of the TMCM-1260 with velocities in pps.
+Numbers and meanings are those of the TMCM-1260 with velocities in pps; 15 to 20 as the vendor's library has them.
 """
 
 from __future__ import annotations
@@ -10,6 +10,10 @@ SETTINGS: dict[int, tuple[str, int, int]] = {
     5: ("max_acceleration", 0, 7_629_278),
     12: ("right_stop", 0, 1),
     13: ("left_stop", 0, 1),
+    15: ("first_acceleration", 0, 7_629_278),
+    16: ("first_speed", 0, 1_000_000),
+    17: ("max_deceleration", 1, 7_629_278),
+    18: ("last_deceleration", 1, 7_629_278),
     26: ("soft_stop", 0, 1),
     140: ("microsteps", 0, 8),
     193: ("search_mode", 1, 8),
@@ -18,13 +22,16 @@ SETTINGS: dict[int, tuple[str, int, int]] = {
 }
 """Axis parameters that set the motion: number → (setting, smallest, largest value)."""
 
-SEARCH_MODES = (1, 2, 5, 7)
+SEARCH_MODES = (1, 2, 3, 4, 5, 6, 7)
 """Values of axis parameter 193 that this module knows."""
 
 PLAIN: dict[int, tuple[int, int, int]] = {
     6: (128, 0, 255),
     7: (8, 0, 255),
     14: (0, 0, 1),
+    19: (0, 0, 7_999_774),
+    20: (10, 1, 7_999_774),
+    21: (0, 0, 65535),
     24: (0, 0, 1),
     25: (0, 0, 1),
     31: (0, 0, 65535),

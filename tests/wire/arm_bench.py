@@ -101,7 +101,7 @@ def _main(speed: float, table: float | None, name: str, factory: list[list[float
                 answer = {
                     "outputs": model.digital_outputs, "moving": model.moving, "q": model.drive.q.tolist(),
                     "time": model.time, "fault": model.fault_text, "payload": model.payload[0],
-                    "tcp": model.drive.flange_from_tcp.tolist(),
+                    "speed": model.drive.speed_fraction, "tcp": model.drive.flange_from_tcp.tolist(),
                 }  # fmt: skip
             case ["late_states"]:
                 peer.fault("arm.late_states")

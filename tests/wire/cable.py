@@ -13,7 +13,8 @@ PORTS = (30004, 30003, 30002, 30001, 29999)
 class Cable:
     """Passes every port of the arm at `far_end` on, `but` some; `address` is the near end. To be used as a context."""
 
-    def __init__(self, far_end: str, but: tuple[int, ...] = ()) -> None:
+    def __init__(self, far_end: str, but: tuple[int, ...] = (), silent: tuple[int, ...] = ()) -> None:
+        """A connection to a `silent` port is taken, and nothing comes of it."""
         ports = [port for port in PORTS if port not in but]
         self._far_end = far_end
         self._listeners: list[socket.socket] = []
@@ -21,6 +22,7 @@ class Cable:
             self.address = f"127.0.3.{number}"
             try:
                 self._listeners = [socket.create_server((self.address, port)) for port in ports]
+                self._deaf = [socket.create_server((self.address, port)) for port in silent]
                 break
             except OSError:
                 continue
@@ -46,7 +48,7 @@ class Cable:
         self._over.set()
         self._in.set()
         self._thread.join(5.0)
-        for end in (*self._listeners, *self._peers):
+        for end in (*self._listeners, *self._deaf, *self._peers):
             end.close()
 
     def _pass_on(self) -> None:

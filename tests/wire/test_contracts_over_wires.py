@@ -9,13 +9,17 @@ from pathlib import Path
 
 import pytest
 
+from cell.devices.makes import make_of
 from tests.wire.cells import served
 
 pytestmark = pytest.mark.wire
 
 
 def test_every_built_in_make_keeps_the_contract_of_its_kind(tmp_path: Path) -> None:
-    with served(tmp_path, "--seed", "4", "--level", "ideal"):
+    """The target camera on the frame stream, the scan camera on GigE Vision where Aravis is installed."""
+    gige = [] if make_of("camera", "gige").missing() else ["--gige", "scan"]
+    with served(tmp_path, "--seed", "4", "--level", "ideal", *gige) as endpoints:
+        assert endpoints["scan_camera"]["driver"] == ("gige" if gige else "stream")
         environment = {**os.environ, "CELL_CONTRACTS": "sim.toml", "CELL_CONTRACTS_MOTION": "1"}
         done = subprocess.run(
             [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs",

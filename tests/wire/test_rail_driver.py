@@ -529,8 +529,12 @@ def test_a_silent_module_is_a_deadline(bench: Bench) -> None:
 
 @pytest.fixture
 def module() -> Iterator[Callable[[Callable[[bytes], bytes]], str]]:
-    """Starts a module that gives `answer(request)` to each request; returns its URL."""
+    """Starts a module that gives `answer(request)` to each request, but tells its settings as they were set.
+
+    Returns its URL.
+    """
     listener = socket.create_server(("127.0.0.1", 0))
+    settings = {255: 1}
     threads: list[threading.Thread] = []
 
     def start(answer: Callable[[bytes], bytes]) -> str:
@@ -538,7 +542,10 @@ def module() -> Iterator[Callable[[Callable[[bytes], bytes]], str]]:
             connection, _ = listener.accept()
             with connection:
                 while request := connection.recv(9):
-                    connection.sendall(answer(request))
+                    if request[1] == 5:
+                        settings[request[2]] = int.from_bytes(request[4:8], "big", signed=True)
+                    told = request[1] == 6 and request[2] in settings
+                    connection.sendall(reply(request, settings[request[2]]) if told else answer(request))
 
         threads.append(threading.Thread(target=serve, daemon=True))
         threads[-1].start()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import struct
 import threading
@@ -54,6 +55,21 @@ def test_a_ramp_arrives_at_rest_within_its_limits(x0: float, v0: float, target: 
     assert np.max(np.abs(np.diff(states[:, 1]))) <= 2.0 * dt * (1 + 1e-9)
     assert np.max(np.abs(states[:, 1])) <= max(4.0, abs(v0)) + 1e-9
     np.testing.assert_allclose(np.diff(states[:, 0]), 0.5 * dt * (states[1:, 1] + states[:-1, 1]), atol=1e-6)
+
+
+@pytest.mark.parametrize("x0, v0, target", [(0.0, 0.0, 10.0), (0.0, 0.0, 0.3), (0.0, 3.0, 0.5), (2.0, -4.0, 8.0)])
+def test_a_ramp_of_six_points_changes_speed_by_each_of_its_slopes(x0: float, v0: float, target: float) -> None:
+    slopes = ramp.Slopes(up=2.0, down=1.0, first_speed=0.5, first_up=0.8, last_down=0.6)
+    pieces = ramp.to_position(0.0, x0, v0, target, 4.0, slopes)
+    assert pieces[-1].at(pieces[-1].t + 1.0) == pytest.approx((target, 0.0))
+    for piece, after in itertools.pairwise(pieces):
+        end = piece.at(after.t)
+        assert end == pytest.approx((after.x, after.v), abs=1e-6), "no jump"
+        if piece.a:
+            faster = abs(end[1]) > abs(piece.v)
+            below = max(abs(end[1]), abs(piece.v)) <= 0.5 + 1e-9
+            wanted = (0.8 if below else 2.0) if faster else (0.6 if below else 1.0)
+            assert abs(piece.a) == pytest.approx(wanted)
 
 
 def test_a_move_takes_the_time_of_its_trapezoid() -> None:
@@ -188,6 +204,20 @@ def test_the_vendors_client_homes_and_moves_the_rail(
     module.move_by(0, -5 * STEPS)
     until(clock, axis.get_position_reached)
     assert axis.actual_position == 20 * STEPS
+
+
+@pytest.mark.wire
+def test_the_ramp_has_the_names_of_the_vendors_library_and_is_none_until_it_is_set(
+    module: TMCM1260, model: RailModel
+) -> None:
+    axis = module.motors[0]
+    axis.linear_ramp.max_acceleration = 40 * STEPS
+    assert axis.get_axis_parameter(axis.AP.MaxDeceleration) < 40 * STEPS
+    for name, value in (("A1", 1000), ("V1", 2000), ("MaxDeceleration", 3000), ("D1", 4000)):
+        axis.set_axis_parameter(getattr(axis.AP, name), value)
+    found = model.settings
+    ramp_of_module = (found.first_acceleration, found.first_speed, found.max_deceleration, found.last_deceleration)
+    assert ramp_of_module == (1000, 2000, 3000, 4000)
 
 
 @pytest.mark.wire

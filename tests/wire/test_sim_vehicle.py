@@ -290,7 +290,10 @@ def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC) -> None:
 @pytest.mark.wire
 def test_the_version_is_answered(bus: can.BusABC, model: VehicleModel) -> None:
     bus.send(message(0x411, [1]))
-    assert receive(bus, lambda f: f.arbitration_id == 0x4A1).data == struct.pack(">4H", *model.params.versions)
+    assert receive(bus, lambda f: f.arbitration_id == 0x41A).data == struct.pack(">4H", *model.params.versions)
+    bus.send(message(0x4A1, [1]))
+    text = b"".join(receive(bus, lambda f: f.arbitration_id == 0x4A1).data for _ in range(10))
+    assert text.split() == [b"SIMULATED", b"HW2.1", b"CONTROLLER", b"204", b"DRIVERS", b"110"]
 
 
 @pytest.mark.wire

@@ -110,7 +110,7 @@ def enabled(bench: Bench) -> Bench:
 def test_the_vehicle_says_which_versions_it_has(bench: Bench) -> None:
     vehicle: Vehicle = bench.vehicle
     identity = vehicle.identity()
-    assert identity.firmware == "controller 204, drivers 110"
+    assert identity.firmware == "SIMULATED HW2.1 CONTROLLER 204 DRIVERS 110"
     assert identity.address == f"slcan:{bench.peer.channel}"
     assert 0.0 < vehicle.ping() < 0.5
     assert vehicle.statistics.round_trips_s

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.calibration.recorded.conventions import Reading
 from cell.calibration.recorded.series import Series
-from cell.calibration.solve.consistency import angle_apart
+from cell.calibration.solve.consistency import odd_turns, orders
 from cell.calibration.solve.hand_eye import park_martin
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
@@ -23,6 +23,8 @@ MOST_FRAMES = 24
 REWEIGHTINGS = 25
 # The size of the poses' unit is told from 0 by so many of its σ, and is that of the unit to this share.
 SCALE_SIGMAS, SCALE_WRONG = 4.0, 0.4
+# Boards further off than so many times the median, and than this share of their distance, have no say in it.
+FAR_RATIO, FAR_SHARE = 10.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,19 +72,23 @@ def fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], set
     found = []
     for side in SETUPS if setup is None else (setup,):
         flanges = [poses[k] if side == "eye_in_hand" else poses[k].inverse() for k in keys]
-        seen = _ordered(flanges, [boards[k] for k in keys])
+        options = [boards[k] for k in keys]
+        seen = [poses[turn] for poses, turn in zip(options, orders(flanges, options), strict=True)]
         rotation, turn, kept = _rotation(flanges, seen)
         reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))
         flanges, seen = [flanges[k] for k in kept], [seen[k] for k in kept]
         tried = []
         for unit, size in UNITS.items():
-            shift = float(np.median(_shifts(flanges, seen, rotation, size)[0]))
-            tried.append((shift, unit, size))
-        off, scale, sigma = _shifts(flanges, seen, rotation, None)
+            off = _shifts(flanges, seen, rotation, size)[0]
+            tried.append((float(np.median(off)), unit, size, off))
+        # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
+        off = min(tried, key=lambda t: t[0])[3]
+        near = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
+        off, scale, sigma = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
         # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
-        shift, unit, size = min(tried)
+        shift, unit, size, _ = min(tried, key=lambda t: t[0])
         if scale > 4 * sigma > 0:
-            shift, unit, size = min(tried, key=lambda t: abs(math.log(scale / t[2])))
+            shift, unit, size, _ = min(tried, key=lambda t: abs(math.log(scale / t[2])))
         score, best = turn + shift / reach, float(np.median(off))
         if abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma:
             # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
@@ -91,22 +97,11 @@ def fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], set
     return found
 
 
-def _ordered(flanges: Sequence[pin.SE3], options: Sequence[list[pin.SE3]]) -> list[pin.SE3]:
-    """Of boards that look the same turned, the order that goes with the flange's turns."""
-    chosen: list[pin.SE3] = []
-    for flange, poses in zip(flanges, options, strict=True):
-        if chosen and len(poses) > 1:
-            before = list(zip(flanges, chosen, strict=False))
-            misfit = [np.median([angle_apart(flange, pose, f, p) for f, p in before]) for pose in poses]
-            chosen.append(poses[int(np.argmin(misfit))])
-        else:
-            chosen.append(poses[0])
-    return chosen
-
-
 def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Array, float, list[int]]:
     """flange_from_camera (3, 3), median turn in rad of the boards in the base, and the frames that agree."""
-    kept = list(range(len(flanges)))
+    # What turned by another angle than the board did is of another frame, whatever the hand-eye: it would bend it.
+    odd = odd_turns(flanges, boards)
+    kept = [k for k in range(len(flanges)) if k not in odd]
     rotation, turn = np.eye(3), math.inf
     for _ in range(3):
         rotation = park_martin([flanges[k] for k in kept], [boards[k] for k in kept])

@@ -140,7 +140,11 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
         if np.linalg.norm(metres.translation) > FARTHEST_M:
             if frame.reason is None:
                 far = float(np.linalg.norm(metres.translation))
-                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: the flange is {far:.0f} m from the base")
+                frame.refuse(
+                    Reason.NO_POSE,
+                    f"{frame.pose_from}: the flange is {far:.0f} m from the base, read in {best.unit} like the others "
+                    f"(allowed {FARTHEST_M:.0f} m): is its position in another unit? Correct it",
+                )
             continue
         if not refused:
             frame.base_from_flange = metres

@@ -24,6 +24,7 @@ from cell.calibration.recorded.result import (
     hand_eye_dict,
     plane_dict,
     seen_depths,
+    setup_note,
 )
 from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, SHARED, stripe_block
 from cell.calibration.solve.checks import Check
@@ -37,6 +38,7 @@ from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes
 from cell.calibration.solve.scale import Scale, metric_scale
 from cell.calibration.solve.starts import stripe_means
 from cell.geometry.camera import PARAMETER_NAMES
+from cell.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
 Setup = str
@@ -223,9 +225,11 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
     """Put camera, hand-eye, light plane, noise and flatness into the result, lengths in mm."""
     best, choice = chain.choice.best, chain.choice
     adjusted, state, sigma = best.adjusted, best.adjusted.state, best.sigma
+    # Board and hand-eye belong to one camera: that which is reported.
     boards = [
-        o.base_from_flange * state.flange_from_camera * board
-        for o, board in zip(chain.observations, chain.staged.camera_from_board, strict=True)
+        o.base_from_flange * state.flange_from_camera * board_pose(o.view, state.camera).camera_from_board
+        for o in chain.observations
+        if o.view is not None
     ]
     apart = [b.translation - state.base_from_board.translation for b in boards]
     turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]
@@ -266,11 +270,7 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         ],
         "chi2_per_dof": finite(adjusted.chi2_per_dof),
     }
-    if chain.setup == "eye_to_hand":
-        result["notes"].append(
-            "by the poses the camera stands still and the board moves with the flange; if the camera rides on the "
-            "flange, the poses are those of the base in the flange (inverse)"
-        )
+    result["notes"] += setup_note(chain.setup, state.flange_from_camera)
     _report_plane(chain, result)
 
 

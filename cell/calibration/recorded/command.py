@@ -10,10 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pinocchio as pin
+
 from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.conventions import check_reading
 from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
-from cell.calibration.recorded.listing import list_folder
+from cell.calibration.recorded.listing import Listing, list_folder
+from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, match_series, read_series
@@ -52,13 +55,13 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     options = options or Options()
     check_reading(options.poses)
     pairs = read_pose_pairs(folder) if folder.is_dir() else []
-    if spec is None:
-        if not pairs:
-            raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
-        return calibrate_pairs(pairs)
+    if spec is None and pairs:
+        return _of_pairs(pairs, options)
     listing = list_folder(folder)
-    if pairs and not listing.pictures:
-        return calibrate_pairs(pairs)
+    if not listing.pictures and listing.texts:
+        return _of_pairs(pairs, options) if pairs else _from_tables(listing, options)
+    if spec is None:
+        raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     frames, channel = read_frames(listing, spec, links, options.laser)
@@ -69,6 +72,22 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     _from_frames(frames, belonging, options, result)
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
+    return result
+
+
+def _of_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]], options: Options) -> dict[str, Any]:
+    result = calibrate_pairs(pairs)
+    if options.plan:
+        result |= {"hand_eye": None, "checks": [], "refused": {}, "refused_values": {}}
+    return result
+
+
+def _from_tables(listing: Listing, options: Options) -> dict[str, Any]:
+    """The hand-eye from a table of the arm's poses and one of the board's."""
+    pairs, about, unread = pairs_of_tables(listing, options)
+    result = _of_pairs(pairs, options)
+    result["poses"] = about
+    result["unread"] = [{"name": name, "reason": reason} for name, reason in unread]
     return result
 
 

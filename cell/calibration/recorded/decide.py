@@ -7,7 +7,7 @@ board then scatters in the base tells how well they agree. A reading is taken wh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -15,10 +15,16 @@ import pinocchio as pin
 from cell.calibration.recorded.agreement import SCALE_SIGMAS, Fit, angle, fits_of
 from cell.calibration.recorded.conventions import readings_of, why_not
 from cell.calibration.recorded.series import Series
+from cell.calibration.solve.consistency import turns_apart
 from drivers.errors import RefusedError
 
 # The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
 CLEAR, AGREES = 2.5, 0.06
+# … or leave as much turn and so many times the shift, of at least this share of the distance: an inverse turns alike.
+AS_MUCH, CLEAR_SHIFT, LEAST_SHIFT = 0.95, 5.0, 0.002
+# Poses that are shifted by one picture are named when they then agree so much better, in so many frames.
+SHIFTED, LEAST_SHIFTED = 0.5, 6
+QUICK_LOOK, ALIKE = 24, 0.2
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
 # … and where that other size leaves no more than this share of the scatter.
@@ -52,11 +58,13 @@ def decide(
     wanted: str | None = None,
     setup: str | None = None,
     in_order: Sequence[Series] = (),
+    shifts: Sequence[int] = (1, -1),
 ) -> Decision:
     """The reading of the series that agrees with the boards that frames (by index) saw, in each order they allow.
 
     `pitch` of the board in m, as it was named. `in_order` are the same poses, given to the pictures in order and not by
-    their names: they are taken where they agree, and clearly better.
+    their names: they are taken where they agree, and clearly better. `shifts`: where nothing agrees it is asked whether
+    poses and pictures are shifted by so many.
 
     Raises RefusedError when none does, or when two do that mean different things; its text names the option to give.
     """
@@ -77,12 +85,19 @@ def decide(
             raise RefusedError(f"read as {other.text}, {scale_problem(other, pitch)[0]}")
         raise RefusedError(
             f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
-            "scatter; are they the poses of these pictures, of the flange, and is the board's pitch right?"
+            f"scatter; {_shifted(series, boards, wanted, setup, shifts)}"
         )
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
-    if rival is not None and rival.score < CLEAR * best.score:
+    if rival is not None and not clearly_worse(rival, best):
         raise RefusedError(_question(best, rival))
     return Decision(best, rival, by_name)
+
+
+def clearly_worse(rival: Fit, best: Fit) -> bool:
+    """True where a reading leaves so much more that it cannot be meant, in all or in where it puts the board."""
+    return rival.score >= CLEAR * best.score or (
+        rival.turn >= AS_MUCH * best.turn and rival.shift >= CLEAR_SHIFT * max(best.shift, LEAST_SHIFT * best.reach)
+    )
 
 
 def _all_fits(
@@ -98,6 +113,47 @@ def _all_fits(
             except RefusedError as error:
                 problems.append(str(error))
     return sorted(fits, key=lambda f: f.score), problems
+
+
+def _shifted(
+    series: Sequence[Series],
+    boards: dict[int, list[pin.SE3]],
+    wanted: str | None,
+    setup: str | None,
+    shifts: Sequence[int],
+) -> str:
+    """The question that poses ask which agree with no picture: do they agree with the pictures before or after?"""
+    for step in shifts:
+        moved = []
+        for one in series:
+            keys = sorted(one.of)
+            of = {k: one.of[keys[i + step]] for i, k in enumerate(keys) if 0 <= i + step < len(keys)}
+            moved.append(replace(one, of=of))
+        if not _turn_alike(moved, boards, wanted):
+            continue
+        fits, _ = _all_fits(moved, boards, wanted, setup)
+        if fits and fits[0].score < SHIFTED * AGREES and len(boards) >= LEAST_SHIFTED:
+            return (
+                f"with the pose of the {'next' if step > 0 else 'previous'} picture, {fits[0].text}, they leave "
+                f"{fits[0].left}: are poses and pictures shifted by one, and one of either missing? Number them anew"
+            )
+    angles = any(one.count == 6 for one in series)
+    return (
+        f"are they the poses of these pictures, of the flange{' (and not joint angles)' if angles else ''}, and is the "
+        "board's pitch right?"
+    )
+
+
+def _turn_alike(series: Sequence[Series], boards: dict[int, list[pin.SE3]], wanted: str | None) -> bool:
+    """True where the flange turned as the board did in a reading of the poses: a quick look before all are tried."""
+    for one in series:
+        keys = sorted(one.of.keys() & boards.keys())[:QUICK_LOOK]
+        for reading in readings_of(one.count, one.named, wanted):
+            poses = one.poses(reading)
+            both = [k for k in keys if k in poses]
+            if len(both) > 2 and turns_apart([poses[k] for k in both], [boards[k][0] for k in both]) < ALIKE:
+                return True
+    return False
 
 
 def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.result import closed_form_dict, empty_result, hand_eye_dict
+from cell.calibration.recorded.result import closed_form_dict, empty_result, hand_eye_dict, setup_note
 from cell.calibration.recorded.solution import apply_checks
 from cell.calibration.recorded.stops import counted, mean_pair, pairs_by_stop
 from cell.calibration.solve.checks import Check
 from cell.calibration.solve.consistency import misplacements, odd_turns
 from cell.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
+from cell.calibration.solve.scale import metric_scale
 from cell.geometry.camera import Array
 from cell.geometry.poses import difference
 from cell.vision.pictures import Reason
@@ -75,8 +76,12 @@ def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
         "frames": len(kept),
         "closed_form": closed_form_dict(setup, closed),
     }
-    result["notes"].append("pairs of poses only: no intrinsics, no light plane, no flatness")
-    apply_checks(_checks(refined, closed, sigma, off, boards), result)
+    result["notes"] += [
+        *setup_note(setup, refined.flange_from_camera),
+        "pairs of poses only: no intrinsics, no light plane, no flatness",
+    ]
+    scale = metric_scale(flanges, boards)
+    apply_checks(_checks(refined, closed, sigma, off, boards) + ([] if scale is None else [scale.check()]), result)
     return result
 
 

@@ -18,6 +18,8 @@ from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.vision.board.spec import BoardSpec
 
+FAR_CAMERA_M = 0.8
+
 
 def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
     """The keys of every result, nothing known yet."""
@@ -122,6 +124,23 @@ def hand_eye_dict(setup: str, pose: pin.SE3) -> dict[str, Any]:
         "rotation_vector_rad": pin.log3(r).tolist(),
         "euler_xyz_rad": [first, middle, last],
     }
+
+
+def setup_note(setup: str, pose: pin.SE3) -> list[str]:
+    """What the poses cannot tell: whether they are base_from_flange, or the base in the flange."""
+    if setup == "eye_to_hand":
+        return [
+            "by the poses the camera stands still and the board moves with the flange; if the camera rides on the "
+            "flange, the poses are those of the base in the flange (inverse)"
+        ]
+    far = float(np.linalg.norm(pose.translation))
+    if far < FAR_CAMERA_M:
+        return []
+    return [
+        f"doubt: the camera would ride on the flange {far:.2f} m away from it (usual: below {FAR_CAMERA_M:.1f} m); "
+        "does it stand still, and the board move with the flange? Then the poses are those of the base in the flange: "
+        "invert them"
+    ]
 
 
 def plane_dict(plane: LightPlane) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from cell.calibration.recorded.listing import PICTURES
 from cell.calibration.recorded.records import COUNTS, Content, Record, file_like, named_numbers
+from cell.calibration.recorded.several_lines import read_several_lines
 
 NUMBER = r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)"
 # No position is as large: what stands in front of a pose is a time.
@@ -22,7 +23,7 @@ def read_table(path: Path, text: str, content: Content) -> None:
     lines = [line.strip(" \r") for line in text.splitlines() if line.strip() and line.strip()[:1] not in "#%"]
     cells = [_cells(line) for line in lines]
     rows = [[c for c in row if c] for row in cells]
-    if _blocks(path, rows, content):
+    if _blocks(path, rows, content) or read_several_lines(path, [_apart(row) for row in rows], content):
         return
     header = None
     if len(rows) > 1 and not any(_number(c) is not None for c in rows[0]):
@@ -48,6 +49,12 @@ def read_table(path: Path, text: str, content: Content) -> None:
         if record is None:
             raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; a pose has 6, 7, 12 or 16")
         content.records.append(record)
+
+
+def _apart(row: list[str]) -> tuple[list[str], list[float]]:
+    """The words and the numbers of a row."""
+    found = [(cell, _number(cell)) for cell in row]
+    return [cell for cell, value in found if value is None], [value for _, value in found if value is not None]
 
 
 def _blocks(path: Path, rows: list[list[str]], content: Content) -> bool:

@@ -7,7 +7,6 @@ the hand-eye. It also settles the order of boards that look the same turned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
@@ -29,37 +28,48 @@ MISPLACED_SHARE, MISPLACED_RATIO = 0.008, 6.0
 LEAST_JUDGES = 5
 """Others that a frame has to disagree with before it is blamed: of fewer, any may be the one that is wrong."""
 REWEIGHTINGS = 40
-ORDER_ROUNDS = 5
+ORDER_ROUNDS, REFERENCES = 5, 12
 LEAST_OFF_M = 1e-4
 
 
 def settle_orders(frames: Sequence[RecordedFrame], camera: CameraModel) -> None:
-    """Give boards that look the same turned the order that agrees with the flange's turns.
-
-    Frame after frame at first, then each against all others until none changes. The first frame's order stands.
-    """
+    """Give boards that look the same turned the order that agrees with the flange's turns."""
     options = [[] if f.view is None else f.view.turns() for f in frames]
     if all(len(views) < 2 for views in options):
         return
     poses = [[board_pose(view, camera).camera_from_board for view in views] for views in options]
-    flanges = [f.base_from_flange for f in frames]
-    chosen = [0] * len(frames)
-
-    def best(k: int, others: Sequence[int]) -> int:
-        misfit = [np.median([angle_apart(flanges[k], pose, flanges[j], poses[j][chosen[j]]) for j in others])
-                  for pose in poses[k]]  # fmt: skip
-        return int(np.argmin(misfit))
-
-    for k in range(1, len(frames)):
-        chosen[k] = best(k, range(k))
-    for _ in range(ORDER_ROUNDS):
-        before = list(chosen)
-        for k in range(1, len(frames)):
-            chosen[k] = best(k, [j for j in range(len(frames)) if j != k])
-        if chosen == before:
-            break
+    chosen = orders([f.base_from_flange for f in frames], poses)
     for frame, views, turn in zip(frames, options, chosen, strict=True):
         frame.view = views[turn]
+
+
+def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> list[int]:
+    """Which of the poses (camera_from_board) that a board may have goes, in each frame, with the flange's turns.
+
+    Each of some frames is taken for right in turn, so that none has to be; what most frames agree with is kept. All
+    boards turned together are the same: then the first frame keeps its first pose.
+    """
+    of = np.repeat(np.arange(len(options)), [len(poses) for poses in options])
+    first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
+    apart = np.abs(_turns([flanges[k] for k in of.tolist()]) - _turns([pose for poses in options for pose in poses]))
+    best: tuple[float, int, list[int]] | None = None
+    references: list[int] = np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist()
+    for k in references:
+        for right in range(len(options[k])):
+            reference = apart[first[k] + right]
+            chosen = [int(np.argmin(reference[a : a + len(p)])) for a, p in zip(first, options, strict=True)]
+            for _ in range(ORDER_ROUNDS):
+                before, among = chosen, first + chosen
+                typical = np.median(apart[:, among], axis=1)
+                chosen = [int(np.argmin(typical[a : a + len(p)])) for a, p in zip(first, options, strict=True)]
+                if chosen == before:
+                    break
+            among = first + chosen
+            misfit = float(np.sum(np.median(apart[np.ix_(among, among)], axis=1)))
+            if best is None or (round(misfit, 9), chosen[0]) < best[:2]:
+                best = round(misfit, 9), chosen[0], chosen
+    assert best is not None
+    return best[2]
 
 
 def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:
@@ -89,7 +99,8 @@ def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> li
             frame.refuse(
                 Reason.NO_POSE,
                 f"the flange pose puts the board {1e3 * off:.0f} mm from where the other frames see it, which agree "
-                f"to {1e3 * others:.1f} mm: is it the pose of another frame, or had the board moved?",
+                f"to {1e3 * others:.1f} mm: is it the pose of another frame, had the board moved, or is the picture "
+                "cropped or scaled?",
             )
     return [f for f in frames if f.reason is None]
 
@@ -100,9 +111,7 @@ def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int
     Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
     """
     count = len(flanges)
-    apart: Array = np.zeros((count, count))
-    for i, j in combinations(range(count), 2):
-        apart[i, j] = apart[j, i] = angle_apart(flanges[i], boards[i], flanges[j], boards[j])
+    apart: Array = np.abs(_turns(flanges) - _turns(boards))
     odd: dict[int, float] = {}
     index = list(range(count))
     while len(index) > 2:
@@ -171,6 +180,23 @@ def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
         solution = np.linalg.lstsq((design * root[:, :, None]).reshape(-1, 6), -(known * root).ravel(), rcond=None)[0]
         off = np.linalg.norm(design @ solution + known, axis=1)
     return off
+
+
+def turns_apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> float:
+    """By how much the flange and the board turned differently between each two frames, as a share of the turn (median).
+
+    A reading in which nothing turns agrees with nothing: its share is 1 as well.
+    """
+    pairs = np.triu_indices(len(flanges), 1)
+    hand, eye = _turns(flanges)[pairs], _turns(boards)[pairs]
+    return float(np.median(np.abs(hand - eye) / np.maximum(np.maximum(hand, eye), LEAST_ANGLE)))
+
+
+def _turns(poses: Sequence[pin.SE3]) -> Array:
+    """Angles (n, n) in rad between the rotations of each two poses."""
+    rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    return np.asarray(np.arccos(np.clip(0.5 * (traces - 1), -1.0, 1.0)))
 
 
 def angle_apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:

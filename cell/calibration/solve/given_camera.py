@@ -26,14 +26,15 @@ USUAL_SHARE = 0.01
 def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Intrinsics, list[Check]]:
     """The given camera with the deviation that its difference from the pictures' camera makes likely, and the check.
 
-    `views` are of different stops. With fewer than four nothing can be said: the deviation stays 0, and no check.
+    `views` are of different stops. With fewer than four, or where they give no camera, it is taken to be off by what
+    is usual since a camera was calibrated, and that is doubtful.
     """
-    if len(views) < LEAST_LEFT_OUT:
-        return given, []
     try:
+        if len(views) < LEAST_LEFT_OUT:
+            return _unchecked(given, f"{len(views)} stops do not tell another camera from this one")
         pictures = beside_given(given.camera, views)
-    except (RefusedError, np.linalg.LinAlgError):
-        return given, []
+    except (RefusedError, np.linalg.LinAlgError) as error:
+        return _unchecked(given, f"the pictures give no camera to compare with ({error})")
     apart = given.camera.parameters[:4] - pictures.camera.parameters[:4]
     sigma = np.maximum(pictures.sigma[:4], 1e-9)
     focal = given.camera.parameters[[0, 1, 0, 1]]
@@ -50,5 +51,17 @@ def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Int
         f"{PARAMETER_NAMES[worst]} is given as {given.camera.parameters[worst]:.1f} px, these pictures have "
         f"{pictures.camera.parameters[worst]:.1f} ± {sigma[worst]:.1f} px: is it the file of another camera, focus, "
         "picture size or crop? Leave --camera out, or calibrate the camera anew",
+    )  # fmt: skip
+    return replace(given, sigma=np.sqrt(np.diag(covariance)), covariance=covariance), [check]
+
+
+def _unchecked(given: Intrinsics, why: str) -> tuple[Intrinsics, list[Check]]:
+    """The given camera where nothing speaks for or against it."""
+    covariance = given.covariance.copy()
+    covariance[:4, :4] += np.diag((USUAL_SHARE * given.camera.parameters[[0, 1, 0, 1]]) ** 2)
+    check = Check(
+        "intrinsics", "given camera, not checked", 1.0, 0.5, np.inf, "",
+        f"{why}; focal length and principal point are taken to be off by {100 * USUAL_SHARE:.0f} % of the focal length "
+        f"since it was calibrated; take {LEAST_LEFT_OUT} stops or more, the board tilted to several sides",
     )  # fmt: skip
     return replace(given, sigma=np.sqrt(np.diag(covariance)), covariance=covariance), [check]

@@ -30,6 +30,8 @@ TANGENTIAL_VIEWS = 12
 ROUNDS = 3
 # A term beyond the first ones has to predict left-out views better by this share, and by this many of its deviations.
 CLEARLY_BETTER, CLEAR_DEVIATIONS = 0.005, 1.0
+AS_GOOD = 1.02
+"""A lens predicts left-out views as well as another one up to this ratio."""
 CENTRED_LENS = 0.002
 """Deviation of p1 and p2 of a lens that nothing is known of; the makers centre their lenses."""
 
@@ -144,7 +146,13 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     if one.held_out <= best.held_out:
         best = one
     tried = {fit.model.name: float(np.sqrt(2)) * fit.held_out for fit in fits}
-    return _intrinsics(best, views, tried), _intrinsics(plain, views, tried)
+    other = None
+    if len(views) < TANGENTIAL_VIEWS:
+        # A lens that is off its axis cannot be told from a few views, nor that it is not: what it moves is not known.
+        tilted = _fitted(replace(best.model, tangential=True), best.camera, data)
+        if tilted.held_out <= AS_GOOD * best.held_out:
+            other = tilted.camera
+    return _intrinsics(best, views, tried, other), _intrinsics(plain, views, tried)
 
 
 def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:

@@ -12,7 +12,8 @@ from cell.calibration.solve.blocks import HAND, SHARED, State
 from cell.calibration.solve.bow import FLAT
 from cell.calibration.solve.joint import Joint, effective_hand_eye_covariance
 from cell.calibration.solve.reference import Reference
-from cell.calibration.witness import Pointing, Witness, turned
+from cell.calibration.timing import Timing
+from cell.calibration.witness import ConfirmedTurn, Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.covariance import covariance_root
 from cell.geometry.light_plane import LightPlane
@@ -60,7 +61,8 @@ class ScanCalibration:
     `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain` (21,) how the
     other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual. With a
     `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
-    camera's frame.
+    camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the camera's
+    time stamps were found to come.
     """
 
     camera: CameraModel
@@ -76,6 +78,8 @@ class ScanCalibration:
     witness: Witness | None = None
     pointing: Pointing | None = None
     exit_point: Array = field(default_factory=lambda: np.zeros(3))
+    confirmed: ConfirmedTurn | None = None
+    timing: Timing | None = None
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:
@@ -138,8 +142,9 @@ class ScanCalibration:
         return made
 
     def as_dict(self) -> dict[str, Any]:
-        """For storage."""
-        return {
+        """For storage. What was found out since the calibration has its key only where there is any."""
+        found = {"confirmed": self.confirmed, "timing": self.timing}
+        return {name: one.as_dict() for name, one in found.items() if one is not None} | {
             "camera": _camera_dict(self.camera),
             "light_plane": {
                 "normal": list(self.light_plane.normal),
@@ -173,6 +178,8 @@ class ScanCalibration:
             np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
             tuple(data.get("notes", ())),
             Witness.read(data.get("witness")),
+            confirmed=ConfirmedTurn.read(data.get("confirmed")),
+            timing=Timing.read(data.get("timing")),
         )
 
 

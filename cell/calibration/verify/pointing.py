@@ -13,7 +13,7 @@ import numpy as np
 
 from cell.calibration.solve.blocks import HAND, PLANE, SHARED, State, tangents
 from cell.calibration.verify.evidence import Evidence
-from cell.calibration.witness import NOTED_RAD, Pointing, turned
+from cell.calibration.witness import LARGEST_RAD, NOTED_RAD, ConfirmedTurn, Pointing, turned
 from cell.geometry.camera import Array
 
 APART = 3.5
@@ -55,6 +55,17 @@ class WitnessCheck:
     def corrects(self) -> bool:
         """True when the laser has turned, as the board says, too, so that jobs are right to allow for it."""
         return abs(self.plate.turn) > NOTED_RAD and not self.plate_moved
+
+    def confirmation(self, made: float) -> ConfirmedTurn | None:
+        """The turn as the board measured it, to be kept for jobs; `made` in seconds since the epoch.
+
+        None where there is nothing to confirm, or the board is no judge: it contradicts the plate, tells less than a
+        job needs, or shows more than warmth does to a laser.
+        """
+        board = self.board
+        if not self.corrects or board.sigma > NOTED_RAD or abs(board.turn) > LARGEST_RAD:
+            return None
+        return ConfirmedTurn(self.plate.turn, board.turn, board.sigma, made)
 
     @property
     def words(self) -> str:

@@ -121,7 +121,9 @@ class Verification:
         if self.witness is None or not (self.plate_moved or self.witness.corrects):
             return self._decision
         if self.witness.corrects:
-            return f"{self._decision}. The laser has turned, {self.witness.words}: jobs allow for it"
+            by_board = self.good and self.witness.confirmation(0.0) is not None
+            how = "by the board's figure, which is kept with the calibration" if by_board else "by the plate's"
+            return f"{self._decision}. The laser has turned, {self.witness.words}: jobs allow for it {how}"
         return (
             "the plate on the claw that shows where the laser points (laser.witness) has moved, not the laser: "
             f"it has turned {self.witness.words}, and jobs that believe the plate put the place "

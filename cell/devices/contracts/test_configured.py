@@ -99,6 +99,14 @@ class TestVehicle(_Configured, VehicleContract):
 
     NAME = "vehicle"
 
+    @pytest.fixture(scope="class")
+    @classmethod
+    def bench(cls, configured: CellConfig) -> Iterator[Bench[Any]]:
+        """The vehicle, where there is one that drives."""
+        if not configured.vehicle.DRIVES:
+            pytest.skip("the arm stands on a fixed frame: there is no vehicle")
+        yield from bench_of(configured, cls.NAME)
+
 
 class TestScanCamera(_Configured, CameraContract):
     """The camera on the rail."""

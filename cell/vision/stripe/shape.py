@@ -82,7 +82,10 @@ def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> 
     band = np.zeros((4, size))
     for k in range(4):
         band[3 - k, k:] = normal.diagonal(k)
-    typical = float(np.median(band[3]))
+    # Of a stripe that is narrow in a wide reach most splines have no sample.
+    typical = float(np.median(band[3][band[3] > 0])) if np.any(band[3] > 0) else 0.0
+    if typical == 0:
+        return gaussian(width, reach)
     rough = np.diff(np.eye(size), 3, axis=0)
     penalty = typical * (SMOOTHING * rough.T @ rough + RIDGE * np.eye(size))
     for k in range(4):

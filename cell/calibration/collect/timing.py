@@ -1,0 +1,118 @@
+"""Sweeps to and fro over the fine board, laser off: what the lateness of the camera's time stamps is found from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
+from cell.calibration.store import CellCalibration
+from cell.calibration.timing import Timing
+from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_timing
+from cell.config import CellConfig
+from cell.devices.devices import Devices
+from cell.geometry.poses import from_ur
+from cell.steps.camera_poses import rail_ends, verification_views
+from cell.steps.moves import HOME, Mover
+from cell.vision import BoardSpec, find_board, parse_board
+from drivers.errors import DeviceFault, RefusedError
+
+SLOW_SHARE = 0.25
+"""Of the rail's highest speed: what does not grow with the speed is no lateness."""
+EXPOSURES = 0.25, 0.5
+"""Of what photographs of a board at rest are exposed: short, for the board is smeared by what it moves meanwhile."""
+FRAMES = 7
+"""Of each sweep, about."""
+STAGGER_M = 4e-3
+"""By up to so much one sweep lies beside another along the rail."""
+GOLDEN = 0.618
+"""Multiples of it, less whole numbers, are spread evenly."""
+MOST_MOVED_M = 1e-4
+
+
+def collect_timing(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    check: Check,
+    progress: Progress,
+    keep: Keep,
+) -> Timing:
+    """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
+
+    Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
+    """
+    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
+    view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
+    assert calibration.scan.reference is not None
+    base_from_board = calibration.scan.reference.base_from_board
+    ends = rail_ends(calibration.scan, base_from_board, view, fine, config.rail.travel)
+    if not devices.rail.state().homed_here:
+        progress(0.0, "homing the rail")
+        devices.rail.home().wait(60.0)
+    mover.to_joints(HOME)
+    move_to_view(devices, mover, view, 0)
+    base_from_flange = from_ur(devices.arm.state().flange)
+    fast, (short, long) = config.rail.max_speed, (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    slow = SLOW_SHARE * fast
+    # The clocks are compared before each sweep, and differ by what that leaves open: many short sweeps, not few long.
+    pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
+    pairs.append((fast, short))
+    plan = [(speed, exposure, way) for speed, exposure in pairs for way in (1, -1)]
+    sweeps = []
+    for k, (speed, exposure, way) in enumerate(plan):
+        check()
+        progress(k / len(plan), f"fine board, sweep {k + 1} of {len(plan)}")
+        # Pictures at other places each time: an error of the screw that they share would pass for lateness.
+        inner = STAGGER_M * (k * GOLDEN % 1.0)
+        between = (ends[0] + inner, ends[1] - STAGGER_M + inner)[::way]
+        sweeps.append(_swept(devices, fine, between, speed, exposure, keep, f"timing-{k + 1:02d}"))
+    moved = float(np.linalg.norm(from_ur(devices.arm.state().flange).translation - base_from_flange.translation))
+    if moved > MOST_MOVED_M:
+        raise DeviceFault(
+            devices.arm.name,
+            "arm.moved_in_sweep",
+            f"the flange moved by {1e3 * moved:.2f} mm during the sweeps, allowed {1e3 * MOST_MOVED_M:.1f} mm",
+            recoverable=True,
+            hint="See what pushed the arm; the sweeps are of no use.",
+        )
+    return find_timing(calibration.scan, base_from_flange, sweeps, config.scan_camera.late, config.rail.lead)
+
+
+def _swept(
+    devices: Devices, board: BoardSpec, ends: Sequence[float], speed: float, exposure: float, keep: Keep, what: str
+) -> TimedSweep:
+    """One sweep from end to end, and what its pictures show of the board."""
+    rail, camera = devices.rail, devices.scan_camera
+    start, stop = ends
+    rail.move_to(rail.sweep_start(start, stop, speed)).wait(30.0)
+    camera.configure(exposure, min(FRAMES * speed / abs(stop - start), 0.8 / exposure))
+    seen = []
+    with camera.stream() as frames:
+        sweep = rail.sweep(start, stop, speed)
+        end = np.inf
+        for frame in frames:
+            if sweep.done and end == np.inf:
+                sweep.wait(1.0)
+                end = sweep.window[1]
+            if frame.mid_exposure > end:
+                break
+            keep(what, frame)
+            seen.append(frame)
+    begin, end = sweep.window
+    made, refused = [], ""
+    for frame in seen:
+        if not begin <= frame.mid_exposure <= end:
+            continue
+        try:
+            made.append(TimedFrame(find_board(frame.image, board), sweep.position_at(frame.mid_exposure)))
+        except RefusedError as error:
+            refused = str(error)
+    if not made:
+        raise RefusedError(
+            f"no picture of a sweep over the fine board shows it ({refused or 'none came'}); clean it, see that it is "
+            "lit, and that scan_camera.photo_exposure is enough for a quarter of it"
+        )
+    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made)

@@ -1,0 +1,63 @@
+"""How late the scan camera's time stamps come against the rail's positions, as kept with a calibration.
+
+Found by `cell.calibration.timing_fit`, from sweeps of `cell.calibration.collect.timing`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The camera's stamps come `late` ± `sigma` s after the exposures that the rail's positions are told for.
+
+    `play` ± `play_sigma` m is by how much the carriage stands otherwise when it came from the other side; `readout` ±
+    `readout_sigma` s from the first row's exposure to the last one's; `by_exposure` s of lateness per s of exposure.
+    `made` is in seconds since the epoch.
+    """
+
+    late: float
+    sigma: float
+    play: float
+    play_sigma: float
+    readout: float
+    readout_sigma: float
+    by_exposure: float
+    made: float
+
+    def as_dict(self) -> dict[str, float]:
+        """For storage."""
+        return dict(vars(self))
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Timing | None:
+        """From storage; KeyError, TypeError or ValueError when it is none."""
+        if data is None:
+            return None
+        made = cls(**{name: float(data[name]) for name in cls.__dataclass_fields__})
+        if not (np.isfinite(list(vars(made).values())).all() and made.sigma > 0):
+            raise ValueError(f"time stamps that are {made.late} ± {made.sigma} s late")
+        return made
+
+    @property
+    def date(self) -> str:
+        """When it was made, for people."""
+        return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made))
+
+    def summary(self) -> dict[str, Any]:
+        """For reports and people, units in the names."""
+        return {
+            "late_ms": round(1e3 * self.late, 4),
+            "sigma_ms": round(1e3 * self.sigma, 4),
+            "play_um": round(1e6 * self.play, 2),
+            "play_sigma_um": round(1e6 * self.play_sigma, 2),
+            "readout_ms": round(1e3 * self.readout, 4),
+            "readout_sigma_ms": round(1e3 * self.readout_sigma, 4),
+            "late_per_exposure": round(self.by_exposure, 4),
+            "date": self.date,
+        }

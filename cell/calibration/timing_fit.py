@@ -1,0 +1,175 @@
+"""How late the scan camera's time stamps are against the rail's positions, from sweeps to and fro over a board at rest.
+
+What a camera holds back before it stamps a frame looks, in one sweep, like a shift of the whole scan. Swept the other
+way it is a shift to the other side, and it grows with the speed, which the play of a screw does not. How it differs
+between two exposures tells where in an exposure the stamp is put, and how it differs from row to row whether the camera
+has a rolling shutter. docs/theory.md, section 10.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.observations import ScanObservation
+from cell.calibration.solve.blocks import BOARD, POSITION, State, dots_block
+from cell.calibration.solve.results import ScanCalibration
+from cell.calibration.timing import Timing
+from cell.calibration.verify.evidence import dots_of
+from cell.geometry.camera import Array
+from cell.vision import BoardView
+from drivers.errors import CalibrationStale, Measured, RefusedError
+
+LEAST_FRAMES = 4
+"""Of one sweep."""
+WANTED_S = 0.2e-3
+"""One standard deviation at most: with more, one goes on with what the configuration says."""
+SURE = 5.0
+"""Standard deviations beyond which a shutter or a stamp is told to be another than the cell reckons with."""
+LEAST_READOUT_S = 0.5e-3
+BY_EXPOSURE = 0.25
+"""Cameras stamp the beginning, the middle or the end of an exposure: 0, 0.5 or 1 of its length later."""
+_TIME_S, _PLACE_M = 0.15e-3, 1e-6
+"""About what a sweep's times and its places scatter by: only their ratio counts, what they are shows in the sweeps."""
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame:
+    """A picture of the board from a moving rail: what it shows, and the rail's reading, m, at its stamped middle."""
+
+    view: BoardView
+    rail: float
+
+
+@dataclass(frozen=True, eq=False)
+class TimedSweep:
+    """The frames of one sweep over the board at `velocity` m/s, negative backwards, each exposed for `exposure` s; the
+    camera's clock was known to ±`bound` s."""
+
+    velocity: float
+    exposure: float
+    bound: float
+    frames: Sequence[TimedFrame]
+
+
+def find_timing(
+    scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep], most_late: float, lead: float
+) -> Timing:
+    """From sweeps at two speeds and two exposures, to and fro, the arm standing at `base_from_flange`.
+
+    The rail's screw moves the carriage by `lead` m a turn.
+
+    Raises `RefusedError` for a rolling shutter, for stamps that depend on the exposure, for ones later than `most_late`
+    s, and when the sweeps differ among themselves by more than `WANTED_S` leaves room for.
+    """
+    if scan.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference, an older program made it; run `cell calibrate`"
+        )
+    for sweep in sweeps:
+        if len(sweep.frames) < LEAST_FRAMES:
+            raise RefusedError(
+                f"{len(sweep.frames)} pictures of the sweep at {1e3 * sweep.velocity:+.0f} mm/s show the fine board, "
+                f"{LEAST_FRAMES} are needed: clean it, see that it is lit, and run `cell calibrate timing` again"
+            )
+    shifts, slopes, places = _displacements(scan, base_from_flange, sweeps)
+    of = np.repeat(np.arange(len(sweeps)), [len(sweep.frames) for sweep in sweeps])
+    velocities = np.array([sweep.velocity for sweep in sweeps])
+    exposures = np.array([sweep.exposure for sweep in sweeps])
+    # What the calibration is off by, and the screw in each of its turns, is the same whichever way a place is passed.
+    turn = 2 * np.pi * places / lead
+    slow = np.column_stack([np.vander((places - places.mean()) / np.ptp(places), 3)[:, :2], np.sin(turn), np.cos(turn)])
+    each = (of[:, None] == np.arange(len(sweeps))).astype(np.float64)
+    offsets = np.linalg.lstsq(np.column_stack([each, slow]), shifts, rcond=None)[0][: len(sweeps)]
+    weights = 1.0 / np.hypot(_TIME_S * velocities, _PLACE_M)
+    columns = np.column_stack([np.ones(len(sweeps)), velocities, 0.5 * np.sign(velocities)])
+    (_, late, play), (_, sigma, play_sigma), noise = _least_squares(columns, offsets, weights)
+    # Of what a comparison of the clocks leaves open, the sweeps' scatter shows what differs from one to the next.
+    common = np.mean([sweep.bound**2 for sweep in sweeps]) / 3.0 - noise * _TIME_S**2
+    sigma = np.sqrt(sigma**2 + max(0.0, common))
+    longer = np.column_stack([columns, velocities * (exposures - exposures.mean())])
+    by_exposure, by_sigma = (float(v[3]) for v in _least_squares(longer, offsets, weights)[:2])
+    by_row = np.column_stack([np.ones(len(of)), velocities[of]])
+    readout, readout_sigma = (float(v[1]) for v in _least_squares(by_row, slopes, np.ones(len(of)))[:2])
+    found = float(late), float(sigma), float(play), float(play_sigma), readout, readout_sigma, by_exposure
+    made = Timing(*found, time.time())
+    _require(made, by_sigma, most_late)
+    return made
+
+
+def _displacements(
+    scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep]
+) -> tuple[Array, Array, Array]:
+    """For each frame how much farther the carriage is read to be than the picture has it, m, how much farther on the
+    last row has it than the first, m, and the reading, m."""
+    assert scan.reference is not None
+    state = State(
+        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
+    )  # fmt: skip
+    frames = [frame for sweep in sweeps for frame in sweep.frames]
+    looks = [dots_of(ScanObservation(frame.view, None, base_from_flange, frame.rail)) for frame in frames]
+    # The board's place as all of them see it: in the mean over to and fro.
+    for _ in range(_ROUNDS):
+        normal, right = np.zeros((6, 6)), np.zeros(6)
+        for look in looks:
+            off, jacobian = dots_block(state, look, base_from_flange, look.rail)
+            by_board = jacobian[:, :, BOARD].reshape(-1, 6)
+            normal, right = normal + by_board.T @ by_board, right + by_board.T @ off.ravel()
+        step = np.zeros(BOARD.stop)
+        step[BOARD] = np.linalg.solve(normal, right)
+        state = state.moved(step)
+    shifts, slopes = [], []
+    for look in looks:
+        off, jacobian = dots_block(state, look, base_from_flange, look.rail)
+        by_rail = jacobian[:, :, POSITION].reshape(-1)
+        row = np.repeat(look.pixels[:, 1] / scan.camera.height - 0.5, 2)
+        shift, slope = np.linalg.lstsq(np.column_stack([by_rail, by_rail * row]), off.ravel(), rcond=None)[0]
+        shifts.append(shift)
+        slopes.append(slope)
+    return -np.array(shifts), np.array(slopes), np.array([frame.rail for frame in frames])
+
+
+def _least_squares(columns: Array, values: Array, weights: Array) -> tuple[Array, Array, float]:
+    """Estimates, their standard deviations from what is left, and the weighted mean square of that."""
+    columns, values = columns * weights[:, None], values * weights
+    inverse = np.linalg.inv(columns.T @ columns)
+    found = inverse @ columns.T @ values
+    left = values - columns @ found
+    noise = float(left @ left) / (len(values) - columns.shape[1])
+    return np.asarray(found), np.sqrt(np.diag(inverse) * noise), noise
+
+
+def _require(made: Timing, by_sigma: float, most_late: float) -> None:
+    """Raise `RefusedError` for what no correction of the stamps mends."""
+    if abs(made.readout) > max(LEAST_READOUT_S, SURE * made.readout_sigma):
+        raise RefusedError(
+            f"the scan camera has a rolling shutter: its last row is exposed {1e3 * made.readout:.1f} ms after its "
+            f"first one, allowed are {1e3 * LEAST_READOUT_S:g} ms. Switch it to a global shutter, or take another one",
+            Measured("readout of the scan camera", 1e3 * made.readout, "ms", most=1e3 * LEAST_READOUT_S),
+        )
+    if abs(made.by_exposure) > max(BY_EXPOSURE, SURE * by_sigma):
+        raise RefusedError(
+            f"the scan camera's time stamps come later by {made.by_exposure:.2f} times what an exposure is longer, "
+            "where they have to be those of its beginning (1.00 are those of its end): set the camera, or its "
+            "driver, to stamp the start of the exposure",
+            Measured("lateness per exposure", made.by_exposure, "", most=BY_EXPOSURE),
+        )
+    if made.sigma > WANTED_S or SURE * by_sigma > BY_EXPOSURE:
+        raise RefusedError(
+            f"the sweeps differ by more than time stamps do: these are known to ±{1e3 * made.sigma:.2f} ms, wanted are "
+            f"±{1e3 * WANTED_S:g} ms. See that nothing shakes the cell and the rail runs evenly, then run `cell "
+            "calibrate timing` again; until then jobs go on with scan_camera.late",
+            Measured("time stamps, one sigma", 1e3 * made.sigma, "ms", most=1e3 * WANTED_S),
+        )
+    if abs(made.late) > most_late + 3 * made.sigma:
+        raise RefusedError(
+            f"the scan camera's time stamps come {1e3 * made.late:.2f} ms late, scan_camera.late allows "
+            f"{1e3 * most_late:g} ms: see the camera's and its driver's settings, or, if that is how this camera is, "
+            f'write scan_camera.late = "{np.ceil(1e3 * abs(made.late)):g} ms" and run `cell calibrate timing` again',
+            Measured("time stamps are late by", 1e3 * made.late, "ms", most=1e3 * most_late),
+        )

@@ -1,0 +1,96 @@
+"""`cell calibrate list` and `show`: the stored calibrations, and what was found out since they were made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cell.cli.options import ConfigOption, JsonOption, print_json
+
+
+def register(group: typer.Typer) -> None:
+    """Add the commands of this file to `cell calibrate`."""
+    group.command(name="list")(list_calibrations)
+    group.command()(show)
+
+
+def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """List the stored calibrations, newest last: when, of which devices, how well they fit, what was found since."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from cell.calibration.store import read_calibration
+    from drivers.errors import CalibrationStale
+
+    rows: list[dict[str, Any]] = []
+    for path in sorted(_folder(config).glob("*.json")):
+        try:
+            calibration = read_calibration(path)
+        except CalibrationStale as error:
+            rows.append({"name": path.stem, "made": 0.0, "unreadable": str(error)})
+            continue
+        told = calibration.summary()
+        kept = {name: told[name] for name in ("date", "identities", "laser_since", "timing")}
+        fit = {"chi2_per_dof": told["scan_quality"]["chi2_per_dof"]}
+        rows.append({"name": path.stem, "made": calibration.made, "hash": calibration.hash(), **kept, **fit})
+    rows.sort(key=lambda row: float(row["made"]))
+    if json:
+        print_json(rows)
+        return
+    table = Table(title=f"calibrations in {_folder(config)}")
+    for name in ("made", "name", "hash", "chi²/dof", "found since"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        if "unreadable" in row:
+            table.add_row("", row["name"], "", "", row["unreadable"])
+            continue
+        table.add_row(row["date"], row["name"], row["hash"], f"{row['chi2_per_dof']:.3f}", _since(row))
+    Console().print(table)
+
+
+def show(
+    name: Annotated[
+        str | None, typer.Argument(help="As `cell calibrate list` names it; without it the newest.")
+    ] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Show a stored calibration: its values with their deviations, and what was found out since."""
+    from cell.calibration.store import read_calibration
+    from cell.cli.display import print_calibration
+    from drivers.errors import CalibrationStale, ConfigError
+
+    folder = _folder(config)
+    paths = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+    chosen = [path for path in paths if name in (None, path.stem)]
+    if not chosen:
+        known = ", ".join(path.stem for path in paths) or "none"
+        raise ConfigError(f"{folder} holds no calibration {name or ''}; there are: {known}; see `cell calibrate list`")
+    try:
+        summary = read_calibration(chosen[-1]).summary()
+    except CalibrationStale as error:
+        raise ConfigError(str(error)) from error
+    if json:
+        print_json(summary)
+    else:
+        print_calibration(summary, str(chosen[-1]))
+
+
+def _since(row: dict[str, Any]) -> str:
+    told = []
+    if (turn := row["laser_since"]) is not None:
+        told.append(f"laser turned {turn['turned_mrad']:+.3f} ± {turn['sigma_mrad']:.3f} mrad, verified {turn['date']}")
+    if (timing := row["timing"]) is not None:
+        told.append(
+            f"time stamps {timing['late_ms']:+.2f} ± {timing['sigma_ms']:.2f} ms late, measured {timing['date']}"
+        )
+    return "; ".join(told)
+
+
+def _folder(config: Path | None) -> Path:
+    from cell.config import beside, find_config, load_config
+
+    path = find_config(config, simulated=True)
+    return beside(path) / load_config(path).cell.calibrations

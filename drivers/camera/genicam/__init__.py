@@ -1,0 +1,1 @@
+"""Cameras on GigE Vision and USB3 Vision, through the library Aravis."""

@@ -1,0 +1,232 @@
+"""Pictures from one camera while it acquires: the library's stream, emptied by one thread.
+
+A stream lives as long as the acquisition, so no picture of an earlier one can be taken for a new one. A picture of
+which packets are missing is dropped and counted; the gap in the block ids tells of it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.camera.genicam.aravis import Aravis, AravisError, Status
+from drivers.camera.genicam.device import GenicamDevice
+from drivers.camera.genicam.pixels import NAMES, to_grey
+from drivers.errors import CellError
+from drivers.interfaces import Image, LinkStatistics
+
+_POP_US = 10_000
+_FIXED = 0
+_SOCKET_BUFFER = 4 * 1024 * 1024
+_IMAGE = 1
+_STOP_WALL_S = 0.5
+_WRAP = 0xFFFF
+"""Block ids of 16 bits run from 1 to this and begin again at 1; longer ones do not wrap in a lifetime."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A complete picture; `device_ns` is the camera's time stamp, `count` counts its exposures in this acquisition."""
+
+    image: Image
+    count: int
+    device_ns: int
+
+
+@dataclass(frozen=True)
+class Network:
+    """How pictures come over the network: packets in bytes (None: the largest that passes), times in s.
+
+    `resend`: missing packets are asked for again; a picture is given up `retention` after its last packet.
+    """
+
+    packet_size: int | None = None
+    packet_delay: float = 0.0
+    resend: bool = True
+    packet_timeout: float = 0.02
+    retention: float = 0.5
+
+
+class BlockCount:
+    """Block ids as a count that never goes back: 1 for the first picture of the acquisition."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._count = 0
+
+    def of(self, block_id: int) -> int:
+        """The count of the next picture that came."""
+        if self._last is None:
+            self._count = 1
+        elif block_id < self._last <= _WRAP:
+            self._count += block_id - self._last + _WRAP
+        else:
+            self._count += block_id - self._last
+        self._last = block_id
+        return self._count
+
+
+class Acquisition:
+    """An acquisition from `start` to `stop`; `take(picture)` is called in its thread, `failed()` when it ended badly.
+
+    `failure` is then why; `incomplete` counts the pictures that were dropped because packets were missing.
+    """
+
+    def __init__(
+        self,
+        device: GenicamDevice,
+        network: Network | None,
+        buffers: int,
+        take: Callable[[Picture], None],
+        failed: Callable[[], None],
+        statistics: LinkStatistics,
+    ) -> None:
+        self.failure: CellError | None = None
+        self.incomplete = 0
+        self._device = device
+        self._library: Aravis = device.library
+        self._take = take
+        self._failed = failed
+        self._statistics = statistics
+        self._ids = BlockCount()
+        self._ended = threading.Event()
+        self._stopping = threading.Lock()
+        payload = int(device.call("get_payload"))
+        self._stream = device.call("create_stream", None, None)
+        if network is not None:
+            self._set_network(network)
+        for _ in range(buffers):
+            self._push(self._library.plain("arv_buffer_new_allocate", payload))
+        self._thread = threading.Thread(target=self._empty, name=f"{device.name} pictures", daemon=True)
+
+    def start(self) -> None:
+        """Let the camera acquire."""
+        self._thread.start()
+        self._device.call("start_acquisition")
+
+    def stop(self) -> None:
+        """End it; a camera that is lost is not asked. Idempotent."""
+        with self._stopping:
+            if not self._ended.is_set():
+                self._stop()
+
+    def _stop(self) -> None:
+        try:
+            if self.failure is None and self._device.held and self._device.open:
+                self._ask_for_the_end()
+        finally:
+            self._ended.set()
+            if self._thread.ident is not None:
+                self._thread.join()
+            self._count_packets()
+            # The library tells the camera that its stream is over, which takes seconds where nobody answers.
+            giver = threading.Thread(target=self._library.plain, args=("g_object_unref", self._stream), daemon=True)
+            giver.start()
+            if self._device.open and self.failure is None:
+                giver.join()
+
+    def _ask_for_the_end(self) -> None:
+        """Who ends a sweep has a laser to switch off: it waits for no camera that is silent."""
+        failed: list[CellError] = []
+
+        def ask() -> None:
+            try:
+                self._device.call("stop_acquisition")
+            except CellError as error:
+                failed.append(error)
+
+        asker = threading.Thread(target=ask, name=f"{self._device.name} stop", daemon=True)
+        asker.start()
+        asker.join(_STOP_WALL_S)
+        if asker.is_alive():
+            self._device.abandon()
+            raise self._device.lost(f"no answer to the end of its acquisition within {_STOP_WALL_S:g} s")
+        if failed:
+            raise failed[0]
+
+    def _set_network(self, network: Network) -> None:
+        for name, kind, value in (
+            ("packet-resend", "gv_stream_packet_resend", int(network.resend)),
+            # All of a picture's packets may be asked for again, not only a quarter of them.
+            ("packet-request-ratio", "double", 1.0),
+            ("packet-timeout", "uint", round(network.packet_timeout * 1e6)),
+            ("frame-retention", "uint", round(network.retention * 1e6)),
+            # What arrives while this computer is busy has to wait somewhere; the system may allow less.
+            ("socket-buffer", "gv_stream_socket_buffer", _FIXED),
+            ("socket-buffer-size", "int", _SOCKET_BUFFER),
+        ):
+            self._library.set_property(self._stream, name, kind, value)
+
+    def _push(self, buffer: Any) -> None:
+        self._library.plain("arv_stream_push_buffer", self._stream, buffer)
+
+    def _empty(self) -> None:
+        while not self._ended.is_set():
+            buffer = self._library.plain("arv_stream_timeout_pop_buffer", self._stream, _POP_US)
+            try:
+                if buffer is not None:
+                    self._look_at(buffer)
+                elif not self._device.held:
+                    raise self._device.lost("its heartbeat got no answer, or another application took control")
+            except Exception as error:
+                # Whatever it was, no picture comes any more, and whoever waits for one has to be told.
+                self.failure = error if isinstance(error, CellError) else self._device.lost(str(error))
+                self._failed()
+                return
+            finally:
+                if buffer is not None:
+                    self._push(buffer)
+
+    def _look_at(self, buffer: Any) -> None:
+        library = self._library
+        status = Status(library.plain("arv_buffer_get_status", buffer))
+        if status is not Status.SUCCESS:
+            if status in (Status.TIMEOUT, Status.MISSING_PACKETS, Status.WRONG_PACKET_ID, Status.SIZE_MISMATCH):
+                self.incomplete += 1
+                self._statistics.count("frames_incomplete")
+                self._failed()
+            return
+        if (kind := library.plain("arv_buffer_get_payload_type", buffer)) != _IMAGE:
+            raise ValueError(f"it sends payload type {kind} instead of plain pictures; switch chunks and multipart off")
+        self._take(
+            Picture(
+                self._image(buffer),
+                self._ids.of(library.plain("arv_buffer_get_frame_id", buffer)),
+                library.plain("arv_buffer_get_timestamp", buffer),
+            )
+        )
+
+    def _image(self, buffer: Any) -> Image:
+        library = self._library
+        x, y, width, height = (ctypes.c_int() for _ in range(4))
+        library.plain("arv_buffer_get_image_region", buffer, *map(ctypes.byref, (x, y, width, height)))
+        across, down = ctypes.c_int(), ctypes.c_int()
+        library.plain("arv_buffer_get_image_padding", buffer, ctypes.byref(across), ctypes.byref(down))
+        if across.value or down.value:
+            raise ValueError(f"its lines are padded by {across.value} bytes, which is not read; choose another width")
+        code = library.plain("arv_buffer_get_image_pixel_format", buffer)
+        if code not in NAMES:
+            raise ValueError(
+                f"it sends pixel format 0x{code:08x}, which is not known; known: {', '.join(NAMES.values())}"
+            )
+        size = ctypes.c_size_t()
+        address = library.plain("arv_buffer_get_data", buffer, ctypes.byref(size))
+        # A copy: the buffer is filled again.
+        data = np.frombuffer(ctypes.string_at(address, size.value), np.uint8)
+        return to_grey(NAMES[code], data, height.value, width.value)
+
+    def _count_packets(self) -> None:
+        with suppress(AravisError):
+            for index in range(self._library.plain("arv_stream_get_n_infos", self._stream)):
+                name = self._library.plain("arv_stream_get_info_name", self._stream, index).decode()
+                if name in ("n_resent_packets", "n_missing_packets", "n_underruns"):
+                    count = self._library.plain("arv_stream_get_info_uint64", self._stream, index)
+                    if count:
+                        key = name.removeprefix("n_")
+                        self._statistics.errors[key] = self._statistics.errors.get(key, 0) + count

@@ -1,0 +1,87 @@
+"""What a camera's time stamps are worth: its clock against the host's, and each triggered picture against its trigger.
+
+A camera whose clock can be latched is asked before each acquisition. Of one without a latch a triggered picture tells:
+its exposure began after the trigger was sent, and ended before the picture came.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from drivers.camera.genicam.device import GenicamDevice
+from drivers.clock import Clock
+from drivers.clock_map import ClockMap, Latch
+from drivers.errors import DeviceFault
+from drivers.interfaces import Frame
+
+_LATCHES, _MAX_LATCHES = 8, 32
+_GOOD_LATCH_WALL_S = 0.0005
+_SLACK_S = 0.002
+"""By how much a time stamp may leave the interval of its trigger beyond what the clocks are known to."""
+
+
+class Stamps:
+    """The stamps of the camera `name` since it was connected."""
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self._name = name
+        self._clock = clock
+        self._map: ClockMap | None = None
+        self._latched = False
+
+    @property
+    def bound(self) -> float:
+        """Largest error in s of a host time; unlimited while nothing has told of the camera's clock."""
+        return math.inf if self._map is None else self._map.uncertainty
+
+    @property
+    def slack(self) -> float:
+        """By how much, in s, a stamp may seem too early or too late."""
+        return _SLACK_S + (0.0 if self._map is None else self._map.uncertainty)
+
+    def compare(self, device: GenicamDevice) -> None:
+        """Latch the camera's clock, as often as it takes to get a short round trip; nothing if it has no latch."""
+        latches: list[Latch] = []
+        good = _GOOD_LATCH_WALL_S * self._clock.rate
+        while len(latches) < _LATCHES or (
+            len(latches) < _MAX_LATCHES and min(latch.after - latch.before for latch in latches) > good
+        ):
+            latch = device.latch(self._clock)
+            if latch is None:
+                return
+            latches.append(latch)
+        self._latched = True
+        self._add(latches)
+
+    def host_time(self, device_time: float, *, latest: float) -> float:
+        """Host time in s of a stamp; `latest`, at which it was at the latest, while the clock is not known."""
+        return latest if self._map is None else self._map.host_time(device_time)
+
+    def judged(self, frame: Frame, called: float) -> Frame:
+        """The frame of a trigger that was sent at `called`, s; `DeviceFault` (camera.clock) when its stamp is none."""
+        last = frame.received - frame.exposure
+        early, late = called - self.slack - frame.host_time, frame.host_time - last - self.slack
+        if self._map is not None and max(early, late) > 0.0:
+            raise self._wrong(early, late)
+        if self._latched or not frame.device_time or last <= called:
+            return frame
+        self._add([Latch(called, frame.device_time, last)])
+        return replace(frame, host_time=self.host_time(frame.device_time, latest=last))
+
+    def _add(self, latches: list[Latch]) -> None:
+        if self._map is None:
+            self._map = ClockMap()
+        self._map.add(latches)
+
+    def _wrong(self, early: float, late: float) -> DeviceFault:
+        which = "before it was triggered" if early > 0.0 else "too late to be here already"
+        return DeviceFault(
+            self._name,
+            "camera.clock",
+            f"the time stamp of a triggered picture says that its exposure began "
+            f"{1e3 * (max(early, late) + self.slack):.1f} ms {which} (allowed: {1e3 * self.slack:.1f} ms)",
+            recoverable=False,
+            hint="Its stamps are none of the start of the exposure, or its clock does not run at the rate that it "
+            "tells. Look into its maker's manual; such a camera cannot measure a sweep.",
+        )

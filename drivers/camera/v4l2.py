@@ -1,0 +1,258 @@
+"""A USB or built-in camera under Linux (V4L2, UVC) through OpenCV.
+
+Such a camera does not say when an exposure began. The kernel stamps a picture with the computer's own clock: at the
+start of the exposure, or as late as when its first bytes came, after the exposure and up to a frame later. Its times
+are known to half of that: enough for photographs and not for a sweep, which is then refused. Never run on a camera.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import cv2
+
+from drivers.camera.frame_queue import FrameQueue
+from drivers.camera.v4l2_pictures import Timing, to_grey
+from drivers.clock import Clock
+from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError, NotConnectedError
+from drivers.interfaces import Frame, Identity, LinkStatistics
+from drivers.quantities import check_positive, check_range, shown
+
+FORMATS = ("GREY", "YUYV", "MJPG")
+_EXPOSURE_UNIT_S = 1e-4
+_EXPOSURES_S = (1e-4, 1.0)
+_HIGHEST_HZ = 500.0
+_MANUAL = 1
+_TOLERANCE = 0.02
+_OLDEST_S = 10.0
+_QUEUE_BYTES = 64 * 1024 * 1024
+
+
+class V4l2Camera:
+    """The camera at the device file `path`, set to (height, width) `shape` in the pixel format `fourcc`.
+
+    Raises `NotConnectedError` when there is none or another program has it, `ConfigError` when its size is another.
+    """
+
+    def __init__(
+        self, name: str, path: str, *, clock: Clock, shape: tuple[int, int], fourcc: str = "YUYV",
+        gain: float | None = None, look: bool = False,
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.shape = shape
+        self.statistics = LinkStatistics()
+        self._path = path
+        self._clock = clock
+        self._look = look
+        self._timing = Timing(0.01, 10.0)
+        self._acquiring = threading.Lock()
+        self._queue: FrameQueue | None = None
+        self._ended = threading.Event()
+        self._failure: CellError | None = None
+        self._count = 0
+        self._stamp: float | None = None
+        self._capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
+        if not self._capture.isOpened():
+            raise NotConnectedError(
+                name,
+                f"{path} is no camera that can be opened. Check the cable and `v4l2-ctl --list-devices`, that this "
+                f"user is in the group video, and that no other program uses it (`fuser -v {path}`)",
+            )
+        if not look:
+            try:
+                self._set_image(fourcc, gain)
+            except CellError:
+                self._capture.release()
+                raise
+
+    def identity(self) -> Identity:
+        """The device file; OpenCV tells neither model nor serial number."""
+        self._require()
+        return Identity(f"V4L2 camera ({self._capture.getBackendName()})", "", "", self._path)
+
+    @property
+    def time_bound(self) -> float:
+        """Largest error in s of a frame's host time: half of what its stamp leaves open."""
+        return 0.5 * self._timing.open_s
+
+    def ping(self) -> float:
+        """Read one setting; returns the wall seconds it took."""
+        self._require()
+        before = self._clock.now()
+        self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+        seconds = self._clock.wall(self._clock.now() - before)
+        self.statistics.add_round_trip(seconds)
+        return seconds
+
+    def configure(self, exposure: float, frame_rate: float) -> None:
+        """Set exposure in s (in steps of 0.1 ms) and frame rate in Hz, and read them back.
+
+        Raises `LimitError` outside UVC's range or when the exposure does not fit into a frame, `InterlockError` while
+        frames are being acquired, `DeviceFault` (camera.setting) when the camera takes other values.
+        """
+        check_range(self.name, "exposure", exposure, *_EXPOSURES_S, "s")
+        check_positive(self.name, "frame rate", frame_rate, _HIGHEST_HZ, "Hz")
+        if exposure * frame_rate > 1.0:
+            raise LimitError(
+                self.name,
+                f"exposure {shown(exposure, 's')} does not fit into a frame at {frame_rate:g} Hz; nothing was sent. "
+                f"Choose at most {shown(1.0 / frame_rate, 's')}, or at most {1.0 / exposure:g} Hz",
+            )
+        with self._exclusive():
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
+            self._set(cv2.CAP_PROP_EXPOSURE, "exposure", round(exposure / _EXPOSURE_UNIT_S), "x 0.1 ms")
+            self._set(cv2.CAP_PROP_FPS, "frame rate", frame_rate, "Hz")
+            self._timing = Timing(exposure, frame_rate)
+
+    def grab(self, timeout: float = 2.0) -> Frame:
+        """One frame whose exposure began after the call, as far as its stamp can tell: never a buffered one."""
+        with self._exclusive():
+            called = self._clock.now()
+            with self._acquire(8) as frames:
+                while True:
+                    frame = frames.next(timeout)
+                    if frame.host_time - self.time_bound >= called:
+                        return frame
+                    self.statistics.count("stale_frames")
+
+    @contextmanager
+    def stream(self) -> Iterator[FrameQueue]:
+        """Frames as they come; lost ones are known from gaps between the stamps."""
+        with self._exclusive(), self._acquire(max(8, _QUEUE_BYTES // (self.shape[0] * self.shape[1]))) as frames:
+            yield frames
+
+    def stop(self) -> None:
+        """End every acquisition; whoever waits for a frame gets `Aborted`."""
+        self._ended.set()
+        if (queue := self._queue) is not None:
+            queue.close(aborted=True)
+
+    def close(self) -> None:
+        """End acquisition and connection; idempotent."""
+        self.stop()
+        if self._acquiring.acquire(timeout=2.0):
+            self._acquiring.release()
+        self._capture.release()
+
+    def _require(self) -> None:
+        if not self._capture.isOpened():
+            raise NotConnectedError(self.name, f"{self._path} was closed. Open it again")
+
+    def _set_image(self, fourcc: str, gain: float | None) -> None:
+        capture = self._capture
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*fourcc))
+        # The first plane of YUYV is the grey itself; what is compressed has to be decoded.
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, float(fourcc == "MJPG"))
+        height, width = self.shape
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+        taken = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if taken != (width, height):
+            raise ConfigError(
+                f"{self.name}: the camera at {self._path} gives {taken[0]}x{taken[1]} pixels, configured are "
+                f"{width}x{height}. `v4l2-ctl -d {self._path} --list-formats-ext` shows what it has"
+            )
+        code = int(capture.get(cv2.CAP_PROP_FOURCC))
+        if (named := code.to_bytes(4, "little").decode("ascii", "replace")) != fourcc:
+            raise DeviceFault(
+                self.name,
+                "camera.setting",
+                f"the camera took pixel format {named!r} instead of {fourcc!r}",
+                recoverable=False,
+                hint=f"Choose one that it has ({', '.join(FORMATS)} are known here).",
+            )
+        if gain is not None:
+            self._set(cv2.CAP_PROP_GAIN, "gain", gain, "")
+
+    def _set(self, setting: int, what: str, value: float, unit: str) -> None:
+        accepted = self._capture.set(setting, value)
+        taken = self._capture.get(setting)
+        if not accepted or abs(taken - value) > _TOLERANCE * abs(value):
+            raise DeviceFault(
+                self.name,
+                "camera.setting",
+                f"the camera took {what} {taken:g} {unit} instead of {value:g} {unit}".replace("  ", " "),
+                recoverable=False,
+                hint=f"Choose a value that it has: `v4l2-ctl -d {self._path} --list-ctrls` shows its ranges.",
+            )
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        if self._look:
+            raise InterlockError(self.name, "the camera is only looked at. Open it to use it")
+        self._require()
+        if not self._acquiring.acquire(blocking=False):
+            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
+        try:
+            yield
+        finally:
+            self._acquiring.release()
+
+    @contextmanager
+    def _acquire(self, capacity: int) -> Iterator[FrameQueue]:
+        self._ended.clear()
+        self._failure = None
+        longest = 2.0 + 2.0 / self._timing.frame_rate
+        queue = FrameQueue(
+            self.name,
+            self._clock,
+            capacity=capacity,
+            longest_gap=longest,
+            check=self._check,
+            statistics=self.statistics,
+        )
+        self._queue = queue
+        reader = threading.Thread(target=self._read, args=(queue,), name=f"{self.name} pictures", daemon=True)
+        reader.start()
+        try:
+            yield queue
+        finally:
+            self._ended.set()
+            reader.join()
+            self._queue = None
+            queue.close()
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _read(self, queue: FrameQueue) -> None:
+        begun = time.monotonic()
+        try:
+            while not self._ended.is_set():
+                there, raw = self._capture.read()
+                stamp = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
+                if not there:
+                    raise self._fault(
+                        "camera.lost", "no picture comes any more", "Check the cable, then open it again."
+                    )
+                if stamp >= begun:
+                    queue.put(self._frame(raw, stamp))
+        except CellError as error:
+            self._failure = error
+        except Exception as error:
+            self._failure = self._fault("camera.lost", repr(error), "Check the camera, then open it again.")
+        queue.wake()
+
+    def _frame(self, raw: object, stamp: float) -> Frame:
+        age = time.monotonic() - stamp
+        if not 0.0 <= age < _OLDEST_S:
+            raise self._fault(
+                "camera.clock",
+                f"a picture's stamp is {age:.3g} s old (allowed: 0 to {_OLDEST_S:g} s)",
+                "The kernel has to stamp by CLOCK_MONOTONIC: load uvcvideo with clock=CLOCK_MONOTONIC.",
+            )
+        received = self._clock.now()
+        if self._stamp is None:
+            self._count += 1
+        else:
+            self._count += max(1, round((stamp - self._stamp) * self._timing.frame_rate))
+        self._stamp = stamp
+        host = received - age * self._clock.rate - self.time_bound
+        return Frame(to_grey(raw, self.shape), self._count, self._timing.exposure, stamp, host, received)
+
+    def _fault(self, code: str, what: str, hint: str) -> DeviceFault:
+        return DeviceFault(self.name, code, f"{what} from {self._path}", recoverable=False, hint=hint)

@@ -1,0 +1,89 @@
+"""The clients of the script ports: what they send is run, and each hears what its port tells.
+
+Primary (30001) and secondary (30002) tell the state ten times a second, the primary one messages as well, real time
+(30003) the state in every cycle. 30011 to 30013 tell the same and take nothing.
+"""
+
+from __future__ import annotations
+
+from sim_backends.models.arm import ArmModel, Power
+from sim_backends.peers.controller_ports import Client
+from sim_backends.peers.dashboard import VERSION
+from sim_backends.peers.real_time_port import real_time_packet
+from sim_backends.peers.rtde_registers import View
+from sim_backends.peers.script import ControlProgram
+from sim_backends.peers.script_port import message, robot_state, version_message
+from sim_backends.peers.urscript.words import Collector
+
+_PRIMARY, _SECONDARY, _REAL_TIME = (30001, 30011), (30002, 30012), (30003, 30013)
+_READ_ONLY = (30011, 30012, 30013)
+SCRIPT_PORTS = (*_PRIMARY, *_SECONDARY, *_REAL_TIME)
+_REPORT_EVERY = 50
+"""Ticks between two reports on the primary and the secondary port, which come ten times a second."""
+
+
+class ScriptClients:
+    """All connections to `SCRIPT_PORTS` of one controller."""
+
+    def __init__(self, model: ArmModel, program: ControlProgram, view: View) -> None:
+        self._model = model
+        self._program = program
+        self._view = view
+        self._texts: dict[Client, Collector] = {}
+        self._ports: dict[Client, int] = {}
+
+    def serve(self, port: int, client: Client, data: bytes | None) -> None:
+        """`data` came from `client` of `port`: b"" for a new one, None for one that has left."""
+        if data is None:
+            self._texts.pop(client, None)
+            self._ports.pop(client, None)
+            return
+        if client not in self._ports:
+            self._ports[client] = port
+            if port not in _REAL_TIME:
+                client.send(version_message(VERSION))
+        if port not in _READ_ONLY:
+            for text in self._texts.setdefault(client, Collector()).feed(data):
+                self._take(text)
+
+    def tick(self, count: int) -> None:
+        """Tell everybody what is due in the cycle with this number."""
+        if not self._ports:
+            self._program.announcements.clear()
+            return
+        told = [message(*one, self._model.time) for one in self._program.announcements]
+        self._program.announcements.clear()
+        reports = count % _REPORT_EVERY == 0
+        state = packet = b""
+        for client, port in self._ports.items():
+            if port in _REAL_TIME:
+                packet = packet or real_time_packet(self._view)
+                client.offer(packet)
+                continue
+            if told and port in _PRIMARY:
+                client.send(b"".join(told))
+            if reports:
+                state = state or robot_state(self._model, self._program.runtime_state, self._view.registers.analog_out)
+                client.send(state)
+
+    def _take(self, text: str) -> None:
+        """A script, or one of the controller's own commands. In local control nothing is taken."""
+        if not self._model.remote:
+            self._program.announcements.append(("read-only", "the arm is in local control"))
+            return
+        match " ".join(text.split()).lower():
+            case "power on":
+                self._model.set_power(max(self._model.power, Power.IDLE))
+            case "power off":
+                self._program.stop("power off")
+                self._model.set_power(Power.OFF)
+            case "set robotmode run":
+                self._model.set_power(Power.RUNNING)
+            case "set unlock protective stop":
+                self._model.unlock()
+            case "stop program":
+                self._program.stop("stopped by a client")
+            case "pause program":
+                self._program.pause()
+            case _:
+                self._program.load(text)

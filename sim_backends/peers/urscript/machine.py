@@ -1,0 +1,130 @@
+"""One URScript program as it runs: its threads, what ends them, and the commands of the controller that it calls.
+
+The threads take turns, each until its cycle ends. What the commands do is in the modules beside this one.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Generator
+from typing import Any
+
+from sim_backends.peers.script_context import Context, Job, ProgramError
+from sim_backends.peers.urscript import arithmetic, motions, sensing, settings, sockets
+from sim_backends.peers.urscript.environment import Environment
+from sim_backends.peers.urscript.translate import translate
+from sim_backends.peers.urscript.values import List, Pose, own
+
+Thread = Generator[None, None, Any]
+_MOST_TURNS = 20000
+"""Turns of a program's loops in one cycle; a controller calls more an infinite loop."""
+_MAIN = -1
+"""The program's own thread; scripts take 0 for no thread."""
+_LIBRARIES: tuple[Callable[[Environment], dict[str, Callable[..., Any]]], ...] = (
+    arithmetic.commands,
+    motions.commands,
+    sensing.commands,
+    settings.commands,
+    sockets.commands,
+)
+
+
+class _Halt(Exception):
+    """The program has ended itself."""
+
+
+class Machine:
+    """A compiled program; `run` is the job that carries it out."""
+
+    def __init__(self, text: str, context: Context, environment: Environment) -> None:
+        """Raises `ScriptError` when `text` does not compile."""
+        self._environment = environment
+        environment.context = context
+        known = {name: act for library in _LIBRARIES for name, act in library(environment).items()}
+        waiting = {name for name, act in known.items() if inspect.isgeneratorfunction(act)}
+        at_once = known.keys() - waiting
+        secondary = text.lstrip().startswith("sec ")
+        program = translate(text, at_once, set() if secondary else waiting)
+        self.name = program.name
+        self._threads: dict[int, Thread] = {}
+        self._turns = 0
+        self._names: dict[str, Any] = known | {
+            "__builtins__": {"bool": bool},
+            "List": List,
+            "Pose": Pose,
+            "own": own,
+            "turn": self._turn,
+            "halt": _halt,
+            "run": self._run_thread,
+            "kill": self._kill,
+            "join": self._join,
+        }
+        # The source holds nothing of the script's but numbers, texts and names with a `u_` before them.
+        exec(compile(program.source, f"<{self.name}>", "exec"), self._names)
+
+    def run(self) -> Job:
+        """Carry the program out, a cycle at a time, until its main thread ends. Raises `ProgramError`."""
+        self._threads = {_MAIN: self._names[f"u_{self.name}"]()}
+        try:
+            while _MAIN in self._threads:
+                self._round()
+                if _MAIN in self._threads:
+                    self._environment.end_cycle()
+                    yield
+        except _Halt:
+            return
+        finally:
+            self._close()
+
+    def run_at_once(self) -> None:
+        """Carry a secondary program out, which has nothing that takes time. Raises `ProgramError`."""
+        for _ in self.run():
+            raise ProgramError(f"{self.name}: a secondary program may not take time")
+
+    def _round(self) -> None:
+        for number in sorted(self._threads, reverse=True):
+            thread = self._threads.get(number)
+            if thread is None:
+                continue
+            self._turns = 0
+            self._environment.thread = number
+            try:
+                next(thread)
+            except StopIteration:
+                self._threads.pop(number, None)
+            except (ProgramError, _Halt):
+                raise
+            except NameError as error:
+                raise ProgramError(f"variable {str(error.name).removeprefix('u_')!r} is not defined") from error
+            except (ArithmeticError, AttributeError, IndexError, RecursionError, TypeError, ValueError) as error:
+                raise ProgramError(f"{self.name}: {error}") from error
+
+    def _close(self) -> None:
+        for number in list(self._threads):
+            self._kill(number)
+        self._environment.close()
+
+    # --- what the program calls ---
+
+    def _turn(self) -> None:
+        self._turns += 1
+        if self._turns > _MOST_TURNS:
+            raise ProgramError(f"{self.name}: an infinite loop, {_MOST_TURNS} turns in one cycle")
+
+    def _run_thread(self, name: str, thread: Thread) -> int:
+        number = self._environment.next_thread()
+        self._threads[number] = thread
+        return number
+
+    def _kill(self, number: Any) -> None:
+        thread = self._threads.pop(number, None)
+        if thread is not None and number != self._environment.thread:
+            thread.close()
+
+    def _join(self, number: Any) -> Job:
+        while number in self._threads:
+            yield
+
+
+def _halt() -> None:
+    raise _Halt

@@ -1,0 +1,142 @@
+"""URScript's commands that move the arm: moves, streams, stops and compliance. Source: the maker's script manual.
+
+Blend radii are not modelled: the arm stops at every way point. A circle is two straight lines, by its via point.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+
+from sim_backends.models.arm_kinematics import Matrix, Vector
+from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
+from sim_backends.peers.script_context import CYCLE, Job, ProgramError
+from sim_backends.peers.script_motion import tool_contact
+from sim_backends.peers.urscript.arithmetic import matrix
+from sim_backends.peers.urscript.environment import Environment
+from sim_backends.peers.urscript.values import Pose
+
+_MOST_ACCELERATION = 8.0
+"""rad/s², of which the moves that plan for themselves take a share."""
+_RAMPS = 0.25
+"""Share of a move of given time that it speeds up, and as much that it slows down."""
+
+
+def _timed(length: float, t: float, speed: float, acceleration: float) -> tuple[float, float]:
+    """Speed and acceleration of a move over `length`, which takes `t` s when that is not 0."""
+    if t <= 0 or length <= 0:
+        return speed, acceleration
+    cruise = length / ((1 - _RAMPS) * t)
+    return cruise, cruise / (_RAMPS * t)
+
+
+def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+    """By name; those that take time are generator functions."""
+    e = environment
+
+    def joints(target: Any) -> Vector:
+        return e.context.solve(matrix(target)) if isinstance(target, Pose) else _six(target)
+
+    def tool(target: Any) -> Matrix:
+        return matrix(target) if isinstance(target, Pose) else e.context.forward(_six(target))
+
+    def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
+        goal = joints(q)
+        length = float(np.abs(goal - e.context.model.drive.q).max())
+        yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
+
+    def movel(pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
+        goal, here = tool(pose), e.context.model.drive.base_from_tcp()
+        length = math.dist(goal[:3, 3], here[:3, 3])
+        yield from e.move(LinearMove(goal, *_timed(length, t, v, a)))
+
+    def movep(pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
+        yield from movel(pose, a, v)
+
+    def movec(pose_via: Any, pose_to: Any, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
+        yield from movel(pose_via, a, v)
+        yield from movel(pose_to, a, v)
+
+    def optimovej(q: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+        yield from movej(q, a * _MOST_ACCELERATION, v * _leading(e))
+
+    def optimovel(pose: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+        yield from movel(pose, 2.5 * a, v)
+
+    def stopj(a: float = 2.0) -> Job:
+        yield from e.move(Stop(a))
+
+    def stopl(a: float = 1.2, aRot: float = 0) -> Job:
+        yield from e.move(Stop(a, linear=True))
+
+    def servoj(
+        q: Any, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
+    ) -> Job:
+        lag = max(e.context.model.params.tracking_lag, lookahead_time * 300.0 / max(gain, 1.0))
+        motion, target = e.context.model.motion, joints(q)
+        if isinstance(motion, Servo):
+            motion.target, motion.lag = target, lag
+        else:
+            motion = Servo(target, lag)
+        yield from e.stream(motion, t, lasting=True)
+
+    def speedj(qd: Any, a: float = 1.4, t: float = 0) -> Job:
+        yield from _speed(e, JointSpeed(_six(qd), a), t)
+
+    def speedl(xd: Any, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
+        yield from _speed(e, LinearSpeed(_six(xd), a), t)
+
+    def force_mode(task_frame: Any, selection_vector: Any, wrench: Any, type: float, limits: Any) -> None:
+        e.force = ForceMode(matrix(task_frame), _six(selection_vector), _six(wrench), _six(limits))
+
+    def end_force_mode() -> Job:
+        if e.force is not None:
+            e.force = None
+            yield from e.move(Stop(10.0, linear=True))
+
+    def tool_contact_(direction: Any = (0.0,) * 6) -> int:
+        return tool_contact(e.context, _six(direction))
+
+    def sleep(t: float) -> Job:
+        for _ in range(round(t / CYCLE)):
+            yield
+
+    def sync() -> Job:
+        yield
+
+    moving: dict[str, Callable[..., Generator[None, None, Any]]] = {
+        "movej": movej, "movel": movel, "movep": movep, "movec": movec, "optimovej": optimovej,
+        "optimovel": optimovel, "stopj": stopj, "stopl": stopl, "servoj": servoj, "speedj": speedj, "speedl": speedl,
+        "end_force_mode": end_force_mode, "sleep": sleep, "sync": sync,
+    }  # fmt: skip
+    return {**moving, "force_mode": force_mode, "tool_contact": tool_contact_}
+
+
+def _speed(e: Environment, wanted: JointSpeed | LinearSpeed, t: float) -> Job:
+    motion = e.context.model.motion
+    if isinstance(motion, JointSpeed | LinearSpeed) and type(motion) is type(wanted):
+        motion.target, motion.acceleration = wanted.target, wanted.acceleration
+    else:
+        motion = wanted
+    if not wanted.acceleration > 0:
+        raise ProgramError(f"an acceleration of {wanted.acceleration:g} must be greater than 0")
+    if t <= 0:
+        # Until the speed is reached.
+        gap = wanted.target - e.context.model.drive.qd if isinstance(wanted, JointSpeed) else wanted.target
+        t = float(np.abs(gap).max()) / wanted.acceleration
+    yield from e.stream(motion, t)
+
+
+def _leading(e: Environment) -> float:
+    return float(e.context.model.params.speed_limits.min())
+
+
+def _six(values: Any) -> Vector:
+    array = np.array(values, float)
+    if array.shape != (6,) or not np.isfinite(array).all():
+        raise ProgramError(f"{list(values)} are not six finite numbers")
+    return array

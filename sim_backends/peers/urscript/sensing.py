@@ -1,0 +1,106 @@
+"""URScript's commands that ask the arm and its controller, and the kinematics. Source: the maker's script manual."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sim_backends.models.arm import Safety
+from sim_backends.models.arm_kinematics import Matrix, Vector, invert
+from sim_backends.peers.script_context import CYCLE, ProgramError
+from sim_backends.peers.urscript.arithmetic import as_pose, matrix, numbers
+from sim_backends.peers.urscript.environment import Environment
+from sim_backends.peers.urscript.values import List
+
+
+def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+    """By name; actual and target are one, as on an arm that follows exactly."""
+    e = environment
+
+    def joints() -> List:
+        return numbers(e.context.model.drive.q)
+
+    def speeds() -> List:
+        return numbers(e.context.model.drive.qd)
+
+    def tool() -> List:
+        return as_pose(e.context.model.drive.base_from_tcp())
+
+    def flange() -> List:
+        return as_pose(e.context.model.reported_flange())
+
+    def tool_speed() -> List:
+        drive = e.context.model.drive
+        return numbers(drive.tcp_jacobian().dot(drive.qd))
+
+    def inverse(x: Any, qnear: Any, tcp: Any) -> Vector:
+        near = None if qnear is None else np.array(qnear, float)
+        target = matrix(x)
+        if tcp is not None:
+            target = target.dot(invert(matrix(tcp))).dot(e.context.model.drive.flange_from_tcp)
+        return e.context.solve(target, near)
+
+    def get_inverse_kin(
+        x: Any,
+        qnear: Any = None,
+        maxPositionError: float = 1e-10,
+        maxOrientationError: float = 1e-10,
+        tcp: Any = None,
+    ) -> List:
+        return numbers(inverse(x, qnear, tcp))
+
+    def has_solution(x: Any, qnear: Any = None, *others: Any, tcp: Any = None) -> bool:
+        try:
+            inverse(x, qnear, tcp)
+        except ProgramError:
+            return False
+        return True
+
+    def get_forward_kin(q: Any = None, tcp: Any = None) -> List:
+        drive = e.context.model.drive
+        place: Matrix = e.context.model.kinematics.forward(drive.q if q is None else np.array(q, float))
+        return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))
+
+    def within_limits(q: Any) -> bool:
+        target = np.array(q if len(q) == 6 else [], float)
+        return bool((np.abs(target) <= e.context.model.params.joint_limit).all())
+
+    def history(steps: int = 0) -> List:
+        return numbers(e.context.joints_before(int(steps)))
+
+    def torques() -> List:
+        model = e.context.model
+        return numbers(model.drive.tcp_jacobian().T.dot(model.felt))
+
+    zeros = [0.0] * 6
+    return {
+        "get_actual_joint_positions": joints, "get_joint_positions": joints, "get_target_joint_positions": joints,
+        "get_actual_joint_speeds": speeds, "get_target_joint_speeds": speeds, "get_joint_speeds": speeds,
+        "get_target_joint_accelerations": lambda: List(zeros),
+        "get_actual_joint_positions_history": history,
+        "get_actual_tcp_pose": tool, "get_target_tcp_pose": tool, "get_tcp_pose": tool,
+        "get_actual_tool_flange_pose": flange, "get_target_tool_flange_pose": flange,
+        "get_actual_tcp_speed": tool_speed, "get_target_tcp_speed": tool_speed,
+        "get_tcp_offset": lambda: as_pose(e.context.model.drive.flange_from_tcp),
+        "get_tcp_force": lambda: numbers(e.context.model.felt),
+        "force": lambda: math.hypot(*e.context.model.felt[:3]),
+        "get_joint_torques": torques,
+        "get_joint_temp": lambda joint: 30.0,
+        "get_controller_temp": lambda: 30.0,
+        "get_tool_current": lambda: 0.0,
+        "get_target_payload": lambda: e.context.model.payload[0],
+        "get_target_payload_mass": lambda: e.context.model.payload[0],
+        "get_target_payload_cog": lambda: numbers(e.context.model.payload[1]),
+        "get_target_payload_inertia": lambda: List(zeros),
+        "get_target_waypoint": tool,
+        "get_inverse_kin": get_inverse_kin, "get_inverse_kin_has_solution": has_solution,
+        "get_forward_kin": get_forward_kin,
+        "get_steptime": lambda: CYCLE,
+        "is_steady": lambda: e.context.model.steady,
+        "is_within_safety_limits": within_limits,
+        "is_robot_stopped": lambda: not e.context.model.moving,
+        "is_in_protective_stop": lambda: e.context.model.safety is Safety.PROTECTIVE_STOP,
+    }  # fmt: skip

@@ -1,0 +1,374 @@
+"""A URScript program as the source of a Python one.
+
+Every function and thread becomes a generator that yields where a control cycle ends; a user's function is called with
+`yield from`, and so is a command that takes time. A script's names get a `u_` in front, so that it reaches nothing of
+Python but what `Machine` gives it. Variables of the program itself, and those declared global, are Python's globals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from sim_backends.peers.urscript.words import ScriptError, Token, tokens
+
+_LEVELS = (("or",), ("xor",), ("and",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
+"""Binary operators, those that bind least first."""
+_KEYWORDS = frozenset(
+    (
+        *("def", "sec", "thread", "end", "if", "elif", "else", "while", "switch", "case", "default", "break"),
+        *("continue", "return", "halt", "global", "local", "run", "kill", "join", "and", "or", "xor", "not"),
+        *("True", "False", "enter_critical", "exit_critical"),
+    )
+)
+
+
+@dataclass
+class _Function:
+    """What is known of the function that is being translated."""
+
+    outermost: bool
+    mine: set[str] = field(default_factory=set)
+    """Its parameters and what it declares local."""
+    assigned: set[str] = field(default_factory=set)
+
+
+@dataclass(frozen=True)
+class Translation:
+    """The Python `source` and the `name` of the program, whose generator is `u_` + name."""
+
+    source: str
+    name: str
+
+
+def translate(text: str, commands: Collection[str], waiting: Collection[str]) -> Translation:
+    """`commands` are those that act at once, `waiting` those that take time. Raises `ScriptError`."""
+    return _Translator(tokens(text), commands, waiting).program()
+
+
+class _Translator:
+    def __init__(self, words: list[Token], commands: Collection[str], waiting: Collection[str]) -> None:
+        self._words = words
+        self._at = 0
+        self._commands, self._waiting = commands, waiting
+        pairs = list(pairwise(words))
+        self._functions = {after.text for word, after in pairs if word.text in ("def", "thread")}
+        self._globals = {after.text for word, after in pairs if word.text == "global"}
+        self._lines: list[str] = []
+        self._indent = 0
+        self._function = _Function(outermost=True)
+        self._choices = 0
+
+    def program(self) -> Translation:
+        while self._words and self._now.kind == "end" and self._at < len(self._words) - 1:
+            self._at += 1
+        if self._now.text in ("def", "sec"):
+            name = self._words[self._at + 1].text
+            self._define(outermost=True)
+        else:
+            name = "unnamed"
+            self._body("unnamed", [], _Function(outermost=True), until=())
+        while self._at < len(self._words):
+            if self._take().kind != "end":
+                raise self._error("goes on after its end")
+        return Translation("\n".join(self._lines) + "\n", name)
+
+    # --- words ---
+
+    @property
+    def _now(self) -> Token:
+        return self._words[min(self._at, len(self._words) - 1)]
+
+    def _take(self) -> Token:
+        word = self._now
+        self._at += 1
+        return word
+
+    def _expect(self, text: str) -> None:
+        if self._take().text != text:
+            self._at -= 1
+            raise self._error(f"has {self._now.text!r} where {text!r} is needed")
+
+    def _name(self) -> str:
+        word = self._take()
+        if word.kind != "name" or word.text in _KEYWORDS:
+            self._at -= 1
+            raise self._error(f"has {word.text!r} where a name is needed")
+        return word.text
+
+    def _error(self, what: str) -> ScriptError:
+        return ScriptError(f"line {self._now.line} {what}")
+
+    def _write(self, line: str) -> None:
+        self._lines.append("    " * self._indent + line)
+
+    # --- functions ---
+
+    def _define(self, outermost: bool = False) -> None:
+        self._take()
+        name = self._name()
+        function = _Function(outermost)
+        parameters = []
+        self._expect("(")
+        while self._now.text != ")":
+            parameter = self._name()
+            function.mine.add(parameter)
+            default = ""
+            if self._now.text == "=":
+                self._take()
+                default = "=" + self._expression()
+            parameters.append(f"u_{parameter}{default}")
+            if self._now.text != ")":
+                self._expect(",")
+        self._expect(")")
+        self._expect(":")
+        self._body(name, parameters, function, until=("end",))
+        self._take()
+
+    def _body(self, name: str, parameters: list[str], function: _Function, until: tuple[str, ...]) -> None:
+        outer, self._function = self._function, function
+        self._write(f"def u_{name}({', '.join(parameters)}):")
+        self._indent += 1
+        place = len(self._lines)
+        self._write("if False: yield")
+        self._statements(until)
+        shared = sorted(f"u_{name}" for name in function.assigned - function.mine)
+        if shared:
+            self._lines.insert(place, "    " * self._indent + "global " + ", ".join(shared))
+        self._indent -= 1
+        self._function = outer
+
+    def _block(self, *until: str) -> None:
+        self._indent += 1
+        self._write("pass")
+        self._statements(until)
+        self._indent -= 1
+
+    def _statements(self, until: tuple[str, ...]) -> None:
+        while self._now.text not in until:
+            if self._at >= len(self._words):
+                if until:
+                    raise self._error(f"ends without {until[0]!r}")
+                return
+            if self._now.kind == "end":
+                self._at += 1
+            else:
+                self._statement()
+
+    # --- statements ---
+
+    def _statement(self) -> None:
+        word = self._now.text
+        if word in ("def", "thread"):
+            self._define()
+        elif word == "while":
+            self._take()
+            self._write(f"while {self._condition()}:")
+            self._indent += 1
+            self._write("turn()")
+            self._indent -= 1
+            self._block("end")
+            self._take()
+        elif word == "if":
+            self._if()
+        elif word == "switch":
+            self._switch()
+        elif word in ("break", "continue"):
+            self._write(self._take().text)
+        elif word == "return":
+            self._take()
+            self._write("return" if self._now.kind == "end" else f"return {self._expression()}")
+        elif word == "halt":
+            self._take()
+            self._write("halt()")
+        elif word in ("enter_critical", "exit_critical"):
+            # Threads change over only where a cycle ends: each is alone in between.
+            self._take()
+        elif word in ("kill", "join"):
+            self._take()
+            self._write(("yield from " if word == "join" else "") + f"{word}({self._expression()})")
+        elif word in ("global", "local"):
+            self._take()
+            name = self._name()
+            if word == "local":
+                self._function.mine.add(name)
+            self._assign(name, f"u_{name}")
+        else:
+            self._assign_or_act()
+        if self._now.kind != "end" and self._now.text not in ("end", "elif", "else", "case", "default"):
+            raise self._error(f"has {self._now.text!r} after a statement")
+
+    def _assign_or_act(self) -> None:
+        name = self._now.text
+        target = self._expression()
+        if self._now.text != "=":
+            self._write(target)
+        elif target == f"u_{name}":
+            self._assign(name, target)
+        else:
+            self._take()
+            self._write(f"{target} = own({self._expression()})")
+
+    def _assign(self, name: str, target: str) -> None:
+        self._expect("=")
+        value = self._expression()
+        function = self._function
+        if function.outermost:
+            self._globals.add(name)
+        if name in self._globals:
+            function.assigned.add(name)
+        else:
+            function.mine.add(name)
+        self._write(f"{target} = own({value})")
+
+    def _condition(self) -> str:
+        condition = self._expression()
+        self._expect(":")
+        return condition
+
+    def _if(self) -> None:
+        word = "if"
+        while word in ("if", "elif"):
+            self._take()
+            self._write(f"{word} {self._condition()}:")
+            self._block("elif", "else", "end")
+            word = self._now.text
+        if word == "else":
+            self._take()
+            self._expect(":")
+            self._write("else:")
+            self._block("end")
+        self._take()
+
+    def _switch(self) -> None:
+        self._take()
+        self._choices += 1
+        choice = f"choice_{self._choices}"
+        self._write(f"{choice} = {self._condition()}")
+        word = "if"
+        while True:
+            while self._now.kind == "end":
+                self._take()
+            kind = self._take().text
+            if kind == "case":
+                self._write(f"{word} {choice} == ({self._condition()}):")
+                word = "elif"
+            elif kind == "default":
+                self._expect(":")
+                self._write("else:" if word == "elif" else "if True:")
+            elif kind == "end":
+                return
+            else:
+                self._at -= 1
+                raise self._error(f"has {kind!r} in a switch")
+            self._block("end")
+            self._take()
+
+    # --- expressions ---
+
+    def _expression(self, level: int = 0) -> str:
+        if level == len(_LEVELS):
+            return self._unary()
+        left = self._expression(level + 1)
+        while self._now.text in _LEVELS[level] and self._now.kind != "text":
+            operator = self._take().text
+            right = self._expression(level + 1)
+            if operator == "xor":
+                left = f"(bool({left}) != bool({right}))"
+            else:
+                left = f"({left} {operator} {right})"
+        return left
+
+    def _unary(self) -> str:
+        if self._now.text == "not":
+            self._take()
+            return f"(not {self._expression(3)})"
+        if self._now.text in ("-", "+"):
+            sign = self._take().text
+            return f"({sign}{self._unary()})"
+        return self._members(self._primary())
+
+    def _members(self, value: str) -> str:
+        while True:
+            if self._now.text == "[":
+                self._take()
+                value += f"[{self._expression()}]"
+                if self._now.text == ",":
+                    self._take()
+                    value += f"[{self._expression()}]"
+                self._expect("]")
+            elif self._now.text == ".":
+                self._take()
+                value += f".u_{self._name()}"
+                if self._now.text == "(":
+                    value += self._arguments("")
+            else:
+                return value
+
+    def _primary(self) -> str:
+        word = self._take()
+        if word.kind == "number":
+            return str(int(word.text, 16)) if word.text[:2] in ("0x", "0X") else _decimal(word.text)
+        if word.kind == "text":
+            return repr(word.text[1:-1])
+        if word.text == "(":
+            inner = [self._expression()]
+            while self._now.text == ",":
+                self._take()
+                inner.append(self._expression())
+            self._expect(")")
+            # Clients write lists in round brackets too, and controllers take them.
+            return f"({inner[0]})" if len(inner) == 1 else f"List([{', '.join(inner)}])"
+        if word.text == "[":
+            return f"List({self._elements()})"
+        if word.text == "p" and self._now.text == "[":
+            self._take()
+            return f"Pose({self._elements()})"
+        if word.text in ("True", "False"):
+            return word.text
+        if word.text == "run":
+            name = self._name()
+            return f"run({name!r}, u_{name}{self._arguments('u_')})"
+        self._at -= 1
+        name = self._name()
+        return self._call(name) if self._now.text == "(" else f"u_{name}"
+
+    def _call(self, name: str) -> str:
+        if name in self._functions:
+            return f"(yield from u_{name}{self._arguments('u_')})"
+        if name in self._waiting:
+            return f"(yield from {name}{self._arguments('')})"
+        if name in self._commands:
+            return f"{name}{self._arguments('')}"
+        raise self._error(f"calls {name!r}, which is neither a function of it nor a command of this controller")
+
+    def _elements(self) -> str:
+        values = []
+        while self._now.text != "]":
+            values.append(self._expression())
+            if self._now.text != "]":
+                self._expect(",")
+        self._take()
+        return "[" + ", ".join(values) + "]"
+
+    def _arguments(self, prefix: str) -> str:
+        values = []
+        self._expect("(")
+        while self._now.text != ")":
+            after = self._words[min(self._at + 1, len(self._words) - 1)]
+            if self._now.kind == "name" and after.text == "=":
+                name = self._name()
+                self._take()
+                values.append(f"{prefix}{name}={self._expression()}")
+            else:
+                values.append(self._expression())
+            if self._now.text != ")":
+                self._expect(",")
+        self._take()
+        return "(" + ", ".join(values) + ")"
+
+
+def _decimal(text: str) -> str:
+    """Python takes no 007 for a number."""
+    return text.lstrip("0") or "0" if text.isdigit() else text

@@ -1,0 +1,183 @@
+"""How late a camera's stamps come, from sweeps to and fro: on boards projected by OpenCV, and on the simulated cell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.calibration import ScanCalibration
+from cell.calibration.collect.timing import collect_timing
+from cell.calibration.solve.reference import Reference
+from cell.calibration.solve.results import KEPT, Quality
+from cell.calibration.store import CellCalibration
+from cell.calibration.timing import Timing
+from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_timing
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from cell.geometry.camera import CameraModel
+from cell.geometry.light_plane import LightPlane
+from cell.inversion import NominalSurface
+from cell.job import load_job
+from cell.lab.bench.whole_job import run_whole_job
+from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.run import Run
+from cell.steps.moves import Mover
+from cell.vision import BoardView, parse_board
+from drivers.errors import RefusedError
+from sim_backends.world import scene
+from tests.test_rail_sweep import ERRORS, sweep
+
+CONFIG = load_config(None)
+CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
+BOARD = parse_board("chessboard:9x7:3mm")
+FAR_MM = 130.0
+MOST_LATE_S, LEAD_M = 2e-3, 2e-3
+FOUND = Timing(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9)
+
+
+def calibration() -> ScanCalibration:
+    """A head that looks square at the board, a hair off where the board is, as calibrations are."""
+    turned = pin.SE3(np.diag([1.0, 1.0, 1.0]), np.array([-12e-3 + 2e-4, -9e-3, 1e-3 * FAR_MM + 3e-4]))
+    reference = Reference(turned, np.eye(27), 1e-4, 1e-4, 1e-5, 1.0, 1.0)
+    plane, along, here = LightPlane.of((1.0, 0.0, -0.29), -0.035), np.array([1.0, 0.0, 0.0]), pin.SE3.Identity()
+    return ScanCalibration(
+        CAMERA, plane, along, here, np.eye(KEPT), Quality(20, 1.0, 0.05, 1e-5, 0.05, 1e-5), reference
+    )
+
+
+def sweeps(
+    seed: int,
+    late: float,
+    play: float = 12e-6,
+    readout: float = 0.0,
+    by_exposure: float = 0.0,
+    jitter: float = 0.25e-3,
+    bound: float = 0.25e-3,
+) -> list[TimedSweep]:
+    """Sixteen of them, as the cell makes them, of clocks that are known to ±`bound` s; each sweep's are off by anything
+    up to ±`jitter` s.
+    """
+    rng = np.random.default_rng(seed)
+    corners = BOARD.points()
+    made = []
+    fast, slow = [(0.04, 10e-3), (0.04, 5e-3)], [(0.01, 10e-3), (0.01, 5e-3)]
+    for speed, exposure in [*fast, slow[0], *fast, slow[1], *fast]:
+        for velocity in (speed, -speed):
+            off = late + by_exposure * exposure + rng.uniform(-jitter, jitter)
+            frames = []
+            for read in np.linspace(-0.01, 0.01, 7) + rng.uniform(-1e-3, 1e-3):
+                # The screw's own error, which is the same whichever way it is passed.
+                true = (
+                    read
+                    - velocity * off
+                    - np.sign(velocity) * play / 2
+                    + 3e-6 * np.sin(2 * np.pi * read / LEAD_M + 1.0)
+                )
+                place = np.array([-12e-3 - true, -9e-3, 1e-3 * FAR_MM])
+                pixels = cv2.projectPoints(corners, np.zeros(3), place, CAMERA.matrix, np.zeros(5))[0].reshape(-1, 2)
+                rows = pixels[:, 1] / CAMERA.height - 0.5
+                pixels[:, 0] -= velocity * readout * rows * CAMERA.fx / (1e-3 * FAR_MM)
+                pixels += rng.normal(0.0, 0.03, pixels.shape)
+                seen = BoardView(BOARD, (640, 480), np.arange(len(corners)), pixels, np.full(len(corners), 0.03))
+                frames.append(TimedFrame(seen, float(read)))
+            made.append(TimedSweep(velocity, exposure, bound, frames))
+    return made
+
+
+def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() -> None:
+    here, off = pin.SE3.Identity(), []
+    for seed in range(10):
+        late = np.random.default_rng(100 + seed).uniform(-0.5e-3, 2e-3)
+        found = find_timing(calibration(), here, sweeps(seed, late), MOST_LATE_S, LEAD_M)
+        assert found.sigma < 0.12e-3
+        assert abs(found.readout) < 0.1e-3
+        assert found.play == pytest.approx(12e-6, abs=4 * found.play_sigma)
+        off.append((found.late - late) / found.sigma)
+    assert np.abs(off).max() < 3.5
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatters() -> None:
+    """A link whose shortest round trip is kept: what it left open once, it leaves open in every sweep."""
+    found = find_timing(calibration(), pin.SE3.Identity(), sweeps(5, 1e-3 + 0.2e-3, jitter=0.0), MOST_LATE_S, LEAD_M)
+    assert found.sigma == pytest.approx(0.25e-3 / np.sqrt(3), rel=0.1)
+    assert abs(found.late - 1e-3) < 2 * found.sigma
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [
+        ({"readout": 12e-3}, r"rolling shutter: its last row is exposed 12\.0 ms after"),
+        ({"by_exposure": 1.0}, r"1\.\d\d times what an exposure is longer|0\.9\d times what an exposure is longer"),
+        ({"by_exposure": 0.5}, r"stamp the start of the exposure"),
+        ({"jitter": 1.5e-3}, r"the sweeps differ by more than time stamps do"),
+        ({"late": 4.4e-3}, r"come 4\.\d+ ms late, scan_camera\.late allows 2 ms.*scan_camera\.late = \"5 ms\""),
+    ],
+)
+def test_what_no_correction_mends_is_refused_by_name(spoilt: dict[str, float], words: str) -> None:
+    with pytest.raises(RefusedError, match=words):
+        find_timing(calibration(), pin.SE3.Identity(), sweeps(3, **{"late": 0.5e-3, **spoilt}), MOST_LATE_S, LEAD_M)
+
+
+def test_sweeps_that_hardly_show_the_board_are_refused() -> None:
+    few = [replace(one, frames=one.frames[:2]) for one in sweeps(1, 0.0)]
+    with pytest.raises(RefusedError, match="2 pictures of the sweep at \\+40 mm/s"):
+        find_timing(calibration(), pin.SE3.Identity(), few, MOST_LATE_S, LEAD_M)
+
+
+def test_it_is_stored_with_the_calibration() -> None:
+    head = replace(calibration(), timing=FOUND)
+    assert ScanCalibration.from_dict(head.as_dict()).timing == FOUND
+    assert "timing" not in calibration().as_dict()
+    with pytest.raises(ValueError, match="time stamps"):
+        Timing.read(FOUND.as_dict() | {"sigma": 0.0})
+
+
+def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
+    before = sweep(errors=replace(ERRORS, late=MOST_LATE_S))
+    after = sweep(errors=replace(ERRORS, late=MOST_LATE_S, timing=FOUND))
+    same = np.isin(before.frame_ids, after.frame_ids)
+    # At 20 mm/s.
+    moved = before.rail[same] - after.rail[np.isin(after.frame_ids, before.frame_ids)]
+    assert moved == pytest.approx(np.full(len(moved), 0.02 * FOUND.late), abs=0.3e-6)
+    shares = [float(np.sqrt(np.linalg.eigvalsh(one.covariance)[-1])) for one in (before, after)]
+    assert shares[0] > 0.02 * MOST_LATE_S / np.sqrt(3)
+    assert shares[1] < 0.005e-3
+
+
+def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> Timing:
+    """What the simulated cell of `seed` finds."""
+    cell = VirtualCell(CONFIG, seed, level, "pot")
+    job, _ = load_job("pot")
+
+    def look(hands: Hands) -> Timing:
+        cell.devices.interlocks.work_with(made.configuration)
+        cell.devices.vehicle.brake()
+        mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, hands.safe_point)
+        given = CONFIG, cell.devices, mover, made, hands.check, lambda f, t: None, lambda what, frame: None
+        return collect_timing(*given)
+
+    return Run("timing", lambda run: RecordedWork(run, "timing", cell.devices, folder, {}).perform(look)).result()
+
+
+@pytest.mark.campaign
+def test_ten_simulated_cells_know_their_lateness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two milliseconds late each; the eleventh has a rolling shutter."""
+    drawn = scene._clock
+    monkeypatch.setattr(scene, "_clock", lambda *given: replace(drawn(*given), latency=2e-3))
+    job, mesh = load_job("pot")
+    nominal, off = NominalSurface.load(mesh, unit=job.surface.mesh_unit), []
+    for seed in range(1, 11):
+        record = run_whole_job(CONFIG, job, nominal, seed, "nominal")
+        assert record.calibration is not None
+        found = measured(record.calibration, seed, "nominal", tmp_path)
+        assert found.sigma <= 0.2e-3
+        off.append((found.late - 2e-3) / found.sigma)
+    assert np.abs(off).max() < 3.5
+    with pytest.raises(RefusedError, match="rolling shutter"):
+        measured(record.calibration, 10, "nominal+rolling_shutter", tmp_path)

@@ -1,0 +1,99 @@
+"""First touch: where a force begins, by closed forms; and a laser that turned unseen, on the simulated cell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.config import load_config
+from cell.inversion import NominalSurface
+from cell.job import Job, load_job
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from cell.steps.touch import FELT_M, Touch, TouchCheck, expected_touch, felt_touch
+from drivers.interfaces import ArmSafety, ArmState
+from sim_backends.world import effects
+
+JOB, MESH = load_job("pot")
+NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+UP = np.array([0.6, 0.0, 0.8])
+ORIGIN = np.array([0.3, -0.2, 0.5])
+HEIGHTS = np.linspace(1e-3, -0.5e-3, 300)
+NOISE_N = 0.35
+
+
+def states(forces: np.ndarray, like: ArmState, seed: int = 0) -> list[ArmState]:
+    """A descent along `UP` with a force along it, that ends at 8 N, and noise on every axis."""
+    forces = forces[: np.argmax(forces > 8.0) or None]
+    noise = np.random.default_rng(seed).normal(0.0, NOISE_N, (len(forces), 3))
+    made = []
+    for height, force, scatter in zip(HEIGHTS, forces, noise, strict=False):
+        flange = np.concatenate([ORIGIN + height * UP, np.zeros(3)])
+        made.append(replace(like, flange=flange, wrench=np.concatenate([force * UP + scatter, np.zeros(3)])))
+    return made
+
+
+@pytest.fixture(scope="module")
+def still() -> ArmState:
+    zero = np.zeros(6)
+    return ArmState(0.0, zero, zero, zero, zero, ArmSafety.NORMAL, False, 0, 0)
+
+
+@pytest.mark.parametrize("grows", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("height", [0.2e-3, -0.15e-3])
+def test_the_touch_is_where_the_force_begins_flat_on_an_edge_or_round(
+    height: float, grows: float, still: ArmState
+) -> None:
+    """A flat contact presses back in proportion, an edge with the square, round bodies (Hertz) with the power 3/2."""
+    forces = 8.0 * (np.maximum(0.0, height - HEIGHTS) / 0.4e-3) ** grows
+    found = [felt_touch(states(forces, still, seed), ORIGIN, UP) for seed in range(8)]
+    off = np.array([(one.height - height) / one.sigma for one in found if one is not None])
+    assert len(off) == 8
+    assert np.sqrt(np.mean(off**2)) < 1.2
+    assert FELT_M <= max(one.sigma for one in found if one is not None) < 0.1e-3
+
+
+def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState) -> None:
+    assert felt_touch(states(np.zeros(300), still)[:10], ORIGIN, UP) is None
+
+
+def test_a_touch_is_noted_before_it_is_refused() -> None:
+    check = TouchCheck(Touch(-0.3e-3, 0.0), Touch(0.0, 0.1e-3))
+    check.require()
+    assert "0.300 mm lower than the scan says" in check.notes[0]
+    assert TouchCheck(Touch(-0.2e-3, 0.0), Touch(0.0, 0.1e-3)).notes == ()
+
+
+def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRecord) -> None:
+    assert placed_pot.placing is not None
+    pose, known = placed_pot.results["invert_pose"], replaced_grasp(1e-6, 1e-6)
+    tilted = replaced_grasp(1e-6, 3e-3)
+    steady, early = (expected_touch(job, NOMINAL, pose, placed_pot.placing) for job in (known, tilted))
+    # Half of edges 35 and 18 mm away, which is what tilts of 3 mrad (1 σ) bring in the mean: 0.8 σ, for either way.
+    assert early.height == pytest.approx(0.5 * 0.8 * 3e-3 * (0.035 + 0.018), rel=0.25)
+    assert steady.height < 0.5 * early.height
+    assert early.sigma > steady.sigma
+
+
+def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
+    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One milliradian, no plate to see it on, and a job that knows its grasp as this level's claw holds it."""
+    assert placed_pot.calibration is not None
+    blind = replace(placed_pot.calibration, scan=replace(placed_pot.calibration.scan, witness=None))
+    monkeypatch.setattr(effects, "ALONE", replace(effects.ALONE, laser_pointing=150e-6))
+    job, quick = replaced_grasp(0.02e-3, 0.1e-3), {"speed": 2 * JOB.scan.speed}
+    job = job.model_copy(update={"scan": JOB.scan.model_copy(update=quick)})
+    before = replace(placed_pot, calibration=blind)
+    level = "nominal+laser_pointing"
+    done = run_whole_job(load_config(None), job, NOMINAL, placed_pot.seed, level, calibrated=before, stood=3600.0)
+    assert done.outcome == "refused"
+    assert done.stage == "place"
+    assert "than the scan says" in done.reason
+    assert "still held" in done.reason
+
+
+def replaced_grasp(sigma: float, angle: float) -> Job:
+    """The job with a grasp that is known to `sigma` m and `angle` rad."""
+    return JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"sigma": sigma, "sigma_angle": angle})})

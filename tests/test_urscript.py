@@ -1,0 +1,341 @@
+"""URScript on the simulated controller, without its network: the language, threads, registers, watchdogs, motions."""
+
+from __future__ import annotations
+
+import math
+import socket
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.peers.rtde_registers import Registers
+from sim_backends.peers.script import ControlProgram, RuntimeState
+from sim_backends.peers.urscript.words import Collector
+
+TICK = 0.002
+
+
+class Controller:
+    """A model, its program and their common tick."""
+
+    def __init__(self) -> None:
+        self.model = ArmModel(ArmParams(), np.random.default_rng(1), WorldClock())
+        self.registers = Registers()
+        self.program = ControlProgram(self.model, self.registers)
+
+    def cycles(self, count: int) -> None:
+        for _ in range(count):
+            self.program.tick()
+            self.model.tick(self.model.time + TICK)
+
+    def run(self, text: str, most: int = 3000) -> None:
+        """Run a program to its end."""
+        self.program.load(text)
+        for _ in range(most):
+            if self.program.runtime_state is RuntimeState.STOPPED:
+                return
+            self.cycles(1)
+        raise AssertionError("the program did not end")
+
+    def said(self) -> list[str]:
+        """What the program has written for the log."""
+        return [words for kind, words in self.program.announcements if kind == "text"]
+
+    def failed(self) -> list[str]:
+        return [words for kind, words in self.program.announcements if kind == "failed"]
+
+
+@pytest.fixture
+def controller() -> Controller:
+    return Controller()
+
+
+def program(*lines: str) -> str:
+    return "def program():\n" + "".join(f"  {line}\n" for line in lines) + "end\n"
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("1 + 2 * 3 - 8 / 4", "5"),
+        ("7 / 2", "3.5"),
+        ("-2 * -(3 + 1)", "8"),
+        ("17 % 5", "2"),
+        ("0x1F", "31"),
+        ("1e3", "1000"),
+        ("not 1 > 2 and True", "True"),
+        ("True xor True", "False"),
+        ("False or 2 == 2.0", "True"),
+        ("[1, 2, 3] + [10, 20, 30]", "[11, 22, 33]"),
+        ("2 * [1, 2] - [1, 1]", "[1, 3]"),
+        ("[1, 2] / 4", "[0.25, 0.5]"),
+        ("[[1, 2], [3, 4]][1][0]", "3"),
+        ("pow(2, 10)", "1024"),
+        ("norm([3, 4])", "5"),
+        ("norm(-2)", "2"),
+        ("str_cat(\"a\", 1.5)", "a1.5"),
+        ("str_sub(\"hello\", 1, 3)", "ell"),
+        ("to_num(\"2.5\") + 1", "3.5"),
+        ("get_list_length([1, 2, 3])", "3"),
+        ("struct(a = 1, b = [2]).b", "[2]"),
+        ("p[1, 2, 3, 0, 0, 0]", "p[1, 2, 3, 0, 0, 0]"),
+        ("binary_list_to_integer(integer_to_binary_list(-5))", "-5"),
+    ],
+)  # fmt: skip
+def test_expressions_have_the_values_of_arithmetic(controller: Controller, expression: str, value: str) -> None:
+    controller.run(program(f"textmsg({expression})"))
+    assert controller.said() == [value]
+
+
+def test_poses_are_combined_as_an_independent_library_does_it(controller: Controller) -> None:
+    a, b = [0.1, -0.2, 0.3, 0.5, -1.1, 0.7], [0.4, 0.0, -0.1, -0.2, 0.3, 2.0]
+    controller.run(
+        program(
+            f"c = pose_trans(p{a}, p{b})",
+            "i = 0",
+            "while i < 6:",
+            "  write_output_float_register(i, c[i])",
+            "  i = i + 1",
+            "end",
+        )
+    )
+    turn = Rotation.from_rotvec(a[3:])
+    np.testing.assert_allclose(controller.registers.double_out[:3], np.array(a[:3]) + turn.apply(b[:3]), atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(controller.registers.double_out[3:6]).as_matrix(),
+        (turn * Rotation.from_rotvec(b[3:])).as_matrix(),
+        atol=1e-12,
+    )
+
+
+def test_functions_loops_branches_and_scopes(controller: Controller) -> None:
+    controller.run(
+        """def program():
+  global total = 0
+  outer = 5
+  def add(value, times=1):
+    local i = 0
+    while True:
+      if i >= times:
+        break
+      elif value < 0:
+        return -1
+      end
+      total = total + value
+      i = i + 1
+    end
+    outer = outer + 1
+    hidden = 3
+    return total
+  end
+  textmsg(add(2, times=3))
+  textmsg(add(-1))
+  textmsg("outer ", outer)
+  numbers = [1, 2]
+  others = numbers
+  others[0] = 9
+  textmsg(numbers)
+  switch (total):
+    case 5:
+      textmsg("five")
+    end
+    case 6:
+      textmsg("six")
+    end
+    default:
+      textmsg("other")
+    end
+  end
+  if total == 6 and
+    outer == 6:
+    textmsg("a line that goes on")
+  end
+  halt
+  textmsg("never")
+end
+"""
+    )
+    assert controller.said() == ["6", "-1", "outer 6", "[1, 2]", "six", "a line that goes on"]
+    assert controller.failed() == []
+
+
+def test_threads_share_globals_take_turns_and_are_joined_and_killed(controller: Controller) -> None:
+    controller.program.load(
+        """def program():
+  global count = 0
+  thread counting():
+    while True:
+      count = count + 1
+      sync()
+    end
+  end
+  thread brief():
+    sleep(0.02)
+    textmsg("brief ends")
+  end
+  counter = run counting()
+  other = run brief()
+  join other
+  textmsg("joined")
+  sleep(0.1)
+  kill counter
+  seen = count
+  sleep(0.1)
+  textmsg(seen == count)
+  textmsg(seen > 55 and seen < 65)
+end
+"""
+    )
+    controller.cycles(200)
+    assert controller.said() == ["brief ends", "joined", "True", "True"]
+    assert controller.program.runtime_state is RuntimeState.STOPPED
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("x = ", "'\\n'"),
+        ("launch()", "'launch'"),
+        ("if True", "needed"),
+        ("@", "'@"),
+    ],
+)
+def test_a_text_that_does_not_compile_changes_nothing_and_its_line_is_named(
+    controller: Controller, line: str, reason: str
+) -> None:
+    controller.program.load(program("while True:", "  sync()", "end"))
+    controller.cycles(2)
+    controller.program.load(program(line))
+    assert controller.program.runtime_state is RuntimeState.PLAYING
+    assert "line 2" in controller.failed()[0] or "line 3" in controller.failed()[0]
+    assert reason.strip("'") in controller.failed()[0] or reason == "'\\n'"
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("textmsg(missing)", "variable 'missing' is not defined"),
+        ("x = 1 / 0", "division by zero"),
+        ("x = [1, 2][5]", "index"),
+        ("while True: \n  x = 1\n end", "infinite loop"),
+        ("get_inverse_kin(p[9, 0, 0, 0, 0, 0])", "no solution"),
+        ("write_output_integer_register(48, 1)", "register 48 does not exist"),
+        ("movej([0, 0, 0, 0, 0])", "six"),
+    ],
+)
+def test_a_run_time_error_ends_the_program_and_says_why(controller: Controller, line: str, reason: str) -> None:
+    controller.run(program(line, 'textmsg("went on")'))
+    assert controller.said() == []
+    assert reason in controller.failed()[0]
+
+
+def test_a_script_reaches_nothing_of_the_host(controller: Controller) -> None:
+    for line in ("x = __import__", "open(1)", "exec(1)", "x = [1].__class__", "eval(1)"):
+        controller.run(program(line))
+    assert len(controller.failed()) == 5
+
+
+def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None:
+    goal = [0.3, -1.5, -1.6, -1.5, 1.5, 0.1]
+    controller.program.load(program(f"movej({goal}, t=1.0)", "write_output_integer_register(0, 1)"))
+    controller.cycles(495)
+    assert controller.registers.int_out[0] == 0
+    controller.cycles(10)
+    assert controller.registers.int_out[0] == 1
+    np.testing.assert_allclose(controller.model.drive.q, goal, atol=1e-9)
+    before = controller.model.drive.base_from_tcp()
+    controller.run(program("movel(pose_add(get_actual_tcp_pose(), p[0, 0, -0.05, 0, 0, 0]), v=0.1)"))
+    way = controller.model.drive.base_from_tcp()[:3, 3] - before[:3, 3]
+    np.testing.assert_allclose(way, [0, 0, -0.05], atol=1e-6)
+
+
+def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller) -> None:
+    controller.program.load(program("speedj([0.2, 0, 0, 0, 0, 0], 2.0, 0.3)", "sleep(1)"))
+    controller.cycles(150)
+    assert controller.model.drive.qd[0] == pytest.approx(0.2)
+    controller.cycles(60)
+    assert not controller.model.moving
+    controller.program.load(
+        "def program():\n  thread go():\n    movej([1, -1.57, -1.57, -1.57, 1.57, 0])\n  end\n"
+        "  mover = run go()\n  sleep(0.3)\n  kill mover\n  sleep(1)\nend\n"
+    )
+    controller.cycles(140)
+    assert controller.model.moving
+    controller.cycles(160)
+    assert not controller.model.moving
+
+
+def test_two_threads_cannot_move_the_arm_at_once(controller: Controller) -> None:
+    controller.run(
+        "def program():\n  thread go():\n    movej([1, -1.57, -1.57, -1.57, 1.57, 0])\n  end\n"
+        "  mover = run go()\n  sync()\n  sync()\n  movej([0, -1.57, -1.57, -1.57, 1.57, 0])\nend\n"
+    )
+    assert "another thread is already controlling the robot" in controller.failed()[0]
+
+
+@pytest.mark.parametrize(("action", "state"), [("PAUSE", RuntimeState.PAUSED), ("STOP", RuntimeState.STOPPED)])
+def test_a_watched_input_that_is_not_written_to_pauses_or_stops(
+    controller: Controller, action: str, state: RuntimeState
+) -> None:
+    name = "input_int_register_0"
+    controller.program.load(program(f'rtde_set_watchdog("{name}", 10, "{action}")', "while True:", "  sync()", "end"))
+    for _ in range(5):
+        controller.cycles(45)
+        controller.registers.written[name] += 1
+    assert controller.program.runtime_state is RuntimeState.PLAYING
+    controller.cycles(60)
+    assert controller.program.runtime_state is state
+
+
+def test_a_script_talks_with_a_server_and_only_on_loopback(controller: Controller) -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+    controller.program.load(
+        program(
+            'textmsg(socket_open("192.0.2.1", 5))',
+            f'textmsg(socket_open("127.0.0.1", {port}, "s"))',
+            'textmsg(socket_read_binary_integer(2, "s", 0.01))',
+            'socket_send_line("hello", "s")',
+            'socket_send_int(-2, "s")',
+            'textmsg(socket_read_binary_integer(2, "s", 0))',
+            'textmsg(socket_read_ascii_float(2, "s"))',
+            'textmsg(socket_read_string("s", "<", ">"))',
+        )
+    )
+    controller.cycles(20)
+    connection = server.accept()[0]
+    assert connection.recv(100) == b"hello\n\xff\xff\xff\xfe"
+    assert controller.program.runtime_state is RuntimeState.PLAYING
+    connection.sendall(b"\0\0\0\7\xff\xff\xff\xff(1.5, 2)<ok>")
+    controller.cycles(10)
+    connection.close()
+    server.close()
+    assert controller.said() == ["False", "True", "[0, 0, 0]", "[2, 7, -1]", "[2, 1.5, 2]", "ok"]
+
+
+def test_texts_are_taken_whole_however_they_arrive() -> None:
+    text = "def a():\n  def b():\n  if True:\n sync()\nend\nend\nb()\nend\n"
+    collector = Collector()
+    whole = [one for byte in (text + "movej([0])\n").encode() for one in collector.feed(bytes([byte]))]
+    assert whole == [text, "movej([0])\n"]
+    assert Collector(longest=100).feed(b"def a():\n" + b"x" * 200) == []
+
+
+def test_actual_values_are_those_of_the_arm(controller: Controller) -> None:
+    controller.run(
+        program(
+            "set_tcp(p[0, 0, 0.1, 0, 0, 0])",
+            "q = get_actual_joint_positions()",
+            "again = get_inverse_kin(get_forward_kin(q), q)",
+            "write_output_float_register(0, norm(again - q))",
+            "write_output_float_register(1, point_dist(get_actual_tcp_pose(), get_actual_tool_flange_pose()))",
+            "write_output_float_register(2, get_steptime())",
+        )
+    )
+    error, length, step = controller.registers.double_out[:3]
+    assert error < 1e-8
+    assert math.isclose(length, 0.1, abs_tol=1e-12)
+    assert step == TICK
