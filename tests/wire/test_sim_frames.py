@@ -286,13 +286,14 @@ def test_stopping_leaves_no_thread_even_in_mid_stream(clock: WorldClock, scene: 
 
 def test_the_truth_endpoint_tells_the_truth_and_causes_faults() -> None:
     faults: list[str] = []
+    drawn: list[str] = []
 
     def fault(name: str) -> None:
         if name != "rail.drop_reply":
             raise ValueError(f"unknown fault {name!r}; known: rail.drop_reply")
         faults.append(name)
 
-    peer = TruthPeer(lambda: {"pose": np.eye(2), "s": np.float64(0.5)}, fault, faults.clear)
+    peer = TruthPeer(lambda: {"pose": np.eye(2), "s": np.float64(0.5)}, fault, faults.clear, drawn.append)
     peer.start()
     host, port = peer.address.split(":")
     with socket.create_connection((host, int(port)), timeout=3.0) as connection, connection.makefile("rwb") as lines:
@@ -309,6 +310,8 @@ def test_the_truth_endpoint_tells_the_truth_and_causes_faults() -> None:
         assert "known: rail.drop_reply" in ask(b'{"op": "fault", "name": "rail.explode"}')["error"]
         assert ask(b'{"op": "reset"}') == {"ok": True}
         assert faults == []
+        assert ask(b'{"op": "make_ready", "drawing": "of a job"}') == {"ok": True}
+        assert drawn == ["of a job"]
         for bad in (b'{"op": "dance"}', b"[]", b"not json", b"\xff\xfe", b'{"no": 1}'):
             assert ask(bad)["ok"] is False
     peer.stop()
