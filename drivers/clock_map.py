@@ -1,7 +1,8 @@
 """The way from a device's clock to the host's, from latched device times and their round trips.
 
 The device latched at some instant within the round trip, so half of it bounds the error of its middle. Of several
-latches the shortest is kept; latches far apart show how fast the device's clock runs.
+latches the shortest is kept; latches far apart show how fast the device's clock runs. A clock that was set meanwhile,
+by a restart or by a time service, contradicts its earlier latches: they are forgotten.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ class ClockMap:
     def add(self, latches: Iterable[Latch]) -> None:
         """Take the latches of one moment, of which the shortest round trip counts."""
         newest = min(latches, key=lambda latch: latch.bound)
+        if self._best is not None and not self._continues(newest):
+            self._latches.clear()
+            self._rate, self._drift = 1.0, MAX_DRIFT
         self._latches.append(newest)
         oldest = self._latches[0]
         span = newest.device - oldest.device
@@ -54,6 +58,10 @@ class ClockMap:
             self._drift = uncertainty
         self._best = min(self._latches, key=lambda latch: latch.bound + self._drift * (newest.host - latch.host))
         self._newest = newest
+
+    def _continues(self, latch: Latch) -> bool:
+        """Whether the clock may have run on evenly from the earlier latches to this one."""
+        return abs(self.host_time(latch.device) - latch.host) <= self.bound_at(latch.host) + latch.bound
 
     def host_time(self, device: float) -> float:
         """Host time in s at which the device's clock read `device` s."""

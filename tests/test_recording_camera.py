@@ -82,6 +82,11 @@ def test_what_is_wrong_with_a_recording_is_named(tmp_path: Path) -> None:
         (folder / "times.csv").write_text(text)
         with pytest.raises(ConfigError, match=words):
             opened(folder)
+    (folder / "times.csv").write_text(good, encoding="utf-8-sig")  # as spreadsheets write it
+    opened(folder)
+    (folder / "times.csv").write_text(good, encoding="utf-16")
+    with pytest.raises(ConfigError, match="is no table of text"):
+        opened(folder)
     (folder / "times.csv").unlink()
     with pytest.raises(ConfigError, match="cannot be read"):
         opened(folder)

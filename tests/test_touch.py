@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config import load_config
-from cell.inversion import NominalSurface
+from cell.inversion import NominalSurface, PlacePose
+from cell.inversion.observability import Motion, Verdict
 from cell.job import Job, load_job
 from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.steps.touch import FELT_M, Touch, TouchCheck, expected_touch, felt_touch
+from drivers.errors import RefusedError
 from drivers.interfaces import ArmSafety, ArmState
 from sim_backends.world import effects
 
@@ -97,3 +100,23 @@ def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
 def replaced_grasp(sigma: float, angle: float) -> Job:
     """The job with a grasp that is known to `sigma` m and `angle` rad."""
     return JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"sigma": sigma, "sigma_angle": angle})})
+
+
+def test_a_part_that_is_put_down_aslant_touches_along_its_own_way() -> None:
+    """On flat ground, on a way 40° off its normal, an error of the place is felt 1/cos 40° as large."""
+    corners = 0.02 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    flat = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
+    made, none = np.diag([1e-8] * 3 + [0.0] * 3), np.zeros((6, 6))
+    verdict = Verdict(Motion(np.zeros(3), np.zeros(3), 0.0, ""), (), (), np.ones(6))
+    pose = PlacePose(pin.SE3.Identity(), made, none, made, verdict, 0.0, 1.0, 1000, 1.0, 1.0, 0.0, np.zeros(6), 0.0)
+    known = replaced_grasp(1e-9, 1e-9)
+
+    def aslant(degrees: float) -> Job:
+        way = {"translation": ["0 mm"] * 3, "rotation": ["0 deg", f"{degrees} deg", "0 deg"]}
+        turned = JOB.place.surface_from_part.model_validate(way)
+        return known.model_copy(update={"place": JOB.place.model_copy(update={"surface_from_part": turned})})
+
+    touch = expected_touch(aslant(40.0), flat, pose, none)
+    assert touch.sigma == pytest.approx(1e-4 / np.cos(np.radians(40.0)), rel=0.08)
+    with pytest.raises(RefusedError, match="steeper everywhere"):
+        expected_touch(aslant(90.0), flat, pose, none)

@@ -339,3 +339,57 @@ def test_actual_values_are_those_of_the_arm(controller: Controller) -> None:
     assert error < 1e-8
     assert math.isclose(length, 0.1, abs_tol=1e-12)
     assert step == TICK
+
+
+NESTED = "def program():\n" + "while True:\n" * 25 + "end\n" * 26
+SAME_NAME_TWICE = "def program():\n  def f(a, a):\n  end\nend\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        NESTED,
+        SAME_NAME_TWICE,
+        program("x = " + "(" * 3000 + "1" + ")" * 3000),
+        program("x = " + "+".join(["1"] * 20000)),
+        program("break"),
+        program("3 = 3"),
+    ],
+)
+def test_a_text_that_python_does_not_compile_is_a_compile_error(controller: Controller, text: str) -> None:
+    assert not controller.program.load(text)
+    assert controller.failed()
+
+
+FIBONACCI = "def program():\n def f(n):\n  if n < 2:\n   return n\n  end\n  return f(n-1)+f(n-2)\n end\n f(60)\nend\n"
+FORKING = "def program():\n thread t():\n  run t()\n  run t()\n  sync()\n end\n run t()\n sleep(1)\nend\n"
+SQUARES = "def program():\n def f(n):\n  return f(n*n)\n end\n f(9)\nend\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (FIBONACCI, "infinite loop"),
+        (FORKING, "threads"),
+        (SQUARES, "bits"),
+        (program("x = 9", "while True:", "x = x * x", "end"), "bits"),
+        (program('x = "aaaaaaaa"', "while True:", "x = str_cat(x, x)", "end"), "characters"),
+        (program("x = [1, 1]", "while True:", "x = [x, x]", "end"), "values"),
+        (program("x = make_list(2000000000, 0)"), "elements"),
+        (program("x = pow(10, 1000000000)"), "range"),
+        (program("socket_send_int(99999999999)"), "2147483647"),
+    ],
+)
+def test_a_script_that_would_never_give_way_ends_and_the_controller_goes_on(
+    controller: Controller, text: str, reason: str
+) -> None:
+    controller.run(text, 60)
+    assert reason in controller.failed()[-1]
+    controller.run(program("sync()"))
+
+
+def test_a_function_changes_only_its_own_copy_of_a_list(controller: Controller) -> None:
+    controller.run(
+        "def program():\n  def f(a):\n    a[0] = 7\n  end\n  b = [1]\n  f(b)\n  textmsg(to_str(b[0]))\nend\n"
+    )
+    assert controller.said() == ["1"]

@@ -9,6 +9,7 @@ from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.faults import driver_trouble, system_trouble
 from drivers.vehicle.feedback import CAN_MODE, Feedback
+from drivers.vehicle.version import VersionAnswer
 
 
 class Hand(Clock):
@@ -177,3 +178,14 @@ def test_that_commands_stayed_away_is_no_fault_of_a_vehicle_that_nobody_commands
     assert system_trouble(0x0200, commanded=False) == ()
     assert system_trouble(0x0200, commanded=True) == ("commands stayed away",)
     assert system_trouble(0x0100, commanded=False) == ("a motor driver fails",)
+
+
+def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros() -> None:
+    answer = VersionAnswer()
+    for part in [b"SCOUT V2", b".3-1\0\0\0\0", *[bytes(8)] * 8]:
+        assert not answer.is_complete()
+        words = (int.from_bytes(part[k : k + 2], "big") for k in range(0, 8, 2))
+        names = ("ControllerHardware", "DriverHardware", "ControllerSoftware", "DriverSoftware")
+        answer.take("VersionResponse", dict(zip(names, words, strict=True)))
+    assert answer.is_complete()
+    assert answer.describe() == "SCOUT V2.3-1"

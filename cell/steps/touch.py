@@ -115,9 +115,16 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
     steps = np.random.default_rng(0).standard_normal((DRAWS, 6)) @ root.T
     every = max(1, len(nominal.samples) // UNDERSIDE)
     normals = nominal.normals[nominal.sample_triangles[::every]]
-    ground = normals[:, 2] > STEEPEST
-    # Each point's way to the ground, straight down, where the part is displaced by d: n·d / n_z.
-    slopes = normals[ground] / normals[ground, 2:]
+    up = job.place.surface_from_part.se3().rotation[:, 2]
+    rise = normals @ up
+    ground = rise > STEEPEST
+    if not ground.any():
+        raise RefusedError(
+            "the surface is steeper everywhere than the part could be set down on, seen along the part's z axis; "
+            "correct place.surface_from_part or the surface's mesh"
+        )
+    # Each point's way to the ground, down the part's axis, where the part is displaced by d: n·d / n·up.
+    slopes = normals[ground] / rise[ground, None]
     arms = nominal.samples[::every][ground] - job.place.surface_from_part.se3().translation
     gaps = steps[:, :3] @ slopes.T + steps[:, 3:] @ np.cross(arms, slopes).T
     heights = -np.concatenate([gaps.min(axis=1), gaps.mean(axis=1)])

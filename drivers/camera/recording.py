@@ -50,7 +50,7 @@ def read_times(folder: Path) -> list[Recorded]:
     path = folder / TIMES
     rows: list[Recorded] = []
     try:
-        with path.open(encoding="utf-8", newline="") as text:
+        with path.open(encoding="utf-8-sig", newline="") as text:
             for line, row in enumerate(csv.DictReader(text), 2):
                 try:
                     made = Recorded(
@@ -70,6 +70,8 @@ def read_times(folder: Path) -> list[Recorded]:
                 rows.append(made)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}. Write the pictures' times there") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: is no table of text: {error}. Write it as CSV in UTF-8") from error
     if len(rows) < 2:
         raise ConfigError(f"{path}: has {len(rows)} pictures (allowed: at least 2). Record more")
     return rows

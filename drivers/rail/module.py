@@ -79,14 +79,17 @@ def set_ramp(link: TmclLink, acceleration: int) -> None:
     set_checked(link, Axis.MAX_ACCELERATION, acceleration, ACCELERATION)
     for axis in (Axis.MAX_DECELERATION, Axis.RAMP_18):
         _if_there(link, axis, acceleration, ACCELERATION)
+    raised = False
     for axis in _ZERO_PHASE:
         try:
             _if_there(link, axis, 0, SPEED)
         except CommandRefused as refused:
-            if refused.status != WRONG_VALUE or axis is Axis.RAMP_19:
+            if refused.status != WRONG_VALUE or axis is Axis.RAMP_19 or raised:
                 raise
-            # A first acceleration that may not be 0: with its end speed at 0 it is not used.
+            # A first acceleration that may not be 0: with its end speed at 0 it is not used. One of the two is the
+            # acceleration, the other a speed: not both.
             set_checked(link, axis, acceleration, ACCELERATION)
+            raised = True
     _if_there(link, Axis.STOP_VELOCITY, STOP_SPEED, SPEED)
 
 

@@ -29,9 +29,10 @@ class VersionAnswer:
         """Take a frame of one of the `ANSWERS`."""
         numbers = tuple(int(signals[name]) for name in _NUMBERS)
         data = struct.pack(">4H", *numbers)
-        if message == "VersionResponse" and all(byte in _PRINTABLE for byte in data) and data[0]:
+        # A text may be shorter than its frames: what follows it is zeros, and no numbers.
+        if message == "VersionResponse" and all(byte in _PRINTABLE for byte in data) and (data[0] or self._text):
             self._text.append(data)
-        else:
+        elif not self._text or message == "VersionNumbers":
             self._numbers = numbers
 
     def is_complete(self) -> bool:

@@ -37,7 +37,7 @@ def version_message(version: tuple[int, int, int, int]) -> bytes:
 
 def message(kind: str, words: str, time: float) -> bytes:
     """A message of the primary port: text, popup, started or stopped (a program by its name), failed or read-only."""
-    text = words.encode()
+    text = words.encode(errors="replace")
     if kind == "text":
         return _message(_TEXT, text, time)
     if kind == "popup":

@@ -74,11 +74,29 @@ def test_stamps_that_are_none_of_the_exposure_are_refused() -> None:
     assert caught.value.code == "camera.clock"
 
 
+def test_stamps_that_lie_in_the_future_end_a_stream() -> None:
+    """As after a time service has set the camera's clock: nothing of it may be paired with the rail."""
+    with served(replace(SPEC, latency=0.2)) as bench:
+        camera = bench.open()
+        camera.configure(0.004, 50.0)
+        with pytest.raises(DeviceFault, match="too late to be here already") as caught, camera.stream() as frames:
+            frames.next(5.0)
+        camera.close()
+    assert caught.value.code == "camera.clock"
+
+
 def test_block_ids_of_16_bits_begin_again_at_1() -> None:
     count = BlockCount()
     assert [count.of(block) for block in (65533, 65534, 65535, 1, 2, 5)] == [1, 2, 3, 4, 5, 8]
     long = BlockCount()
     assert [long.of(block) for block in (70_000, 70_001, 70_004)] == [1, 2, 5]
+
+
+def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids() -> None:
+    count = BlockCount()
+    assert [count.of(block) for block in (10, 12, 11, 13)] == [1, 3, 2, 4]
+    around = BlockCount()
+    assert [around.of(block) for block in (65534, 1, 65535, 2)] == [1, 3, 2, 4]
 
 
 # --- settings ---

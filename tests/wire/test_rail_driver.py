@@ -597,6 +597,24 @@ def test_a_refusal_of_the_module_is_a_fault_in_words(module: Callable[..., str])
 
 
 @pytest.mark.wire
+def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_a_speed(
+    module: Callable[..., str],
+) -> None:
+    """Of parameters 15 and 16 one is a speed, and modules differ in which."""
+    told: list[int] = []
+
+    def answer(request: bytes) -> bytes:
+        if request[1] != 5 or request[2] not in (15, 16):
+            return reply(request)
+        told.append(request[2])
+        return reply(request, status=100 if any(request[4:8]) else 4)
+
+    with pytest.raises(DeviceFault, match="command 5, type 16, value 0: invalid value"):
+        connect(module(answer), Clock())
+    assert told == [15, 15, 16]
+
+
+@pytest.mark.wire
 def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(module: Callable[..., str]) -> None:
     variables: dict[int, int] = {}
     full = False

@@ -54,7 +54,8 @@ class Network:
 
 
 class BlockCount:
-    """Block ids as a count that never goes back: 1 for the first picture of the acquisition."""
+    """Block ids as a count: 1 for the first picture of the acquisition. A picture that comes out of turn counts less
+    than the one before it."""
 
     def __init__(self) -> None:
         self._last: int | None = None
@@ -64,8 +65,11 @@ class BlockCount:
         """The count of the next picture that came."""
         if self._last is None:
             self._count = 1
-        elif block_id < self._last <= _WRAP:
+        elif block_id < self._last - _WRAP // 2 and self._last <= _WRAP:
             self._count += block_id - self._last + _WRAP
+        elif block_id > self._last + _WRAP // 2 and block_id <= _WRAP:
+            # Out of turn, from before the ids began again.
+            self._count += block_id - self._last - _WRAP
         else:
             self._count += block_id - self._last
         self._last = block_id

@@ -2,8 +2,8 @@
 
 Its time stamps are mapped to the host's clock through latches of its clock before each acquisition; where it has no
 latch, through triggered pictures, which began after the trigger was sent and ended before they came. Each triggered
-picture is also held against that interval: a camera whose stamps do not lie in it is refused. Nothing of this has run
-on a camera of any maker yet; docs/cameras.md says with what it was tested.
+picture is also held against that interval, every other one against its end: a camera whose stamps do not lie in it is
+refused. Nothing of this has run on a camera of any maker yet; docs/cameras.md says with what it was tested.
 """
 
 from __future__ import annotations
@@ -176,9 +176,13 @@ class GenicamCamera:
     def _acquire(self, device: GenicamDevice, *, capacity: int, whole: bool) -> Iterator[FrameQueue]:
         """Frames while the camera acquires; `whole`: an incomplete picture is a fault, not only a loss."""
 
+        wrong: list[DeviceFault] = []
+
         def check() -> None:
             if acquisition.failure is not None:
                 raise acquisition.failure
+            if wrong:
+                raise wrong[0]
             if whole and acquisition.incomplete:
                 raise self._packets_lost()
 
@@ -194,7 +198,12 @@ class GenicamCamera:
 
         def take(picture: Picture) -> None:
             self._count = base + picture.count
-            queue.put(self._frame(picture, self._count))
+            frame = self._frame(picture, self._count)
+            if (fault := self._stamps.impossible(frame)) is not None:
+                wrong.append(fault)
+                queue.wake()
+            else:
+                queue.put(frame)
 
         network = self._setup.network if self._place.control else None
         buffers = max(4, min(64, _QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))

@@ -61,27 +61,36 @@ class Stamps:
     def judged(self, frame: Frame, called: float) -> Frame:
         """The frame of a trigger that was sent at `called`, s; `DeviceFault` (camera.clock) when its stamp is none."""
         last = frame.received - frame.exposure
-        early, late = called - self.slack - frame.host_time, frame.host_time - last - self.slack
-        if self._map is not None and max(early, late) > 0.0:
-            raise self._wrong(early, late)
+        early = called - frame.host_time
+        if self._map is not None and early > self.slack:
+            raise self._wrong("before it was triggered", early, self.slack)
+        if (wrong := self.impossible(frame)) is not None:
+            raise wrong
         if self._latched or not frame.device_time or last <= called:
             return frame
         self._add([Latch(called, frame.device_time, last)])
         return replace(frame, host_time=self.host_time(frame.device_time, latest=last))
+
+    def impossible(self, frame: Frame) -> DeviceFault | None:
+        """The fault (camera.clock) of a picture that was here before its exposure can have ended, as its stamp says."""
+        if self._map is None:
+            return None
+        slack = _SLACK_S + self._map.bound_at(frame.received)
+        late = frame.host_time - (frame.received - frame.exposure)
+        return None if late <= slack else self._wrong("too late to be here already", late, slack)
 
     def _add(self, latches: list[Latch]) -> None:
         if self._map is None:
             self._map = ClockMap()
         self._map.add(latches)
 
-    def _wrong(self, early: float, late: float) -> DeviceFault:
-        which = "before it was triggered" if early > 0.0 else "too late to be here already"
+    def _wrong(self, which: str, off: float, allowed: float) -> DeviceFault:
         return DeviceFault(
             self._name,
             "camera.clock",
-            f"the time stamp of a triggered picture says that its exposure began "
-            f"{1e3 * (max(early, late) + self.slack):.1f} ms {which} (allowed: {1e3 * self.slack:.1f} ms)",
+            f"the time stamp of a picture says that its exposure began {1e3 * off:.1f} ms {which} "
+            f"(allowed: {1e3 * allowed:.1f} ms)",
             recoverable=False,
-            hint="Its stamps are none of the start of the exposure, or its clock does not run at the rate that it "
-            "tells. Look into its maker's manual; such a camera cannot measure a sweep.",
+            hint="Its stamps are none of the start of the exposure, or its clock was set meanwhile or does not run at "
+            "the rate that it tells. Look into its maker's manual; such a camera cannot measure a sweep.",
         )

@@ -19,7 +19,7 @@ from sim_backends.models.arm_kinematics import (
     rotation_vector,
 )
 from sim_backends.peers.urscript.environment import Environment
-from sim_backends.peers.urscript.values import List, Pose, Struct, shown
+from sim_backends.peers.urscript.values import MOST_ELEMENTS, List, Pose, Struct, shown
 
 
 def matrix(pose: Any) -> Matrix:
@@ -105,6 +105,8 @@ def _bits_to_integer(bits: Any) -> int:
 
 
 def _make_list(length: int, value: Any, capacity: int = 0) -> List:
+    if length > MOST_ELEMENTS:
+        raise ValueError(f"a list of {length} elements, at most {MOST_ELEMENTS}")
     return List([value] * length)
 
 
@@ -121,7 +123,8 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     """By name; they need nothing of `environment`."""
     return {
         "sin": math.sin, "cos": math.cos, "tan": math.tan, "asin": math.asin, "acos": math.acos, "atan": math.atan,
-        "atan2": math.atan2, "sqrt": math.sqrt, "pow": pow, "exp": math.exp, "log": lambda base, x: math.log(x, base),
+        "atan2": math.atan2, "sqrt": math.sqrt, "pow": math.pow, "exp": math.exp,
+        "log": lambda base, x: math.log(x, base),
         "floor": math.floor, "ceil": math.ceil, "round": round, "norm": _norm, "random": random.random,
         "d2r": math.radians, "r2d": math.degrees, "inv": lambda pose: as_pose(invert(matrix(pose))),
         "pose_inv": lambda pose: as_pose(invert(matrix(pose))),

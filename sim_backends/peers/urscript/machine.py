@@ -14,10 +14,14 @@ from sim_backends.peers.urscript import arithmetic, motions, sensing, settings, 
 from sim_backends.peers.urscript.environment import Environment
 from sim_backends.peers.urscript.translate import translate
 from sim_backends.peers.urscript.values import List, Pose, own
+from sim_backends.peers.urscript.words import ScriptError
 
 Thread = Generator[None, None, Any]
 _MOST_TURNS = 20000
-"""Turns of a program's loops in one cycle; a controller calls more an infinite loop."""
+"""Turns of a program's loops and calls of its functions in one cycle; a controller calls more an infinite loop."""
+_VALUES_A_TURN = 1000
+"""So many values copied take as long as a turn."""
+_MOST_THREADS = 100
 _MAIN = -1
 """The program's own thread; scripts take 0 for no thread."""
 _LIBRARIES: tuple[Callable[[Environment], dict[str, Callable[..., Any]]], ...] = (
@@ -44,7 +48,10 @@ class Machine:
         waiting = {name for name, act in known.items() if inspect.isgeneratorfunction(act)}
         at_once = known.keys() - waiting
         secondary = text.lstrip().startswith("sec ")
-        program = translate(text, at_once, set() if secondary else waiting)
+        try:
+            program = translate(text, at_once, set() if secondary else waiting)
+        except RecursionError as error:
+            raise ScriptError("its expressions or blocks are nested too deeply") from error
         self.name = program.name
         self._threads: dict[int, Thread] = {}
         self._turns = 0
@@ -52,7 +59,7 @@ class Machine:
             "__builtins__": {"bool": bool},
             "List": List,
             "Pose": Pose,
-            "own": own,
+            "own": self._own,
             "turn": self._turn,
             "halt": _halt,
             "run": self._run_thread,
@@ -60,7 +67,10 @@ class Machine:
             "join": self._join,
         }
         # The source holds nothing of the script's but numbers, texts and names with a `u_` before them.
-        exec(compile(program.source, f"<{self.name}>", "exec"), self._names)
+        try:
+            exec(compile(program.source, f"<{self.name}>", "exec"), self._names)
+        except (SyntaxError, RecursionError, MemoryError, ValueError) as error:
+            raise ScriptError(f"{self.name}: {error}") from error
 
     def run(self) -> Job:
         """Carry the program out, a cycle at a time, until its main thread ends. Raises `ProgramError`."""
@@ -96,8 +106,9 @@ class Machine:
                 raise
             except NameError as error:
                 raise ProgramError(f"variable {str(error.name).removeprefix('u_')!r} is not defined") from error
-            except (ArithmeticError, AttributeError, IndexError, RecursionError, TypeError, ValueError) as error:
-                raise ProgramError(f"{self.name}: {error}") from error
+            except Exception as error:
+                # Whatever a script brings about ends the script, not the controller.
+                raise ProgramError(f"{self.name}: {str(error) or type(error).__name__}") from error
 
     def _close(self) -> None:
         for number in list(self._threads):
@@ -106,12 +117,19 @@ class Machine:
 
     # --- what the program calls ---
 
-    def _turn(self) -> None:
-        self._turns += 1
+    def _own(self, value: Any) -> Any:
+        copied, count = own(value)
+        self._turn(count // _VALUES_A_TURN)
+        return copied
+
+    def _turn(self, count: int = 1) -> None:
+        self._turns += count
         if self._turns > _MOST_TURNS:
             raise ProgramError(f"{self.name}: an infinite loop, {_MOST_TURNS} turns in one cycle")
 
     def _run_thread(self, name: str, thread: Thread) -> int:
+        if len(self._threads) >= _MOST_THREADS:
+            raise ProgramError(f"{self.name}: more than {_MOST_THREADS} threads")
         number = self._environment.next_thread()
         self._threads[number] = thread
         return number

@@ -132,6 +132,7 @@ class _Translator:
         self._indent += 1
         place = len(self._lines)
         self._write("if False: yield")
+        self._write("turn()")
         self._statements(until)
         shared = sorted(f"u_{name}" for name in function.assigned - function.mine)
         if shared:
@@ -360,13 +361,18 @@ class _Translator:
             if self._now.kind == "name" and after.text == "=":
                 name = self._name()
                 self._take()
-                values.append(f"{prefix}{name}={self._expression()}")
+                values.append(f"{prefix}{name}={self._argument(prefix)}")
             else:
-                values.append(self._expression())
+                values.append(self._argument(prefix))
             if self._now.text != ")":
                 self._expect(",")
         self._take()
         return "(" + ", ".join(values) + ")"
+
+    def _argument(self, prefix: str) -> str:
+        """A script's own functions get copies."""
+        value = self._expression()
+        return f"own({value})" if prefix else value
 
 
 def _decimal(text: str) -> str:

@@ -6,10 +6,12 @@ can reach begin with `u_`, so that a script reaches nothing else of an object.
 
 from __future__ import annotations
 
-import copy
 import operator
 from collections.abc import Callable, Iterable
 from typing import Any
+
+MOST_ELEMENTS, MOST_CHARACTERS, MOST_INTEGER = 100_000, 1_000_000, 2**63
+"""What a variable may hold; a controller's own limits are lower, and a program that exceeds them ends."""
 
 
 class List(list[Any]):
@@ -91,9 +93,33 @@ class Struct:
         return {name[2:]: value for name, value in vars(self).items()}
 
 
-def own(value: Any) -> Any:
-    """A copy of a list or struct, anything else as it is: an assignment gives a variable a value of its own."""
-    return copy.deepcopy(value) if isinstance(value, List | Struct) else value
+def own(value: Any) -> tuple[Any, int]:
+    """A copy of a list or struct, anything else as it is, and how many values that are: an assignment or a call gives
+    a variable a value of its own. `ValueError` for one that is too large.
+    """
+    return _copied(value, 0)
+
+
+def _copied(value: Any, count: int) -> tuple[Any, int]:
+    count += 1
+    if count > MOST_ELEMENTS:
+        raise ValueError(f"a list or struct of more than {MOST_ELEMENTS} values")
+    if isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        raise ValueError(f"a text of {len(value)} characters, at most {MOST_CHARACTERS}")
+    if isinstance(value, int) and abs(value) > MOST_INTEGER:
+        raise ValueError(f"a whole number of {value.bit_length()} bits")
+    if isinstance(value, Struct):
+        members = {}
+        for name, member in value.members().items():
+            members[name], count = _copied(member, count)
+        return Struct(**members), count
+    if not isinstance(value, List):
+        return value, count
+    elements = []
+    for element in value:
+        one, count = _copied(element, count)
+        elements.append(one)
+    return type(value)(elements), count
 
 
 def shown(value: Any) -> str:
