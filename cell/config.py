@@ -12,7 +12,7 @@ import tomllib
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, SerializeAsAny, TypeAdapter, ValidationError, WrapValidator, model_validator
 
@@ -181,9 +181,12 @@ def runs_folder(path: Path | None) -> Path:
 
 def load_config(path: Path | None) -> CellConfig:
     """Read and check a configuration; without a path, the one that ships. Raises `ConfigError`."""
-    if path is None:
-        return validate(CellConfig, tomllib.loads(default_toml()), "the default configuration")
-    return validate(CellConfig, read_toml(path, "configuration", "cell init"), str(path))
+    return validate(CellConfig, tables_of(path), "the default configuration" if path is None else str(path))
+
+
+def tables_of(path: Path | None) -> dict[str, Any]:
+    """The tables of a configuration as they are written; without a path, of the one that ships."""
+    return tomllib.loads(default_toml()) if path is None else read_toml(path, "configuration", "cell init")
 
 
 def example_addresses(config: CellConfig) -> list[str]:

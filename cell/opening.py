@@ -25,7 +25,7 @@ def open_devices(
     seed: int,
     level: str,
     speed: float | None,
-    surface: str,
+    job: str | Path,
     confirm: Confirm | None,
     only: Collection[str],
     clock: str,
@@ -40,16 +40,19 @@ def open_devices(
         raise ConfigError(f'clock="virtual": {wrong}; leave that out')
     path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
     folder = beside(path)
+    # The world takes long to load, and real devices have none; over wires it is in another process.
     if clock == "virtual":
-        # The world takes long to load, and a cell over wires has it in another process, or none.
+        from cell.devices.described import Described
         from cell.devices.direct import VirtualCell
 
-        virtual = VirtualCell(loaded, seed, level, surface)
+        virtual = VirtualCell(loaded, seed, level, Described.of(job))
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
     simulated = None
     if sim == "all":
+        from cell.devices.described import Described
+
         simulated = SimulatedCell(
-            seed=seed, level=level, speed=speed or SIM_SPEED, surface=surface, gige=on_gige(loaded)
+            loaded, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
         )
         undo.callback(simulated.close)
         loaded = with_endpoints(loaded, simulated.endpoints)

@@ -90,7 +90,7 @@ class Cell:
         seed: int = 1,
         level: str = "nominal",
         speed: float | None = None,
-        surface: str = "pot",
+        job: str | Path = "pot",
         confirm: Confirm | None = None,
         only: Collection[str] = tuple(DEVICES),
         clock: str = "wall",
@@ -100,9 +100,11 @@ class Cell:
         With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
         may be switched off, and what is asked of them is a `NotConnectedError`.
 
-        A simulated cell is reached over the devices' real protocols, and runs `speed` times as fast as the wall (three
-        times unless told otherwise). With `clock="virtual"` its models are in this process behind the devices'
-        interfaces, without wires and without waiting: the same seed then takes the same course, to the byte.
+        A simulated cell is the one that the configuration and `job` describe: its station and the part in its claw are
+        that job's, until another one is run. What cannot be simulated as it is described is refused. It is reached
+        over the devices' real protocols, and runs `speed` times as fast as the wall (three times unless told
+        otherwise). With `clock="virtual"` its models are in this process behind the devices' interfaces, without wires
+        and without waiting: the same seed then takes the same course, to the byte.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -118,7 +120,7 @@ class Cell:
                 seed=seed,
                 level=level,
                 speed=speed,
-                surface=surface,
+                job=job,
                 confirm=confirm,
                 only=only,
                 clock=clock,
@@ -295,7 +297,8 @@ class Cell:
         `at_start` is somebody's word that the vehicle stands at the job's start pose. Without it a run drives only when
         the vehicle sees the board, or when this `Cell` has seen it before.
 
-        A simulated cell that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
+        At a simulated cell the job's station is set up and its part put into the claw, where that is not so already.
+        One that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
 
         With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
@@ -344,7 +347,11 @@ class Cell:
         self._runs.require_free()
         self._runs.require_no_late_stop()
         stops = self.stops
-        ready = ReadyJob.read(job, self.config, until, script)
+        ready = ReadyJob.read(job, self.config, until, script, calibrates=self.simulated is not None)
+        if self.simulated is not None:
+            from cell.devices.described import Described
+
+            self.simulated.make_ready(Described.of(job))
         stored: CellCalibration | None = None
         try:
             stored = self.calibration()

@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -36,6 +37,7 @@ from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
+from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
 from sim_backends.world.surfaces import SURFACES
@@ -98,7 +100,7 @@ class ServedCell:
                 for name in CAMERAS
             }
             self._gige = frozenset(gige)
-            self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset))
+            self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
         self._faults: dict[str, Callable[[], None]] = {
             **{name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS},
@@ -147,7 +149,7 @@ class ServedCell:
             "seed": scene.seed,
             "level": scene.level,
             "speed": self.world.clock.speed,
-            "surface": self.world.surface,
+            "surface": self.world.station.ground.name,
             "pid": os.getpid(),
         }
 
@@ -156,6 +158,13 @@ class ServedCell:
         if name not in self._faults:
             raise ValueError(f"unknown fault {name!r}; known: {', '.join(FAULT_NAMES)}")
         self._faults[name]()
+
+    def make_ready(self, text: str) -> None:
+        """Make the world ready for the station in a drawing's text; ValueError when it is of another cell."""
+        drawing, here = read(text), self.world.scene.drawing
+        if replace(drawing, station=here.station).as_json() != here.as_json():
+            raise ValueError("this is a job of another cell than the one that is simulated; serve that one")
+        self.world.make_ready(drawing.station)
 
     def reset(self) -> None:
         """Take away every fault's cause."""
@@ -186,9 +195,12 @@ def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], No
     if options.exit_with_stdin:
         threading.Thread(target=_watch_stdin, args=(ended,), name="stdin", daemon=True).start()
     try:
-        cell = ServedCell(
-            World(options.seed, options.level, options.speed, options.surface, arm=options.arm), options.gige
-        )
+        drawing = read(options.drawing) if options.drawing else STOCK.with_surface(options.surface)
+        drawing = drawing if options.arm is None else drawing.with_arm(options.arm)
+        cell = ServedCell(World(options.seed, options.level, options.speed, drawing), options.gige)
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
     except OSError as error:
         print(f"no free loopback endpoint: {error}; end other simulated cells and try again", file=sys.stderr)
         return 1
@@ -207,7 +219,8 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--level", choices=list(LEVELS), default="nominal", help="deviations (default: %(default)s)")
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second (default: %(default)s)")
     parser.add_argument("--surface", choices=sorted(SURFACES), default="pot", help="what lies at the placement area")
-    parser.add_argument("--arm", choices=sorted(TABLES), default="UR10e", help="which arm (default: %(default)s)")
+    parser.add_argument("--arm", choices=sorted(TABLES), help="which arm, instead of the one that is drawn")
+    parser.add_argument("--drawing", help="the cell and its station, as JSON, instead of the stock cell")
     parser.add_argument("--gige", choices=CAMERAS, action="append", default=[], help="this camera on GigE Vision")
     parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
     parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")

@@ -29,6 +29,7 @@ GROUPS = (
         "test_report.py",
         "test_end_screen.py",
         "test_direct_devices.py",
+        "test_described_jobs.py",
         "test_verify_job.py",
         "test_touch.py",
         "test_confirmed_turn.py",

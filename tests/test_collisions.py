@@ -16,7 +16,8 @@ from sim_backends.models.arm import Safety
 from sim_backends.models.arm_motion import JointMove, LinearMove
 from sim_backends.models.vehicle import MOTOR_FAULT, Mode, State
 from sim_backends.world import nominal
-from sim_backends.world.collisions import FOOTPRINT, ArmPoints, Collisions
+from sim_backends.world.arm_points import BODIES
+from sim_backends.world.collisions import DECK, Collisions
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
 
@@ -42,7 +43,9 @@ def advance(world: World, seconds: float, speed: float = 0.0, yaw_rate: float = 
 def outline(world: World) -> np.ndarray:
     x, y, yaw = world.vehicle.planar(world.clock.now())
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    return FOOTPRINT @ turn.T + [x, y]
+    low, high = DECK[:, :2] + nominal.VEHICLE_FROM_BASE[:2, 3]
+    corners = np.array([[high[0], high[1]], [high[0], low[1]], [low[0], low[1]], [low[0], high[1]]])
+    return corners @ turn.T + [x, y]
 
 
 def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exception(world: World) -> None:
@@ -131,10 +134,11 @@ def test_no_point_of_the_worlds_arm_reaches_beyond_the_bodies_that_the_cell_plan
         pin.forwardKinematics(model, data, joints)
         base_from_joint6 = data.oMi[6].homogeneous
         base_from_flange = world.arm.kinematics.forward(joints)
-        points = world._solid.at(world.arm.kinematics.frames(joints), world.flange_from_camera("scan", 0.0), True)
-        for point, body, radius in zip(points, ArmPoints.body, ArmPoints.radius, strict=True):
+        solid = world._solid
+        points = solid.at(world.arm.kinematics.frames(joints), world.flange_from_camera("scan", 0.0), True)
+        for point, body, radius in zip(points, solid.body, solid.radius, strict=True):
             room = max(inside(point, _pose(b, data, base_from_flange), b.size, b.radius) - radius for b in bodies)
-            assert room > -0.002, ArmPoints.names[body]
+            assert room > -0.002, BODIES[body]
         assert np.allclose(base_from_joint6[:3, 2], base_from_flange[:3, 2], atol=1e-9)
 
 

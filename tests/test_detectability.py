@@ -117,14 +117,15 @@ def test_a_good_verdict_says_within_what(calibrated):
     json.dumps(summary, allow_nan=False)
 
 
-def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated):
+@pytest.mark.parametrize(("checks", "most_alarms"), [(7, 1), pytest.param(42, 4, marks=pytest.mark.campaign)])
+def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated, checks, most_alarms):
     """Calibrations drawn from their covariance about the truth, noise as stated: χ² of the boards, and few alarms."""
     cell, calibration = calibrated
     sigma = cell.scene.deviations
     # Without a kinematic error the arm's scatter is all that its poses are wrong by.
     quiet = ObservedCell(replace(cell.scene, dh_error=np.zeros((6, 4))), CONFIG, np.random.default_rng(3))
     rail = np.sqrt(sigma.rail_homing**2 + cell.scene.rail_backlash**2 / 4 + cell.scene.rail_periodic_amplitude**2 / 2)
-    squares, alarms, checks = [], 0, 14
+    squares, alarms = [], 0
     for _ in range(checks):
         drawn = {}
         for name, of in (("scan", calibration.scan), ("target", calibration.target)):
@@ -155,5 +156,5 @@ def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated):
             squares.append(moved @ np.linalg.solve(covariance, moved))
     freedom = 6 * len(squares)
     assert chi2.ppf(0.002, freedom) < np.sum(squares) < chi2.ppf(0.998, freedom)
-    # At 3 % each, more than two of 14 happens once in a hundred and thirty times.
-    assert alarms <= 2
+    # At 3 % each, more than one of 7 happens once in sixty times, more than four of 42 once in a hundred and fifty.
+    assert alarms <= most_alarms

@@ -71,11 +71,12 @@ def test_the_rail_is_known_to_a_tenth_of_a_milliradian(calibrated):
     assert (np.abs(error) < 4 * sigma).all()
 
 
-def test_a_good_calibration_is_called_good(calibrated):
+@pytest.mark.parametrize(("checks", "most_alarms"), [(3, 0), pytest.param(20, 2, marks=pytest.mark.campaign)])
+def test_a_good_calibration_is_called_good(calibrated, checks, most_alarms):
     cell, calibration = calibrated
-    verdicts = [verify(calibration.scan, calibration.target, look_again(cell, calibration)) for _ in range(6)]
-    # At 3 % each, two of six would be a matter of one in a hundred.
-    assert sum(not verdict.good for verdict in verdicts) <= 1
+    verdicts = [verify(calibration.scan, calibration.target, look_again(cell, calibration)) for _ in range(checks)]
+    # At 3 % each, three of twenty would be a matter of one in fifty.
+    assert sum(not verdict.good for verdict in verdicts) <= most_alarms
     for verdict in verdicts:
         assert all(0.7 < value < 1.3 for value in verdict.fit.values())
 

@@ -13,6 +13,7 @@ from sim_backends.clock import SteppedClock, WorldClock
 from sim_backends.history import History, interpolate
 from sim_backends.world import nominal
 from sim_backends.world.contact import STIFFNESS, PartContact
+from sim_backends.world.drawing import STOCK
 from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
 from sim_backends.world.scene import draw, rotation, stream
 from sim_backends.world.surfaces import HALF_X, HALF_Y, surface
@@ -269,7 +270,7 @@ class StandingWorld(World):
     """An ideal or nominal world whose vehicle stands at the station and whose arm is put wherever a test wants it."""
 
     def __init__(self, level: str = "ideal", seed: int = 5, surface: str = "pot") -> None:
-        super().__init__(seed=seed, level=level, surface=surface)
+        super().__init__(seed=seed, level=level, drawing=STOCK.with_surface(surface))
         self.base = nominal.pose((-0.75, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
 
     def world_from_base(self, t: float) -> np.ndarray:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer.main
 
 from cell.cli import main
 from cell.config import default_toml
@@ -66,6 +68,14 @@ def write_stl(path: Path, size: tuple[float, float] = (0.07, 0.036), height: flo
     ]
     facets = b"".join(struct.pack("<12fH", 0, 0, 0, *np.ravel(corner), 0) for corner in corners)
     path.write_bytes(bytes(80) + struct.pack("<I", len(corners)) + facets)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def commands_put_together_once() -> Iterator[None]:
+    """A process runs one command; typer puts all of them together anew for each, which takes longer than a check."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("typer.main.get_command", cache(typer.main.get_command))
+        yield
 
 
 @pytest.fixture
@@ -537,7 +547,8 @@ def test_a_file_that_is_none_is_refused(
         (("calibrate", "--from", ".", "--board", "chess:7x6"), ("chess:7x6",)),
         (("calibrate", "solve", "gone.npz"), ("gone.npz",)),
         (("calibrate", "solve", "pot.stl"), ("pot.stl",)),
-        (("sim", "serve", "--surface", "teapot"), ("teapot", "pot")),
+        (("sim", "serve", "--job", "teapot"), ("teapot", "pot")),
+        (("sim", "fill"), ("there is no cell.toml",)),
         (("sim", "serve", "--config-out", "pot.stl"), ("exists already",)),
         (("sim", "serve", "--config-out", "no/such/sim.toml"), ("no/such",)),
         (("fly",), ("No such command",)),

@@ -37,10 +37,11 @@ LONGEST_DRIVE_S, LONGEST_DESCENT_S = 150.0, 150.0
 """The steps that drive and place have 180 s."""
 
 
-def require_fit(job: Job, config: CellConfig, mesh: Path) -> None:
+def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = False) -> None:
     """Raise `ConfigError` when the job asks for more than the cell may do or can reach; nothing has moved yet.
 
-    `mesh` is the file of the job's nominal surface. All problems are told at once, a line each.
+    `mesh` is the file of the job's nominal surface. With `calibrates` the cell may be calibrated first, as a simulated
+    one is, with the part in its claw. All problems are told at once, a line each.
     """
     problems = [
         *_kind(job),
@@ -55,7 +56,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path) -> None:
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent), *_stripe(job, config, extent[0][2], extent[1][2])]
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
-    problems = problems or list(reach_problems(job, config, extent))
+    problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 

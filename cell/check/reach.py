@@ -30,7 +30,7 @@ from cell.steps.camera_poses import (
     scan_plans,
     target_calibration_views,
 )
-from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates
+from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates, mounted
 from cell.vision import parse_board
 from drivers.interfaces import Vector
 
@@ -38,14 +38,19 @@ Goal = tuple[str, pin.SE3, tuple[Pair, ...]]
 """What a pose is for, the pose base_from_flange, and which bodies may touch there."""
 
 
-def reach_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:
-    """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m."""
+def reach_problems(
+    job: Job, config: CellConfig, extent: tuple[Vector, Vector], *, calibrates: bool = False
+) -> Iterator[str]:
+    """A line for each of the poses, as drawn, that the arm cannot take. `extent` is the box around the surface, m.
+
+    The calibration's views are taken with an empty claw, or with the job's part in it if this job `calibrates`.
+    """
     kinematics = arm_kinematics(config.arm.model, None)
     arm = arm_bodies(config.arm.model)
     deck = [*vehicle_bodies(deck_plates(config)), *vehicle_obstacles(config.obstacle)]
-    empty = Planner(kinematics, CollisionModel(kinematics, [*arm, *tool_bodies(), *deck]))
-    yield from _unreached(empty, _views(config))
-    part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3())
+    part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))
+    tool = part if calibrates else tool_bodies(None, None, mounted(config))
+    yield from _unreached(Planner(kinematics, CollisionModel(kinematics, [*arm, *tool, *deck])), _views(config))
     board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
     x, y, z = extent[1].tolist()
     station = station_bodies(

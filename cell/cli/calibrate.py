@@ -110,7 +110,7 @@ def calibrate(
     from cell.cli.display import ProgressDisplay, print_calibration
     from cell.supervisor import Cell
 
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
         calibration = cell.calibrate(display, job)
         where, loaded = cell.calibrations_folder, cell.config
     # The devices are free again; what follows takes the observations as they were stored.

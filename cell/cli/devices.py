@@ -56,7 +56,7 @@ def jog(
     wish = parse_jog(device, motion)
     lifted = lift or []
     with (
-        Cell.open(config, sim=sim, seed=seed, level=level.value, only=needed_for(wish, lifted)) as cell,
+        Cell.open(config, sim=sim, seed=seed, level=level.value, job=job, only=needed_for(wish, lifted)) as cell,
         cell.maintenance(reason, lifted) if lifted else nullcontext(),
     ):
         result = perform(cell, wish, job)

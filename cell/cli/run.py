@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -91,7 +90,7 @@ def dry_run(
     from cell.supervisor import Cell
 
     loaded, mesh = load_job(job)
-    require_fit(loaded, load_config(find_config(config, simulated=True)), mesh)
+    require_fit(loaded, load_config(find_config(config, simulated=True)), mesh, calibrates=True)
     find_kind(loaded.job.kind).until(until)
     for text in inject or ():
         Injection.parse(text, find_kind(loaded.job.kind).names)
@@ -102,7 +101,7 @@ def dry_run(
         seed=seed,
         level=level.value,
         speed=speed,
-        surface=Path(loaded.surface.mesh).stem,
+        job=job,
         confirm=None if confirm is None else confirm.value,
         clock=clock.value,
     )
@@ -120,7 +119,6 @@ def resume(
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
-    from cell.job import load_job
     from cell.run.folder import find_run
     from cell.run.resumption import UnfinishedRun
     from cell.supervisor import Cell
@@ -134,7 +132,7 @@ def resume(
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
         speed=before.info["speed"] if simulated and clock == "wall" else None,
-        surface=Path(load_job(before.job)[0].surface.mesh).stem if simulated else "pot",
+        job=before.job if simulated else "pot",
         clock=clock,
     )
     _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)

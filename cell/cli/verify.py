@@ -40,7 +40,7 @@ def verify(
     from cell.cli.display import ProgressDisplay
     from cell.supervisor import Cell
 
-    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
         verification = cell.verify(display, job)
     if json:
         print_json(verification.summary())

@@ -72,7 +72,9 @@ def diagnose(
     _, config = config_to_open(path, simulated=sim is not None)
     if sim is None:
         return _diagnose(config, only)
-    simulated = SimulatedCell(seed=seed, level=level, speed=speed, surface="pot", gige=on_gige(config))
+    from cell.devices.described import Described
+
+    simulated = SimulatedCell(config, Described.of("pot"), seed=seed, level=level, speed=speed, gige=on_gige(config))
     try:
         return _diagnose(with_endpoints(config, simulated.endpoints), only)
     finally:

@@ -10,6 +10,7 @@ from cell.config import CellConfig
 from cell.device_config import MOST_PAYLOAD, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
+from cell.devices.described import Described
 from cell.devices.devices import Devices
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
@@ -27,10 +28,17 @@ from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup,
 class VirtualCell(DirectCell):
     """The cell of one seed and level, and its devices behind the gate as the product takes them."""
 
-    def __init__(self, config: CellConfig, seed: int, level: str = "nominal", surface: str = "pot") -> None:
-        """Raises `ConfigError` for an unknown level or surface."""
+    def __init__(
+        self, config: CellConfig, seed: int, level: str = "nominal", described: Described | None = None
+    ) -> None:
+        """As configuration and job describe it; without one the job is `pot`.
+
+        Raises `ConfigError` for an unknown level, and for what cannot be simulated as it is described.
+        """
+        self._config = config
+        drawing = (described or Described.of("pot")).drawing(config)
         try:
-            super().__init__(setup_of(config), seed, level, surface)
+            super().__init__(setup_of(config), seed, level, drawing)
         except ValueError as error:
             raise ConfigError(str(error)) from error
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
@@ -43,6 +51,14 @@ class VirtualCell(DirectCell):
         """Raise `ConfigError` for a fault that only a wire can have."""
         try:
             faults.require(name)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    def make_ready(self, described: Described) -> None:
+        """See `cell.devices.simulated.Simulation`."""
+        station = described.drawing(self._config).station
+        try:
+            self.world.make_ready(station)
         except ValueError as error:
             raise ConfigError(str(error)) from error
 

@@ -84,7 +84,8 @@ def record_of(kind: str) -> Callable[[Any, Any], DeviceConfig]:
         name = value.get("driver", default.name) if isinstance(value, dict) else default.name
         if not isinstance(name, str):
             raise _wrong_driver("string_type", name, {})
-        if name not in _names(kind):
+        # The installed packages are searched, which takes a while, for what is not built in alone.
+        if not _is_built_in(kind, name) and name not in _names(kind):
             raise _wrong_driver("literal_error", name, {"expected": " or ".join(f"'{n}'" for n in _names(kind))})
         try:
             make = make_of(kind, name)
@@ -109,7 +110,7 @@ def _load(entry: EntryPoint) -> AnyMake:
     kind, _, name = entry.name.partition(".")
     if kind not in KINDS or not name:
         raise _Unusable(f'refused: the entry point is named "{entry.name}", not KIND.NAME with {", ".join(KINDS)}')
-    if any((make.kind, make.name) == (kind, name) for make in BUILT_IN):
+    if _is_built_in(kind, name):
         raise _Unusable("refused: a built-in make has this name")
     others = [_source(other) for other in _entries() if other.name == entry.name and other != entry]
     if others:
@@ -133,6 +134,10 @@ def _load(entry: EntryPoint) -> AnyMake:
     if unknown := made.calibrated - set(made.record.model_fields):
         raise _Unusable(f"broken: its record has no {', '.join(sorted(unknown))}, on which a calibration is to depend")
     return made
+
+
+def _is_built_in(kind: str, name: str) -> bool:
+    return any((make.kind, make.name) == (kind, name) for make in BUILT_IN)
 
 
 def _entries() -> list[EntryPoint]:

@@ -14,11 +14,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from cell.config import DEVICES, CellConfig, default_toml
-from cell.devices.truth_link import ask_truth, cause_fault
+from cell.config import DEVICES, CellConfig
+from cell.devices.truth_link import ask_truth, cause_fault, make_ready
 from drivers.errors import ConfigError, DeviceFault
+
+if TYPE_CHECKING:
+    # It knows the world's drawing, which takes long to load: only who simulates a cell needs it.
+    from cell.devices.described import Described
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 COMPILED_START_S = 4.0  # a start that takes longer is most likely the first one
@@ -40,6 +44,12 @@ class Simulation(Protocol):
     def fault(self, name: str) -> None:
         """Cause a fault by its name, one of `sim_backends.faults.FAULT_NAMES`."""
 
+    def make_ready(self, described: Described) -> None:
+        """As a person does: set up the job's station, with its part in the claw; nothing where that is so already.
+
+        `ConfigError` for a job that cannot be simulated as it is described.
+        """
+
     def close(self) -> None:
         """End its world."""
 
@@ -47,9 +57,21 @@ class Simulation(Protocol):
 class SimulatedCell:
     """A served simulated cell, the cameras in `gige` on GigE Vision; `endpoints` is the JSON object that it printed."""
 
-    def __init__(self, *, seed: int, level: str, speed: float, surface: str, gige: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        config: CellConfig,
+        described: Described,
+        *,
+        seed: int,
+        level: str,
+        speed: float,
+        gige: Collection[str] = (),
+    ) -> None:
+        """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so."""
+        self._config = config
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
-        command += ["--seed", str(seed), "--level", level, "--speed", repr(speed), "--surface", surface]
+        command += ["--seed", str(seed), "--level", level, "--speed", repr(speed)]
+        command += ["--drawing", described.drawing(config).as_json()]
         command += [word for name in gige for word in ("--gige", name.removesuffix("_camera"))]
         # A file, because a pipe that nobody reads would block the writer; closed with the process.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
@@ -81,6 +103,10 @@ class SimulatedCell:
     def fault(self, name: str) -> None:
         """Cause a fault by its name; `CellError` when that was not taken."""
         cause_fault(self.endpoints["truth"]["address"], name)
+
+    def make_ready(self, described: Described) -> None:
+        """See `Simulation`; `CellError` when that was not taken."""
+        make_ready(self.endpoints["truth"]["address"], described.drawing(self._config).as_json())
 
     @property
     def pid(self) -> int:
@@ -161,22 +187,25 @@ def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
     return config.model_copy(update=changed)
 
 
-def endpoint_toml(endpoints: dict[str, Any]) -> str:
-    """The shipped configuration's text with the addresses of a served simulated cell in it."""
-    values = {
-        ("cell", "time_scale"): str(float(endpoints["speed"])),
-        ("cell", "truth"): json.dumps(endpoints["truth"]["address"]),
-        ("rail", "url"): json.dumps(endpoints["rail"]["url"]),
-        ("arm", "address"): json.dumps(endpoints["arm"]["address"]),
-        ("vehicle", "interface"): json.dumps(endpoints["vehicle"]["interface"]),
-        ("vehicle", "channel"): json.dumps(endpoints["vehicle"]["channel"]),
-    }
-    for camera in ("scan_camera", "target_camera"):
-        values |= {(camera, key): json.dumps(endpoints[camera][key]) for key in ("driver", "address")}
-    table, lines = "", []
-    for line in default_toml().splitlines():
-        if line.startswith("["):
-            table = line[1 : line.index("]")]
-        value = values.get((table, line.split(" = ")[0]))
-        lines.append(line if value is None else f"{line.split(' = ')[0]} = {value}")
+def endpoint_toml(config: dict[str, Any], endpoints: dict[str, Any]) -> str:
+    """A configuration's tables as TOML, with the addresses of a served simulated cell in it."""
+    tables: dict[str, Any] = {name: table if isinstance(table, list) else dict(table) for name, table in config.items()}
+    tables["cell"] |= {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+    for name in DEVICES:
+        tables[name] |= endpoints.get(name, {})
+    lines = ["# A simulated cell that is served: the configuration with its addresses."]
+    for name, table in tables.items():
+        several = isinstance(table, list)
+        for one in table if several else [table]:
+            lines += ["", f"[[{name}]]" if several else f"[{name}]"]
+            lines += [f"{key} = {_toml(value)}" for key, value in one.items()]
     return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML has it; tables within tables in braces."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(inner) for inner in value) + "]"
+    return json.dumps(value, ensure_ascii=False)

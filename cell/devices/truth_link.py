@@ -22,6 +22,12 @@ def cause_fault(address: str, name: str) -> None:
     _asked(address, {"op": "fault", "name": name}, f"did not take the fault {name}")
 
 
+def make_ready(address: str, drawing: str) -> None:
+    """Have the station of a drawing set up and its part put into the claw; raises `CellError` when that was not
+    taken."""
+    _asked(address, {"op": "make_ready", "drawing": drawing}, "was not made ready for the job")
+
+
 def clear_faults(address: str) -> None:
     """Take away all causes of faults; raises `CellError` when that was not taken."""
     _asked(address, {"op": "reset"}, "did not take its faults away")

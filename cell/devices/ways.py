@@ -22,7 +22,7 @@ from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import Joints
 from cell.motion.point_speed import PointSpeed, carried_points
 from cell.obstacles import vehicle_obstacles
-from cell.steps.moves import deck_plates
+from cell.steps.moves import deck_plates, mounted
 from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
 
@@ -46,7 +46,8 @@ class Ways:
 
     def _among(self, others: tuple[Body, ...]) -> CollisionModel:
         if self._known is None or self._known[0] != others:
-            own = [*arm_bodies(self._config.arm.model), *tool_bodies(), *vehicle_bodies(deck_plates(self._config))]
+            tool = tool_bodies(None, None, mounted(self._config))
+            own = [*arm_bodies(self._config.arm.model), *tool, *vehicle_bodies(deck_plates(self._config))]
             self._known = others, CollisionModel(self.kinematics, [*own, *self._obstacles, *others], MARGIN_M)
         return self._known[1]
 

@@ -30,7 +30,8 @@ def seen_centres_with_jacobians(centres: ArrayLike, normal: ArrayLike, radius: f
     n = np.asarray(normal, dtype=np.float64)
     share = radius**2 / c[:, 2]
     aside = n * n[2] - np.array([0.0, 0.0, 1.0])
-    by_centre = np.tile(np.eye(3), (len(c), 1, 1))
+    by_centre = np.empty((len(c), 3, 3))
+    by_centre[:] = np.eye(3)
     by_centre[:, :, 2] -= (share / c[:, 2])[:, None] * aside
     by_normal = n[2] * np.eye(3)
     by_normal[:, 2] += n

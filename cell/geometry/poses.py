@@ -68,7 +68,10 @@ def cross(a: Array, b: Array) -> Array:
     """Cross products along the last axis of length 3, with broadcasting; several times quicker than NumPy's."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    x = ay * bz - az * by
+    made = np.empty((*x.shape, 3))
+    made[..., 0], made[..., 1], made[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
+    return made
 
 
 def transform(pose: pin.SE3, points: ArrayLike) -> Array:

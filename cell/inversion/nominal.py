@@ -42,9 +42,13 @@ class NominalSurface:
     """A triangle mesh in the surface frame S, m, with normals by the order of the corners (counter-clockwise outside).
 
     `rim` is the width in m along the mesh's border that is not used: a scan sees walls and mixed pixels there.
+    `source` is the file that it comes from, if any.
     """
 
-    def __init__(self, vertices: ArrayLike, triangles: ArrayLike, rim: float = 0.0006) -> None:
+    def __init__(
+        self, vertices: ArrayLike, triangles: ArrayLike, rim: float = 0.0006, source: Path | None = None
+    ) -> None:
+        self.source = source
         self.vertices: Array = np.asarray(vertices, dtype=np.float64)
         self.triangles: NDArray[np.int64] = np.asarray(triangles, dtype=np.int64)
         corners = self.vertices[self.triangles]
@@ -135,7 +139,7 @@ class NominalSurface:
 def _prepared(path: Path, content: bytes, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
     """The surface in a file of this content."""
     vertices, faces = read_mesh(path, unit)
-    return NominalSurface(vertices, faces, rim)
+    return NominalSurface(vertices, faces, rim, path)
 
 
 def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:

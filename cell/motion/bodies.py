@@ -7,7 +7,7 @@ poses come from the configuration, the job and the measured pose of the board.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -75,21 +75,52 @@ def arm_bodies(model: str = "UR10e") -> list[Body]:
     ]
 
 
-def tool_bodies(part_size: Sequence[float] | None = None, flange_from_part: pin.SE3 | None = None) -> list[Body]:
+_ACROSS = pin.SE3(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """What the flange carries beside the claw: flange_from_camera of both cameras, the scan camera's with the carriage
+    at 0, the laser's `baseline` and the rail's `travel`, m. The carriage runs along the scan camera's x axis."""
+
+    scan: pin.SE3 = field(default_factory=lambda: pin.SE3(_ACROSS.rotation, np.array([0.09, -0.05, 0.08])))
+    target: pin.SE3 = field(default_factory=lambda: pin.SE3(_ACROSS.rotation, np.array([-0.10, 0.0, 0.03])))
+    baseline: float = 0.035
+    travel: tuple[float, float] = (0.0, 0.100)
+
+
+def tool_bodies(
+    part_size: Sequence[float] | None = None,
+    flange_from_part: pin.SE3 | None = None,
+    mounted: Mounted | None = None,
+) -> list[Body]:
     """Claw, rail with the scan head over its whole travel, target camera, and the part when it is held.
 
     The part's frame has its origin in the mating face, z into the part; `part_size` is its extent along its x, y, z.
+    Without `mounted`, cameras and rail are those of the configuration that ships.
     """
+    on = mounted or Mounted()
+    first, last = min(0.0, on.travel[0]), max(0.0, on.travel[1])
     bodies = [
         block("claw", FLANGE, (-0.03, -0.03, 0.0), (0.03, 0.03, 0.145)),
-        block("scan head", FLANGE, (0.065, -0.11, 0.02), (0.115, 0.08, 0.09)),
-        block("target camera", FLANGE, (-0.125, -0.025, -0.03), (-0.075, 0.025, 0.05)),
+        _on_camera("scan head", on.scan, (first - on.baseline - 0.025, -0.025, -0.06), (last + 0.03, 0.025, 0.01)),
+        _on_camera("target camera", on.target, (-0.025, -0.025, -0.06), (0.025, 0.025, 0.02)),
     ]
     if part_size is not None:
         x, y, z = part_size
         placement = (flange_from_part or pin.SE3.Identity()) * pin.SE3(np.eye(3), np.array([0.0, 0.0, z / 2]))
         bodies.append(box("part", FLANGE, placement, (x, y, z)))
     return bodies
+
+
+def _on_camera(name: str, flange_from_camera: pin.SE3, low: Sequence[float], high: Sequence[float]) -> Body:
+    """A box with edges along a camera's axes; along the flange's own where those are the same lines."""
+    turn = flange_from_camera.rotation
+    if np.abs(turn - turn.round()).max() < 1e-9:
+        ends = np.array([turn.round() @ corner + flange_from_camera.translation for corner in (low, high)]).round(9)
+        return block(name, FLANGE, ends.min(axis=0).tolist(), ends.max(axis=0).tolist())
+    local = block(name, FLANGE, low, high)
+    return box(name, FLANGE, flange_from_camera * local.placement, local.size)
 
 
 def vehicle_bodies(plates: Sequence[tuple[str, pin.SE3, Sequence[float]]] = ()) -> list[Body]:

@@ -89,13 +89,13 @@ def draw_surface(
         _title(axes, [f"{len(points)} points of the sweep; the surface was not found in them"])
         if len(points):
             shown = _map(axes, points, points[:, 2], cmap="viridis")
-            figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8)
+            figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.07)
         return
     deviation = 1e3 * surface.deviation
     on = np.isfinite(deviation)
     _map(axes, points[~on], np.zeros(int((~on).sum())), cmap=ListedColormap([BESIDE]), vmin=0.0, vmax=1.0)
     shown = _map(axes, points[on], deviation[on], cmap="RdBu_r", vmin=-span_mm, vmax=span_mm)
-    figure.colorbar(shown, ax=axes, label="deviation from the drawn surface in mm", shrink=0.8, extend="both")
+    figure.colorbar(shown, ax=axes, label="deviation from the drawn surface in mm", shrink=0.8, pad=0.07, extend="both")
     said = "deviation from the drawn surface" if surface.believed else "deviation at the place that was refused"
     rms = float(np.sqrt(np.mean(deviation[on] ** 2))) if on.any() else float("nan")
     _title(axes, [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)])

@@ -41,6 +41,13 @@ from statemachine.runner import RunResult
 
 SCALE_SHARE = 1 / 3
 """End of the colours' scale in tolerances: what lies farther off the surface counts against it."""
+WIDTH, HEIGHT = 17.0, 6.0
+"""Of the picture, in inches."""
+MARGINS = {"left": 0.045, "right": 0.985, "bottom": 0.17, "top": 0.87, "wspace": 0.2}
+"""Of the panels, in the picture's size; `wspace` in a panel's width. Fixed, because a layout that is searched for takes
+as long as the whole drawing."""
+TITLE_LINE = 0.17 / HEIGHT
+"""Height of a line of a panel's title, which a seam needs each."""
 
 
 def draw_run(
@@ -48,7 +55,7 @@ def draw_run(
 ) -> None:
     """Draw a run's picture from what its steps made, from what its end shows, and from its report."""
     evidence = Evidence.of(result)
-    figure = Figure(figsize=(17, 6), dpi=110, layout="constrained")
+    figure = Figure(figsize=(WIDTH, HEIGHT), dpi=110)
     title = f"{report['outcome'].upper()}: run {report['run']}, job {job.job.name}"
     if report["simulated"]:
         title += f" (simulated, seed {report['seed']}, level {report['level']})"
@@ -56,13 +63,18 @@ def draw_run(
     board, stripe = _board(result, evidence, frames), _stripe(result, frames)
     surface = _surface(job, nominal, result, evidence)
     scanned = surface is not None or stripe is not None
-    left, *middle, right = figure.subplots(1, 2 + scanned, width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0])
+    seams = (report["scan"] or {}).get("seams", ())
+    left, *middle, right = figure.subplots(
+        1,
+        2 + scanned,
+        width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * len(seams)},
+    )
     if board is None:
         empty(left, "the board", "not photographed")
     else:
         draw_board(left, board)
     if surface is not None:
-        seams = (report["scan"] or {}).get("seams", ())
         draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams)
     elif stripe is not None:
         draw_stripe(middle[0], stripe)

@@ -29,10 +29,15 @@ class ReadyJob:
     info: dict[str, Any]
 
     @classmethod
-    def read(cls, file: str | Path, config: CellConfig, until: str | None, script: Script) -> ReadyJob:
-        """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step."""
+    def read(
+        cls, file: str | Path, config: CellConfig, until: str | None, script: Script, *, calibrates: bool = False
+    ) -> ReadyJob:
+        """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step.
+
+        With `calibrates` the cell may be calibrated first, with this job's part in the claw.
+        """
         job, mesh = load_job(file)
-        require_fit(job, config, mesh)
+        require_fit(job, config, mesh, calibrates=calibrates)
         kind = find_kind(job.job.kind).until(until)
         kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)

@@ -16,6 +16,7 @@ from cell.motion.bodies import (
     BASE,
     PLACED,
     Body,
+    Mounted,
     arm_bodies,
     box,
     station_bodies,
@@ -69,9 +70,10 @@ class Mover:
         self._station: list[Body] = []
         self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
         grasp = None if job is None else job.grasp
-        part = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
         self._interlocks = interlocks
-        self._moving = [*arm_bodies(config.arm.model), *tool_bodies(*part), *vehicle_bodies(deck_plates(config))]
+        held, at = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
+        tool = tool_bodies(held, at, mounted(config))
+        self._moving = [*arm_bodies(config.arm.model), *tool, *vehicle_bodies(deck_plates(config))]
         self._planner = self._plan_among([])
         if interlocks is not None and grasp is not None:
             interlocks.carry([body for body in self._moving if body.name == "part"])
@@ -178,6 +180,12 @@ def _joint_limits(config: ArmConfig) -> JointLimits:
         acceleration=(config.max_joint_acceleration,) * 6,
         jerk=(config.max_joint_jerk,) * 6,
     )
+
+
+def mounted(config: CellConfig) -> Mounted:
+    """What the flange carries beside the claw, where the configuration has it."""
+    scan, target = (camera.flange_from_camera.se3() for camera in (config.scan_camera, config.target_camera))
+    return Mounted(scan, target, config.laser.baseline, config.rail.travel)
 
 
 def deck_plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:

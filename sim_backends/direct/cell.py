@@ -16,6 +16,7 @@ from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import Setup
 from sim_backends.direct.rail import DirectRail
 from sim_backends.direct.vehicle import DirectVehicle
+from sim_backends.world.drawing import STOCK, Drawing
 from sim_backends.world.scene import stream
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
@@ -41,10 +42,10 @@ class Ticking(Protocol):
 class DirectCell:
     """The world of one seed and level, with its devices."""
 
-    def __init__(self, setup: Setup, seed: int, level: str = "nominal", surface: str = "pot") -> None:
-        """Raises ValueError for an unknown level or surface."""
+    def __init__(self, setup: Setup, seed: int, level: str = "nominal", drawing: Drawing = STOCK) -> None:
+        """Raises ValueError for an unknown level, or what `World` says of the drawing."""
         self._time = SteppedClock()
-        self.world = World(seed, level, surface=surface, clock=self._time)
+        self.world = World(seed, level, drawing=drawing, clock=self._time)
         self.clock = VirtualClock(self._time, self._tick)
         wire = stream(seed, "lockstep.wire")
         self.arm = DirectArm("arm", self.world.arm, self.clock, setup.arm)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sim_backends.models.screw import Screw
 
@@ -21,6 +21,11 @@ class RailParams:
     start: float = 0.037
     serial: int = 1
     firmware: tuple[int, int] = (1, 12)
+
+    def around(self, travel: tuple[float, float]) -> RailParams:
+        """The same for a usable `travel`, m: the home switch at 0, the others 2 mm and the ends 4 mm beyond both."""
+        low, high = min(0.0, travel[0]), max(0.0, travel[1])
+        return replace(self, travel=travel, switches=(low - 0.002, high + 0.002), ends=(low - 0.004, high + 0.004))
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,18 @@ class TruthPeer:
     """Serves at `address` (`127.0.0.1:port`).
 
     `truth` gives the whole truth (numbers, strings, lists, arrays); `fault` causes a fault by name and raises
-    ValueError for one it does not know; `reset` takes away all faults.
+    ValueError for one it does not know; `reset` takes away all faults; `make_ready` makes the world ready for the job
+    of a drawing's text, with ValueError for what is none of this cell.
     """
 
     def __init__(
-        self, truth: Callable[[], dict[str, Any]], fault: Callable[[str], None], reset: Callable[[], None]
+        self,
+        truth: Callable[[], dict[str, Any]],
+        fault: Callable[[str], None],
+        reset: Callable[[], None],
+        make_ready: Callable[[str], None],
     ) -> None:
-        self._truth, self._fault, self._reset = truth, fault, reset
+        self._truth, self._fault, self._reset, self._make_ready = truth, fault, reset, make_ready
         self._server = TcpServer("truth", self._serve)
         self.address = self._server.address
 
@@ -54,16 +59,19 @@ class TruthPeer:
             return _refusal('a request is one line with a JSON object that has "op"')
         if operation == "truth":
             return {"ok": True, "truth": self._truth()}
-        if operation == "fault":
+        if operation in ("fault", "make_ready"):
             try:
-                self._fault(str(request.get("name")))
+                if operation == "fault":
+                    self._fault(str(request.get("name")))
+                else:
+                    self._make_ready(str(request.get("drawing")))
             except ValueError as error:
                 return _refusal(str(error))
             return {"ok": True}
         if operation == "reset":
             self._reset()
             return {"ok": True}
-        return _refusal(f"unknown op {operation!r}; known: truth, fault, reset")
+        return _refusal(f"unknown op {operation!r}; known: truth, fault, make_ready, reset")
 
 
 def _refusal(error: str) -> dict[str, Any]:

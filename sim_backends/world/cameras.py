@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.camera import CameraOptics
-from sim_backends.optics.mesh import Mesh
 from sim_backends.optics.render import render
 from sim_backends.optics.scene import (
     Board,
@@ -27,10 +25,10 @@ from sim_backends.optics.scene import (
     Sun,
 )
 from sim_backends.world import nominal
+from sim_backends.world.drawing import CameraDrawing
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Lens, Scene, rotation, stream
-from sim_backends.world.surfaces import mesh
-from sim_backends.world.surfaces import surface as named_surface
+from sim_backends.world.station import Station
 
 Pose = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -44,27 +42,19 @@ BOW_AT = (0.130, 0.018)
 """Where the sheet's bow is told: from the laser, and beside the fan's middle, m."""
 SUN_SPEED = 0.2e-3
 """m/s: a quarter of a degree a minute, from a window 3 m away."""
-_FAR = {"scan": 0.5, "target": 3.0}
-"""Beyond this distance, m, a camera has nothing to see that matters."""
-
-
-@cache
-def _seen_mesh(surface: str) -> Mesh:
-    """The surface with its box tree, which takes longer to make than all the rest of a world."""
-    made = mesh(surface)
-    return Mesh(made.vertices, made.triangles)
+_FAR = {"scan": (0.5, 3.0), "target": (3.0, 3.0)}
+"""Beyond this distance, m, and so many times its focus, a camera has nothing to see that matters."""
 
 
 class Cameras:
     """The scan camera with its laser and the target camera of one scene; safe between threads."""
 
-    def __init__(self, scene: Scene, surface: str) -> None:
-        self._scene = scene
-        effects = scene.effects
+    def __init__(self, scene: Scene, station: Station) -> None:
+        cell, effects = scene.drawing.cell, scene.effects
         self._lens = {"scan": scene.scan_lens, "target": scene.target_lens}
         self._cold = {
-            "scan": _optics(scene, scene.scan_lens, nominal.SCAN_SIZE, nominal.SCAN_FOCUS, SCAN_TRANSMISSION),
-            "target": _optics(scene, scene.target_lens, nominal.TARGET_SIZE, nominal.TARGET_FOCUS, 1.0),
+            "scan": _optics(scene, scene.scan_lens, cell.scan, SCAN_TRANSMISSION),
+            "target": _optics(scene, scene.target_lens, cell.target, 1.0),
         }
         x, y, z = (float(v) for v in scene.laser_origin)
         nx, ny, nz = (float(v) for v in scene.light_plane_normal)
@@ -80,13 +70,15 @@ class Cameras:
         self._grain = Grain(effects.texture, effects.dust, effects.gloss)
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
-        shape = named_surface(surface)
-        self._mesh = _seen_mesh(surface)
-        self._mesh_radius = float(np.hypot(shape.half_x, shape.half_y)) + 0.015
-        self._large = Board(*nominal.LARGE_BOARD)
-        self._fine = Board(*nominal.FINE_BOARD)
+        self._witness_pose = cell.witness
+        self._deck = (Board.parse(cell.deck_board), Board.parse(cell.fine_board))
+        self.show(scene, station)
         self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._cold}
         self._busy = {name: threading.Lock() for name in self._cold}
+
+    def show(self, scene: Scene, station: Station) -> None:
+        """From now on the cameras see this station, in a scene of the same cell."""
+        self._shown = scene, station, Board.parse(scene.drawing.station.board)
 
     def picture(
         self,
@@ -115,20 +107,22 @@ class Cameras:
 
     def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
         """The plate on the claw, if the camera sees any of it."""
-        pose = camera_from_flange @ nominal.FLANGE_FROM_WITNESS
+        if self._witness_pose is None:
+            return []
+        pose = camera_from_flange @ self._witness_pose
         corners, optics = _witness_corners(pose), self._cold["scan"]
         left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
         return [PlaneInstance(pose, nominal.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
 
     def lens(self, camera: str, warm: float) -> Lens:
         """The lens with the shift and zoom of what is `warm`, 0 to 1."""
-        cold, drawn = self._lens[camera], self._scene.workshop
+        cold, drawn = self._lens[camera], self._shown[0].workshop
         zoom, (du, dv) = 1.0 + warm * drawn.zoom, warm * drawn.shift[int(camera == "target")]
         return replace(cold, fx=cold.fx * zoom, fy=cold.fy * zoom, cx=cold.cx + float(du), cy=cold.cy + float(dv))
 
     def laser(self, warm: float) -> LaserOptics:
         """The laser with its plane turned about its exit point and the stripe's direction (the camera's y axis)."""
-        angle = warm * self._scene.workshop.pointing
+        angle = warm * self._shown[0].workshop.pointing
         if angle == 0.0:
             return self._laser
         turn = rotation(np.array([0.0, angle, 0.0]))
@@ -136,7 +130,7 @@ class Cameras:
         return replace(self._laser, normal=(nx, ny, nz), distance=float(np.dot((nx, ny, nz), self._laser.origin)))
 
     def _warmed(self, camera: str, warm: float) -> CameraOptics:
-        if not self._scene.effects.camera_warm_up:
+        if not self._shown[0].effects.camera_warm_up:
             return self._cold[camera]
         # In steps of a hundredth, since every lens has a table of its pixels' rays.
         lens = self.lens(camera, round(warm, 2))
@@ -144,35 +138,38 @@ class Cameras:
 
     def _sunny(self, camera_from_world: Pose, t: float) -> Light:
         """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis."""
-        strength = self._scene.effects.sunlight
+        scene = self._shown[0]
+        strength = scene.effects.sunlight
         if not strength:
             return self._light
-        low = self._scene.workshop.sun_start + SUN_SPEED * t - 0.1
-        ground = camera_from_world @ nominal.WORLD_FROM_PLACE
+        low = scene.workshop.sun_start + SUN_SPEED * t - 0.1
+        ground = camera_from_world @ scene.world_from_place
         return replace(self._light, sun=Sun(ground, low, low + 0.12, strength))
 
     def _objects(self, camera: str, camera_from_world: Pose, world_from_base: Pose) -> list[SceneObject]:
-        scene = self._scene
+        scene, station, board_there = self._shown
         camera_from_base = camera_from_world @ world_from_base
         camera_from_surface = camera_from_world @ scene.world_from_surface
+        camera_from_table = camera_from_world @ scene.world_from_table
         table = (2 * nominal.TABLE_HALF, 2 * nominal.TABLE_HALF)
         placed: list[tuple[SceneObject, Pose, float]] = [
-            (PlaneInstance(camera_from_surface, table, TABLE_ALBEDO), camera_from_surface, nominal.TABLE_HALF * 1.5),
+            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, nominal.TABLE_HALF * 1.5),
         ]
         boards = [
-            (camera_from_world @ scene.world_from_board, self._large),
-            (camera_from_base @ scene.base_from_deck_board, self._large),
-            (camera_from_base @ scene.base_from_fine_board, self._fine),
+            (camera_from_world @ scene.world_from_board, board_there),
+            (camera_from_base @ scene.base_from_deck_board, self._deck[0]),
+            (camera_from_base @ scene.base_from_fine_board, self._deck[1]),
         ]
         for pose, board in boards:
             x0, x1, y0, y1 = board.bounds
             radius = float(np.hypot(max(-x0, x1), max(-y0, y1)))
             placed.append((BoardInstance(pose, board), pose, radius))
         if camera == "scan":
-            shown = MeshInstance(camera_from_surface, self._mesh, SURFACE_ALBEDO, self._grain)
-            placed.append((shown, camera_from_surface, self._mesh_radius))
+            shown = MeshInstance(camera_from_surface, station.seen, SURFACE_ALBEDO, self._grain)
+            placed.append((shown, camera_from_surface, station.radius))
         optics = self._cold[camera]
-        return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, _FAR[camera])]
+        far = max(_FAR[camera][0], _FAR[camera][1] * optics.focus_distance)
+        return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, far)]
 
 
 def _witness_corners(pose: Pose) -> Pose:
@@ -191,19 +188,19 @@ def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, fa
     return float(np.hypot(x, y) * np.cos(np.arctan(half)) - z * np.sin(np.arctan(half))) <= radius
 
 
-def _optics(scene: Scene, lens: Lens, size: tuple[int, int], focus: float, transmission: float) -> CameraOptics:
+def _optics(scene: Scene, lens: Lens, drawn: CameraDrawing, transmission: float) -> CameraOptics:
     return CameraOptics(
-        width=size[0],
-        height=size[1],
+        width=drawn.size[0],
+        height=drawn.size[1],
         fx=lens.fx,
         fy=lens.fy,
         cx=lens.cx,
         cy=lens.cy,
         distortion=lens.dist,
-        pixel=nominal.PIXEL,
+        pixel=drawn.pixel,
         f_number=nominal.F_NUMBER,
-        focal=nominal.FOCAL_LENGTH,
-        focus_distance=focus,
+        focal=drawn.focal_length,
+        focus_distance=drawn.focus,
         read_noise_dn=scene.deviations.read_noise,
         transmission=transmission,
     )

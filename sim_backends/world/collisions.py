@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.optics.scene import Board
 from sim_backends.world import nominal
+from sim_backends.world.arm_points import BODIES, ArmPoints
 from sim_backends.world.contact import PartContact
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Scene
@@ -29,14 +31,12 @@ DEEPER_M = 0.005
 LONGEST = 100
 """So many collisions are kept."""
 
-FOOTPRINT = np.array([[0.5, 0.4], [0.5, -0.4], [-0.5, -0.4], [-0.5, 0.4]])
-"""Corners (4, 2) of the vehicle on the floor, m, in V."""
-_DECK = np.array([[-0.5, -0.4, 0.25], [0.5, 0.4, 0.54]])
+DECK = np.array([[-0.8, -0.4, -0.30], [0.2, 0.4, -0.01]])
+"""Lowest and highest corner (2, 3) of the vehicle, m, in the arm's base, which stands on it."""
 _FAR = 1.5
-"""From further away, m, no corner of the vehicle reaches the station at the world's origin."""
-_POST = np.array([[0.10, 0.305], [0.14, 0.305], [0.14, 0.335], [0.10, 0.335]])
-_POST_TOP = 0.12
-_BOARD_HALF = np.array([0.10, 0.08, 0.005])
+"""From further away, m, no corner of the stock vehicle reaches the station at the world's origin."""
+_POST = np.array([[0.0, -0.015], [0.04, -0.015], [0.04, 0.015], [0.0, 0.015]])
+"""Corners (4, 2) of the board's post, m, from the board's middle along the place frame's axes."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,34 @@ class Collision:
 class Collisions:
     """Finds and remembers what meets what; safe between threads."""
 
-    def __init__(self, scene: Scene, ground: PartContact) -> None:
+    def __init__(self, scene: Scene, ground: PartContact, found: tuple[Collision, ...] = ()) -> None:
+        """`found` are collisions from before."""
         self._ground = ground
-        post = _lifted(_POST, nominal.WORLD_FROM_PLACE)
+        self._arm = ArmPoints(scene.drawing)
+        base = scene.vehicle_from_base
+        low, high = DECK
+        self._base_from_vehicle = inverse(base)
+        footprint = np.array([[high[0], high[1]], [high[0], low[1]], [low[0], low[1]], [low[0], high[1]]])
+        self._footprint = _lifted(footprint, base)
+        x0, x1, y0, y1 = Board.parse(scene.drawing.station.board).bounds
+        board, half = scene.world_from_board.copy(), np.array([0.5 * (x1 - x0), 0.5 * (y1 - y0), 0.005])
+        board[:3, 3] += board[:3, :3] @ [0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0]
+        centre = board[:3, 3].copy()
+        board[:3, 3] += board[:3, 2] * half[2]
+        post = _POST + centre[:2]
         table = nominal.TABLE_HALF * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-        self._standing = {"table": _lifted(table, scene.world_from_surface), "board post": post}
-        board = scene.world_from_board.copy()
-        size = np.array(nominal.LARGE_BOARD_SIZE)
-        board[:3, 3] += board[:3, :2] @ (0.5 * size) + board[:3, 2] * _BOARD_HALF[2]
-        middle = 0.5 * (nominal.TABLE_HEIGHT + _POST_TOP)
+        self._standing = {"table": _lifted(table, scene.world_from_table), "board post": post}
+        furthest = np.hypot(*self._footprint.T).max() + np.hypot(*post.T).max()
+        self._far = max(_FAR, float(furthest), float(np.hypot(*self._footprint.T).max()) + 2 * nominal.TABLE_HALF)
+        middle = 0.5 * centre[2]
         post_pose = np.eye(4)
         post_pose[:3, 3] = [*post.mean(axis=0), middle]
         self._boxes = {
-            "board": (inverse(board), _BOARD_HALF),
+            "board": (inverse(board), half),
             "board post": (inverse(post_pose), np.array([*(0.5 * np.ptp(post, axis=0)), middle])),
         }
         self._lock = threading.Lock()
-        self._found: list[Collision] = []
+        self._found: list[Collision] = list(found)
         self._touching: dict[tuple[str, str], float] = {}
         self._checked: tuple[float, Vector, Pose] | None = None
         self._against = ""
@@ -88,11 +99,11 @@ class Collisions:
 
     def blocks(self, time: float, pose: tuple[float, float, float]) -> bool:
         """Whether the vehicle at x, y, yaw would stand in something; remembered as a collision once a contact."""
-        if math.hypot(pose[0], pose[1]) > _FAR:
+        if math.hypot(pose[0], pose[1]) > self._far:
             self._against = ""
             return False
         c, s = np.cos(pose[2]), np.sin(pose[2])
-        corners = FOOTPRINT @ np.array([[c, s], [-s, c]]) + np.array(pose[:2])
+        corners = self._footprint @ np.array([[c, s], [-s, c]]) + np.array(pose[:2])
         met = next((name for name, other in self._standing.items() if _overlap(corners, other)), "")
         if met and met != self._against:
             self.note(time, "vehicle", met)
@@ -115,72 +126,24 @@ class Collisions:
 
         The part touches only what is not the ground here.
         """
-        vehicle = _moved(points, inverse(world_from_vehicle)) - _DECK.mean(axis=0)
+        vehicle = _moved(_moved(points, inverse(world_from_vehicle)), self._base_from_vehicle) - DECK.mean(axis=0)
         depths = {name: _inside(_moved(points, pose), half) for name, (pose, half) in self._boxes.items()}
-        depths["vehicle"] = _inside(vehicle, 0.5 * np.ptp(_DECK, axis=0))
+        depths["vehicle"] = _inside(vehicle, 0.5 * np.ptp(DECK, axis=0))
         below, on_table = self._ground.below(points)
-        held = ArmPoints.body == ArmPoints.names.index("part")
+        held = self._arm.body == BODIES.index("part")
         depths["table"] = np.where(on_table & ~held, below, -np.inf)
         depths["floor"] = np.where(on_table | held, -np.inf, below)
         now: dict[tuple[str, str], float] = {}
         for obstacle, depth in depths.items():
-            deep = depth + ArmPoints.radius
+            deep = depth + self._arm.radius
             for point in np.flatnonzero(deep > 0.0):
-                pair = (ArmPoints.names[ArmPoints.body[point]], obstacle)
+                pair = (BODIES[self._arm.body[point]], obstacle)
                 now[pair] = max(now.get(pair, 0.0), float(deep[point]))
         new = [pair for pair, depth in now.items() if depth > self._touching.get(pair, -np.inf) + DEEPER_M]
         self._touching = {pair: depth if pair in new else self._touching[pair] for pair, depth in now.items()}
         for body, obstacle in new:
             self.note(time, body, obstacle)
         return None if not new else " and ".join(f"the {body} hit the {obstacle}" for body, obstacle in new)
-
-
-def _corners(low: tuple[float, float, float], high: tuple[float, float, float]) -> Vector:
-    grid = np.meshgrid(*zip(low, high, strict=True), indexing="ij")
-    return np.stack([axis.ravel() for axis in grid], axis=-1)
-
-
-class ArmPoints:
-    """The points that stand for arm and tool: `body` (n,) indexes `names`, `radius` (n,) is in m."""
-
-    names = ("upper arm", "forearm", "wrist", "claw", "target camera", "scan head", "part")
-    # Link, offset along its z at the beginning and the end, link of the end, number of points, of each capsule.
-    _LINKS = (
-        (0, 1, 0.176, 0.176, 2, 8, 0.065),
-        (1, 2, 0.042, 0.042, 3, 9, 0.050),
-        (2, 3, 0.060, 0.150, 3, 3, 0.040),
-        (2, 4, 0.000, 0.100, 4, 3, 0.040),
-        (2, 5, 0.030, 0.060, 5, 2, 0.040),
-    )
-    _CLAW = _corners((-0.028, -0.028, 0.03), (0.028, 0.028, 0.14))
-    _TARGET = _corners((-0.12, -0.02, -0.02), (-0.08, 0.02, 0.045))
-    _SCAN = _corners((-0.05, -0.02, -0.055), (0.02, 0.02, 0.005))
-    body = np.repeat([*(row[0] for row in _LINKS), 3, 4, 5, 6], [*(row[5] for row in _LINKS), 8, 8, 8, 8])
-    radius = np.repeat([*(row[6] for row in _LINKS), 0.0], [*(row[5] for row in _LINKS), 32])
-    _first = np.repeat([row[1] for row in _LINKS], [row[5] for row in _LINKS])
-    _last = np.repeat([row[4] for row in _LINKS], [row[5] for row in _LINKS])
-    _share = np.concatenate([np.linspace(1.0 / 8 if row[0] == 0 else 0.0, 1.0, row[5]) for row in _LINKS])[:, None]
-    _offset = np.repeat([row[2] for row in _LINKS], [row[5] for row in _LINKS])[:, None]
-    _rise = np.repeat([row[3] for row in _LINKS], [row[5] for row in _LINKS])[:, None]
-
-    def __init__(self, half_x: float, half_y: float) -> None:
-        """For a part of this half length and half width, m."""
-        part = _moved(_corners((-half_x, -half_y, 0.0), (half_x, half_y, 0.018)), nominal.FLANGE_FROM_PART)
-        self._on_flange = np.concatenate([self._CLAW, self._TARGET])
-        self._part = part
-
-    def at(self, frames: Pose, flange_from_scan: Pose, held: bool) -> Vector:
-        """The points (n, 3) in the arm's base; `frames` (7, 4, 4) are those of base and links, the last the flange's.
-
-        A part that the claw does not hold is left out: its points are at the flange, inside the wrist.
-        """
-        along = frames[self._first, :3, 2]
-        start = frames[self._first, :3, 3] + self._offset * along
-        end = frames[self._last, :3, 3] + self._rise * along
-        flange = frames[6]
-        part = self._part if held else np.zeros_like(self._part)
-        tool = np.concatenate([self._on_flange, _moved(self._SCAN, flange_from_scan), part])
-        return np.concatenate([start + self._share * (end - start), _moved(tool, flange)])
 
 
 def _inside(points: Vector, half: Vector) -> Vector:

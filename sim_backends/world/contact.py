@@ -22,8 +22,12 @@ STIFFNESS = 20e3
 """Vertical stiffness of a flat contact over the whole underside, N/m."""
 GRIP_REACH = 0.005
 """How far, m, the claw may be from the part's place in it and still grip it."""
-_HIGHEST = 0.030
-"""No point of a leaning table's surface is higher than this, m, above its origin."""
+FINGERS_ABOVE = 0.015
+"""The fingertips end this far, m, from the part's underside."""
+LEAST_TOUCHING = 40
+"""Of the points of a part's underside that are tried so many have to have a surface below them."""
+_LEAN = 0.015
+"""How much higher than drawn, m, a point of a leaning table's surface may be."""
 
 
 class PartContact:
@@ -32,20 +36,45 @@ class PartContact:
     At the start the claw holds the part at `flange_from_part`. The table reaches 0.25 m around the surface's origin.
     """
 
-    def __init__(self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose) -> None:
+    def __init__(
+        self,
+        surface: Surface,
+        world_from_surface: Pose,
+        flange_from_part: Pose,
+        *,
+        world_from_table: Pose | None = None,
+        surface_from_part: Pose | None = None,
+        table_height: float = nominal.TABLE_HEIGHT,
+    ) -> None:
+        """The table lies at the surface's origin, and the part's frame is the surface's when it is placed, unless
+        `world_from_table` and `surface_from_part` say so. Raises ValueError when there is no surface for the part."""
         self._surface = surface
         self._surface_from_world = inverse(world_from_surface)
         self._world_from_surface = world_from_surface
+        self._table_from_world = self._surface_from_world if world_from_table is None else inverse(world_from_table)
+        self._table_height = table_height
         self._flange_from_part = flange_from_part
+        fingers = flange_from_part[:3, :3] @ [0.0, 0.0, 1.0] * FINGERS_ABOVE + flange_from_part[:3, 3]
+        self._fingertips = np.array([[x, y, 0.0] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]) + fingers
         self._world_from_part: Pose | None = None
         self._claw_closed = True
         self._lock = threading.Lock()
         # A margin keeps the points off the border, where the height field falls to the table.
-        along = np.linspace(-0.98, 0.98, 25) * surface.half_x
-        across = np.linspace(-0.97, 0.97, 13) * surface.half_y
+        along = np.linspace(-0.98, 0.98, 25) * surface.half_x + surface.centre[0]
+        across = np.linspace(-0.97, 0.97, 13) * surface.half_y + surface.centre[1]
         grid = np.meshgrid(along, across)
         x, y = (axis.ravel() for axis in grid)
-        self._underside = np.stack([x, y, surface.height(x, y)], axis=-1)
+        there = np.isfinite(surface.relief(x, y)[0])
+        if there.sum() < LEAST_TOUCHING:
+            raise ValueError(
+                f"the surface {surface.name!r} lies below {there.sum()} of {len(there)} points of the part's underside "
+                f"(allowed: at least {LEAST_TOUCHING}); give a mesh that is seen from above, z up"
+            )
+        underside = np.stack([x, y, surface.height(x, y)], axis=-1)[there]
+        self._underside = underside if surface_from_part is None else _moved(underside, inverse(surface_from_part))
+        box = [[sx * surface.half_x, sy * surface.half_y, surface.top] for sx in (-1, 1) for sy in (-1, 1)]
+        corners = _moved(np.array(box) + np.array([*surface.centre, 0.0]), world_from_surface)
+        self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
 
     @property
     def held(self) -> bool:
@@ -95,25 +124,29 @@ class PartContact:
 
     def _below(self, points: Vector) -> tuple[Vector, Vector]:
         """Depth (n,), m, of world `points` (n, 3) below the ground along z_S, and the ground's normals (n, 3) in S."""
-        local = _moved(points, self._surface_from_world)
-        on_table = np.abs(local[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+        local, on_table = _moved(points, self._surface_from_world), self._on_table(points)
         height, normals = self._surface.sample(local[:, 0], local[:, 1])
-        return np.where(on_table, height, -nominal.TABLE_HEIGHT) - local[:, 2], normals
+        return np.where(on_table, height, -self._table_height) - local[:, 2], normals
+
+    def _on_table(self, points: Vector) -> NDArray[np.bool_]:
+        made: NDArray[np.bool_] = (
+            np.abs(_moved(points, self._table_from_world)[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+        )
+        return made
 
     def below(self, points: Vector) -> tuple[Vector, NDArray[np.bool_]]:
         """How deep (n,), m, world `points` (n, 3) are below the ground, and where that is the table."""
         depth, _ = self._below(points)
-        local = _moved(points, self._surface_from_world)
-        return depth, np.abs(local[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+        return depth, self._on_table(points)
 
     def wrench(self, world_from_flange: Pose) -> Vector:
         """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
-        points = _moved(nominal.FLANGE_FINGERTIPS, world_from_flange)
+        points = _moved(self._fingertips, world_from_flange)
         with self._lock:
             if self._world_from_part is None:
                 points = np.concatenate([points, _moved(self._underside, self._pose(world_from_flange))])
         wrench = np.zeros(6)
-        if points[:, 2].min() > self._world_from_surface[2, 3] + _HIGHEST:
+        if points[:, 2].min() > self._highest:
             return wrench
         depth, normals = self._below(points)
         if depth.max() <= 0.0:

@@ -13,16 +13,20 @@ from sim_backends.models.camera import CameraSpec
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.models.screw import Screw
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
-from sim_backends.world import nominal
 from sim_backends.world.scene import Scene, stream
 
 _TORQUE_PER_FORCE = 0.05
 """Noise of the measured torque, Nm, per newton of noise in the force."""
 
 
-def make_arm(scene: Scene, clock: WorldClock, model: str = "UR10e") -> ArmModel:
-    """The arm of the maker's `model` at rest, with its claw closed."""
-    sigma = scene.deviations
+CAMERA_RATE = {"scan": 120.0, "target": 30.0}
+"""Most pictures a second."""
+
+
+def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
+    """The arm at rest, with its claw closed."""
+    sigma, drawn = scene.deviations, scene.drawing.cell
+    model = drawn.arm
     params = ArmParams.of(
         model,
         dh=TABLES[model] + scene.dh_factory,
@@ -32,24 +36,32 @@ def make_arm(scene: Scene, clock: WorldClock, model: str = "UR10e") -> ArmModel:
         memory=scene.effects.path_memory,
         harmonics=scene.workshop.harmonics,
         compliance=scene.effects.sag,
+        carried=drawn.payload,
         serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)
-    closed = 1 << nominal.CLAW_OUTPUT
+    closed = 1 << drawn.claw_output
     arm.write_digital_outputs(closed, closed)
     return arm
 
 
 def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
     """The rail, switched on anywhere on its travel and not yet homed."""
+    drawn = scene.drawing.cell.rail
     screw = Screw(
+        lead=drawn.lead,
         scale_error=scene.rail_lead_error,
         periodic=scene.rail_periodic_amplitude,
         phase=scene.rail_periodic_phase,
         backlash=scene.rail_backlash,
     )
-    start = float(stream(scene.seed, "rail.start").uniform(0.01, 0.09))
-    params = RailParams(screw=screw, repeatability=scene.deviations.rail_homing, start=start, serial=int(scene.serial))
+    params = RailParams(
+        screw=screw,
+        steps_per_turn=drawn.steps_per_turn,
+        repeatability=scene.deviations.rail_homing,
+        start=float(stream(scene.seed, "rail.start").uniform(*drawn.start)),
+        serial=int(scene.serial),
+    ).around(drawn.travel)
     return RailModel(params, stream(scene.seed, "rail"))
 
 
@@ -59,6 +71,7 @@ def make_vehicle(scene: Scene) -> VehicleModel:
     yaw = float(np.arctan2(start[1, 0], start[0, 0]))
     params = VehicleParams(
         start=(float(start[0, 3]), float(start[1, 3]), yaw),
+        track=scene.drawing.cell.track,
         distance_scale=1.0 + scene.odometry_scale,
         yaw_scale=1.0 + scene.odometry_yaw,
         lateral_walk=0.1 * scene.deviations.odometry_scale,
@@ -69,15 +82,15 @@ def make_vehicle(scene: Scene) -> VehicleModel:
 
 def camera_spec(scene: Scene, camera: str) -> CameraSpec:
     """The camera "scan" or "target"; its serial carries the seed, so that another cell's calibration is recognised."""
-    scan = camera == "scan"
-    size, rate = (nominal.SCAN_SIZE, nominal.SCAN_RATE) if scan else (nominal.TARGET_SIZE, nominal.TARGET_RATE)
+    drawn, scan = scene.drawing.cell, camera == "scan"
+    size = drawn.scan.size if scan else drawn.target.size
     timing = scene.scan_clock if scan else scene.target_clock
     return CameraSpec(
         model=f"SIM-{camera.upper()}",
         serial=f"SIM{scene.serial}-{camera.upper()}",
         width=size[0],
         height=size[1],
-        frame_rate_max=rate,
+        frame_rate_max=CAMERA_RATE[camera],
         epoch=timing.epoch,
         drift_ppm=1e6 * timing.drift,
         latency=timing.latency,

@@ -41,12 +41,8 @@ def board_pose(
     return made
 
 
-LARGE_BOARD = ("marked_dots", 9, 7, 0.020)
-"""Kind, columns, rows and pitch (m) of the station's board and of the deck's large board."""
-FINE_BOARD = ("marked_dots", 11, 9, 0.003)
-"""Kind, columns, rows and pitch (m) of the deck's fine plate."""
 LARGE_BOARD_SIZE = (0.160, 0.120)
-"""From the first dot to the last, m."""
+"""From the first dot to the last of the station's board and of the deck's large board, m."""
 _FINE_SIZE = (0.030, 0.024)
 _C45 = math.sqrt(0.5)
 
@@ -68,8 +64,6 @@ FLANGE_FROM_WITNESS = pose((0.09, -0.0625, 0.165), (0, 1, 0), (0, 0, 1))
 """A plate of `WITNESS_SIZE` on the claw: with the carriage at home the laser's line lies on it, beside the sweeps."""
 WITNESS_SIZE = (0.013, 0.012)
 FLANGE_FROM_PART = pose((0.0, 0.0, 0.17), (0, 1, 0), (0, 0, -1))
-FLANGE_FINGERTIPS = np.array([[sx * 0.02, sy * 0.01, 0.155] for sx in (-1, 1) for sy in (-1, 1)])
-"""(4, 3) lowest points of the claw, m, in F."""
 RAIL_DIRECTION = np.array([1.0, 0.0, 0.0])
 """The way the carriage moves, in C."""
 
@@ -78,12 +72,10 @@ F_NUMBER = 4.0
 PIXEL = 4.8e-6
 SCAN_SIZE = (640, 480)
 SCAN_FOCUS = 0.130
-SCAN_RATE = 120.0
 TARGET_SIZE = (1280, 1024)
 TARGET_FOCUS = 1.0
-TARGET_RATE = 30.0
-LASER_ORIGIN = np.array([-0.035, 0.0, 0.0])
-"""The laser's exit point in C, m."""
+LASER_BASELINE = 0.035
+"""From the scan camera to the laser's exit point, against C's x axis, m."""
 LASER_TAN_THETA = 3.5
 """Tangent of the angle at the laser between baseline and light plane."""
 

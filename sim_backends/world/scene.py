@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world import nominal
+from sim_backends.world.drawing import STOCK, CameraDrawing, CellDrawing, Drawing
 from sim_backends.world.effects import WARMING_K, Effects
 from sim_backends.world.levels import CUT, Deviations, deviations, effects_of, number_of
+from sim_backends.world.nominal import RAIL_DIRECTION, inverse, pose
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -80,14 +81,20 @@ class Workshop:
 
 @dataclass(frozen=True)
 class Scene:
-    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `nominal`."""
+    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `nominal`.
+
+    The station carries table and surface: where `world_from_surface` is off, the table is off with it.
+    """
 
     seed: int
     level: str
+    drawing: Drawing
     deviations: Deviations
     effects: Effects
     world_from_vehicle_start: Pose
     vehicle_from_base: Pose
+    world_from_place: Pose
+    world_from_table: Pose
     world_from_surface: Pose
     world_from_board: Pose
     base_from_fine_board: Pose
@@ -147,49 +154,53 @@ class _Draws:
         return at @ made
 
 
-def draw(seed: int, level: str) -> Scene:
-    """Draw the world of `seed` at `level`. Raises ValueError for an unknown level or a negative seed."""
+def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Scene:
+    """Draw the world of `seed` at `level` around `drawing`; the claw holds its next part after so many `parts`.
+
+    Raises ValueError for an unknown level or a negative seed.
+    """
     sigma, effects = deviations(level), effects_of(level)
     if seed < 0:
         raise ValueError(f"seed {seed} must be 0 or greater")
     d = _Draws(seed)
-    normal, distance, origin = _light_plane(d, sigma)
-    start = nominal.WORLD_FROM_VEHICLE_START.copy()
+    cell, station = drawing.cell, drawing.station
+    normal, distance, origin = _light_plane(d, sigma, cell)
+    world_from_place = pose((0.0, 0.0, station.height), (1, 0, 0), (0, 0, 1))
+    start = world_from_place @ station.place_from_start
     start[:2, 3] += d.vector("start.translation", sigma.start_translation, 2)
-    start[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar("start.rotation", sigma.start_rotation)]))
+    start[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar("start.rotation", sigma.start_rotation)])) @ start[:3, :3]
+    surface = d.moved(
+        "station", world_from_place @ station.place_from_surface, sigma.station_translation, sigma.station_rotation
+    )
+    deck = (sigma.deck_board_translation, sigma.deck_board_rotation)
+    grasp = "grasp" if parts == 0 else f"grasp.{parts}"
     return Scene(
         seed=seed,
         level=level,
+        drawing=drawing,
         deviations=sigma,
         effects=effects,
         world_from_vehicle_start=start,
-        vehicle_from_base=nominal.VEHICLE_FROM_BASE,
-        world_from_surface=d.moved(
-            "station", nominal.WORLD_FROM_PLACE, sigma.station_translation, sigma.station_rotation
-        ),
-        world_from_board=nominal.WORLD_FROM_PLACE @ nominal.PLACE_FROM_BOARD,
-        base_from_fine_board=d.moved(
-            "fine_board", nominal.BASE_FROM_FINE_BOARD, sigma.deck_board_translation, sigma.deck_board_rotation
-        ),
-        base_from_deck_board=d.moved(
-            "deck_board", nominal.BASE_FROM_DECK_BOARD, sigma.deck_board_translation, sigma.deck_board_rotation
-        ),
+        vehicle_from_base=cell.vehicle_from_base,
+        world_from_place=world_from_place,
+        world_from_table=surface @ inverse(station.place_from_surface),
+        world_from_surface=surface,
+        world_from_board=world_from_place @ station.place_from_board,
+        base_from_fine_board=d.moved("fine_board", cell.base_from_fine_board, *deck),
+        base_from_deck_board=d.moved("deck_board", cell.base_from_deck_board, *deck),
         flange_from_scan_camera=d.moved(
-            "hand_eye", nominal.FLANGE_FROM_SCAN_CAMERA, sigma.hand_eye_translation, sigma.hand_eye_rotation
+            "hand_eye", cell.scan.mounting, sigma.hand_eye_translation, sigma.hand_eye_rotation
         ),
         flange_from_target_camera=d.moved(
-            "target_mount",
-            nominal.FLANGE_FROM_TARGET_CAMERA,
-            sigma.target_mount_translation,
-            sigma.target_mount_rotation,
+            "target_mount", cell.target.mounting, sigma.target_mount_translation, sigma.target_mount_rotation
         ),
-        flange_from_part=d.moved("grasp", nominal.FLANGE_FROM_PART, sigma.grasp_translation, sigma.grasp_rotation),
-        scan_lens=_lens(d, "scan_lens", sigma, nominal.SCAN_SIZE),
-        target_lens=_lens(d, "target_lens", sigma, nominal.TARGET_SIZE),
+        flange_from_part=d.moved(grasp, station.flange_from_part, sigma.grasp_translation, sigma.grasp_rotation),
+        scan_lens=_lens(d, "scan_lens", sigma, cell.scan),
+        target_lens=_lens(d, "target_lens", sigma, cell.target),
         light_plane_normal=normal,
         light_plane_distance=distance,
         laser_origin=origin,
-        rail_direction=rotation(d.vector("rail_direction", sigma.rail_direction)) @ nominal.RAIL_DIRECTION,
+        rail_direction=rotation(d.vector("rail_direction", sigma.rail_direction)) @ RAIL_DIRECTION,
         rail_lead_error=d.scalar("rail_lead", sigma.rail_lead),
         rail_periodic_amplitude=abs(d.scalar("rail_periodic", sigma.rail_periodic)),
         rail_periodic_phase=float(stream(seed, "rail_phase").uniform(0.0, 2.0 * np.pi)),
@@ -207,22 +218,22 @@ def draw(seed: int, level: str) -> Scene:
     )
 
 
-def _light_plane(d: _Draws, sigma: Deviations) -> tuple[Vector, float, Vector]:
-    """Unit normal, distance and exit point, in C: nominally X = −l + Z cot θ (docs/theory.md, section 2)."""
-    plain = np.array([1.0, 0.0, -1.0 / nominal.LASER_TAN_THETA])
+def _light_plane(d: _Draws, sigma: Deviations, cell: CellDrawing) -> tuple[Vector, float, Vector]:
+    """Unit normal, distance and exit point, in C: as drawn X = −l + Z cot θ (docs/theory.md, section 2)."""
+    plain = np.array([1.0, 0.0, -1.0 / cell.tan_theta])
     normal = rotation(d.vector("light_plane.tilt", sigma.light_plane_tilt)) @ (plain / np.linalg.norm(plain))
-    origin = nominal.LASER_ORIGIN + d.vector("light_plane.offset", sigma.light_plane_offset)
+    origin = np.array([-cell.baseline, 0.0, 0.0]) + d.vector("light_plane.offset", sigma.light_plane_offset)
     return normal, float(normal @ origin), origin
 
 
-def _lens(d: _Draws, name: str, sigma: Deviations, size: tuple[int, int]) -> Lens:
-    focal = nominal.FOCAL_LENGTH / nominal.PIXEL * (1.0 + d.scalar(name + ".focal", sigma.focal_length))
+def _lens(d: _Draws, name: str, sigma: Deviations, camera: CameraDrawing) -> Lens:
+    focal = camera.focal_length / camera.pixel * (1.0 + d.scalar(name + ".focal", sigma.focal_length))
     # The two focal lengths differ by what pixels that are not quite square give.
     aspect = 1.0 + 0.04 * d.scalar(name + ".aspect", sigma.focal_length)
     shift = d.vector(name + ".principal", sigma.principal_point, 2)
     k1, k2 = d.vector(name + ".distortion", sigma.distortion_k1, 2)
     p1, p2 = d.vector(name + ".tangential", 0.02 * sigma.distortion_k1, 2)
-    cx, cy = (size[0] - 1) / 2.0 + float(shift[0]), (size[1] - 1) / 2.0 + float(shift[1])
+    cx, cy = (camera.size[0] - 1) / 2.0 + float(shift[0]), (camera.size[1] - 1) / 2.0 + float(shift[1])
     return Lens(focal, focal * aspect, cx, cy, (float(k1), 0.5 * float(k2), float(p1), float(p2), 0.0))
 
 

@@ -36,20 +36,28 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """A height field over the footprint |x| ≤ `half_x`, |y| ≤ `half_y`, m.
+    """A height field over the footprint of half the sides `half_x`, `half_y` about `centre`, m, up to `top`, m.
 
-    `relief(x, y)` gives height, ∂h/∂x and ∂h/∂y in m and m/m.
+    `relief(x, y)` gives height, ∂h/∂x and ∂h/∂y in m and m/m, nan where there is nothing. Around it and in its holes
+    lies the `table`, z = a + b x + c y.
     """
 
     name: str
     relief: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
     half_x: float = HALF_X
     half_y: float = HALF_Y
+    centre: tuple[float, float] = (0.0, 0.0)
+    top: float = 0.015
+    table: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def sample(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Heights (n,), m, and upward unit normals (n, 3) at x, y (n,) in S; outside the footprint the table's."""
-        inside = (np.abs(x) <= self.half_x) & (np.abs(y) <= self.half_y)
-        h, gx, gy = (np.where(inside, value, 0.0) for value in self.relief(x, y))
+        relief = self.relief(x, y)
+        inside = (np.abs(x - self.centre[0]) <= self.half_x) & (np.abs(y - self.centre[1]) <= self.half_y)
+        inside &= np.isfinite(relief[0])
+        a, b, c = self.table
+        h = np.where(inside, relief[0], a + b * x + c * y)
+        gx, gy = np.where(inside, relief[1], b), np.where(inside, relief[2], c)
         steepness = np.sqrt(1.0 + gx * gx + gy * gy)
         return h, np.stack([-gx / steepness, -gy / steepness, 1.0 / steepness], axis=-1)
 

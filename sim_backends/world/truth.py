@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sim_backends.world import nominal
 from sim_backends.world.levels import assumed_noise
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import CameraClock, Lens
-from sim_backends.world.surfaces import surface
 from sim_backends.world.world import Pose, World
 
 
@@ -27,7 +25,7 @@ def truth(world: World) -> dict[str, Any]:
     base_from_flange = world.arm.base_from_flange(t)
     world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
     vehicle = world.vehicle.feedback(t)
-    shape = surface(world.surface)
+    shape, drawn = world.station.ground, scene.drawing.cell
     outputs = world.arm.digital_outputs
     return {
         "seed": scene.seed,
@@ -35,7 +33,7 @@ def truth(world: World) -> dict[str, Any]:
         "speed": world.clock.speed,
         "time": t,
         "assumed_noise": assumed_noise(scene.level),
-        "surface": {"name": world.surface, "half_x": shape.half_x, "half_y": shape.half_y, "unit": "m"},
+        "surface": {"name": shape.name, "half_x": shape.half_x, "half_y": shape.half_y, "unit": "m"},
         "poses": {
             name: _nested(pose)
             for name, pose in {
@@ -68,7 +66,7 @@ def truth(world: World) -> dict[str, Any]:
         "scan_clock": _timing(scene.scan_clock),
         "target_clock": _timing(scene.target_clock),
         "part": {"held": world.part.held},
-        "laser_on": bool(outputs >> nominal.LASER_OUTPUT & 1),
+        "laser_on": bool(outputs >> drawn.laser_output & 1),
         "digital_outputs": [bool(outputs >> i & 1) for i in range(8)],
         "vehicle": {
             "stopped": vehicle.speed == 0.0 and vehicle.yaw_rate == 0.0,

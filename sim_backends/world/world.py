@@ -6,6 +6,7 @@ the vehicle's lean under the arm, and the chain of poses from the floor to the c
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,16 @@ from numpy.typing import NDArray
 from sim_backends.clock import WorldClock
 from sim_backends.history import SwitchHistory
 from sim_backends.models.arm import Safety
-from sim_backends.world import hardware, nominal
+from sim_backends.world import hardware
+from sim_backends.world.arm_points import ArmPoints
 from sim_backends.world.cameras import Cameras
-from sim_backends.world.collisions import ArmPoints, Collisions
+from sim_backends.world.collisions import Collision, Collisions
 from sim_backends.world.contact import PartContact
+from sim_backends.world.drawing import STOCK, Drawing, StationDrawing
 from sim_backends.world.effects import WARMING_S
-from sim_backends.world.nominal import inverse
+from sim_backends.world.nominal import inverse, pose
 from sim_backends.world.scene import Lens, draw, rotation
-from sim_backends.world.surfaces import surface as named_surface
+from sim_backends.world.station import Station
 
 Pose = NDArray[np.float64]
 
@@ -38,31 +41,60 @@ class World:
         seed: int = 1,
         level: str = "nominal",
         speed: float = 1.0,
-        surface: str = "pot",
+        drawing: Drawing = STOCK,
         clock: WorldClock | None = None,
-        arm: str = "UR10e",
     ) -> None:
-        """Draw the world and let its clock run, at `speed` unless it is given one; `arm` is the maker's model.
+        """Draw the world around `drawing` and let its clock run, at `speed` unless it is given one.
 
-        Raises ValueError for an unknown level or surface, or a bad number.
+        Raises ValueError for an unknown level or surface, a surface that is no mesh, or a bad number.
         """
-        shape = named_surface(surface)
-        self.surface = surface
-        self._solid = ArmPoints(shape.half_x, shape.half_y)
-        self.scene = draw(seed, level)
+        self.scene = draw(seed, level, drawing)
+        self.station = Station.of(drawing.station)
         self.clock = WorldClock(speed) if clock is None else clock
-        self.arm = hardware.make_arm(self.scene, self.clock, arm)
+        self.arm = hardware.make_arm(self.scene, self.clock)
         self.rail = hardware.make_rail(self.scene, self.clock)
         self.vehicle = hardware.make_vehicle(self.scene)
-        self.part = PartContact(shape, self.scene.world_from_surface, self.scene.flange_from_part)
-        self.collisions = Collisions(self.scene, self.part)
         self.laser = SwitchHistory()
-        self._cameras = Cameras(self.scene, surface)
+        self.parts = 0
+        """How often the claw was filled again."""
+        self._cameras = Cameras(self.scene, self.station)
         self._stood = 0.0
-        self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
+        self._set_up()
         self.vehicle.sag = self._sag
-        self.vehicle.blocked = self.collisions.blocks
+        self.vehicle.blocked = lambda t, pose: self.collisions.blocks(t, pose)
         self.arm.contact = self._touch
+
+    def _set_up(self, found: tuple[Collision, ...] = ()) -> None:
+        """Part in the claw, and bodies of cell and station that may meet."""
+        scene, station = self.scene, self.scene.drawing.station
+        self.part = PartContact(
+            self.station.ground,
+            scene.world_from_surface,
+            scene.flange_from_part,
+            world_from_table=scene.world_from_table,
+            surface_from_part=station.surface_from_part,
+            table_height=station.height,
+        )
+        self._solid = ArmPoints(scene.drawing)
+        self.collisions = Collisions(scene, self.part, found)
+        self.arm.set_digital_input(scene.drawing.cell.grip_input, self.part.held)
+
+    def make_ready(self, station: StationDrawing) -> None:
+        """As when a person makes all ready for a job: the station is set up, and its part is put into the claw.
+
+        What lay at the station is taken away. Vehicle, arm and rail stay as they stand. Where the station stands
+        already, with its part in the claw, all stays as it is. Raises ValueError as `World`.
+        """
+        drawing = replace(self.scene.drawing, station=station)
+        if self.part.held and drawing.as_json() == self.scene.drawing.as_json():
+            return
+        ready = Station.of(station)
+        scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + 1)
+        self.scene, self.station, self.parts = scene, ready, self.parts + 1
+        closed = 1 << drawing.cell.claw_output
+        self.arm.write_digital_outputs(closed, closed)
+        self._set_up(self.collisions.found)
+        self._cameras.show(scene, ready)
 
     # --- where things are ---
 
@@ -132,9 +164,10 @@ class World:
     def warm_up(self) -> None:
         """Render one picture of everything, so that compiling is over before the first client asks for one."""
         base = self.world_from_base(self.clock.now())
-        for camera, distance in (("scan", nominal.SCAN_FOCUS), ("target", nominal.TARGET_FOCUS)):
+        drawn = self.scene.drawing.cell
+        for camera, distance in (("scan", drawn.scan.focus), ("target", drawn.target.focus)):
             for target in (self.scene.world_from_surface, self.scene.world_from_board):
-                facing = target @ nominal.pose((0.0, 0.0, distance), (1, 0, 0), (0, 0, -1))
+                facing = target @ pose((0.0, 0.0, distance), (1, 0, 0), (0, 0, -1))
                 self._cameras.picture(camera, facing, base, True, 0.002)
 
     # --- what couples the devices ---
@@ -144,10 +177,10 @@ class World:
         t = self.arm.time
         world_from_base = self.world_from_base(t)
         world_from_flange = world_from_base @ base_from_flange
-        outputs = self.arm.digital_outputs
-        self.laser.record(t, bool(outputs >> nominal.LASER_OUTPUT & 1))
-        self.part.set_claw(bool(outputs >> nominal.CLAW_OUTPUT & 1), world_from_flange)
-        self.arm.set_digital_input(nominal.GRIP_INPUT, self.part.held)
+        outputs, drawn = self.arm.digital_outputs, self.scene.drawing.cell
+        self.laser.record(t, bool(outputs >> drawn.laser_output & 1))
+        self.part.set_claw(bool(outputs >> drawn.claw_output & 1), world_from_flange)
+        self.arm.set_digital_input(drawn.grip_input, self.part.held)
         self._meet(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
         if np.linalg.norm(wrench[:3]) > self.arm.params.force_limit and self.arm.safety is Safety.NORMAL:

@@ -17,6 +17,7 @@ from drivers.errors import ConfigError
 
 RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 CHESS = parse_board("chessboard:7x6:10mm")
+RECORDED_FRAMES = range(2, 9)
 
 pytestmark = pytest.mark.recorded
 
@@ -29,8 +30,37 @@ def recording(name: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def line_laser():
-    return calibrate_folder(recording("robot_line_laser"), CHESS)
+def line_laser(tmp_path_factory):
+    """The robot's recording with spoilt frames among its own: what is told of it is told in spite of them."""
+    folder = tmp_path_factory.mktemp("robot")
+    source = recording("robot_line_laser")
+    for path in source.iterdir():
+        shutil.copyfile(path, folder / path.name)
+
+    def spoil(number: int, of: int, picture: np.ndarray | None = None, data: bytes | None = None) -> None:
+        shutil.copyfile(source / f"pose{of:04d}.txt", folder / f"pose{number:04d}.txt")
+        target = folder / f"frame{number:04d}.png"
+        if data is None:
+            cv2.imwrite(str(target), picture)
+        else:
+            target.write_bytes(data)
+
+    def frame(number: int) -> np.ndarray:
+        return cv2.imread(str(source / f"frame{number:04d}.png"), cv2.IMREAD_GRAYSCALE)
+
+    spoil(20, 2, frame(2) // 30)
+    spoil(21, 2, np.full((1024, 1280), 255, np.uint8))
+    spoil(22, 3, data=(source / "frame0003.png").read_bytes()[:700_000])
+    spoil(23, 4, cv2.resize(frame(4), None, fx=0.5, fy=0.5))
+    spoil(24, 4, np.full((1024, 1280), 60, np.uint8))
+    spoil(25, 5, cv2.rotate(frame(5), cv2.ROTATE_180))
+    spoil(26, 6, np.ascontiguousarray(frame(6)[:, ::-1]))
+    spoil(27, 7, data=b"")
+    spoil(28, 8, frame(8))
+    (folder / "pose0028.txt").write_text("((1.3, 0.1, 1.4), (0.0, 0.0, 0.0, 9.0))")
+    spoil(29, 8, frame(8))
+    (folder / "pose0029.txt").write_text((source / "pose0008.txt").read_text().replace("((1.3101837", "((1.3601837"))
+    return calibrate_folder(folder, CHESS)
 
 
 def test_the_whole_chain_is_flatter_than_the_staged_pipeline(line_laser):
@@ -47,11 +77,12 @@ def test_the_whole_chain_is_flatter_than_the_staged_pipeline(line_laser):
 def test_frames_that_were_left_out_are_as_flat(line_laser):
     left_out = line_laser["flatness"]["leave_one_out"]
     assert left_out["rms_mm"] < 0.448
-    assert [frame["name"] for frame in left_out["per_frame"]] == [f["name"] for f in line_laser["frames"]]
+    assert [frame["name"] for frame in left_out["per_frame"]] == [f"frame{k:04d}.png" for k in RECORDED_FRAMES]
 
 
 def test_camera_hand_eye_and_plane_are_those_of_the_simple_pipeline(line_laser):
-    assert all(frame["used"] for frame in line_laser["frames"])
+    used = [frame["name"] for frame in line_laser["frames"] if frame["used"]]
+    assert used == [f"frame{k:04d}.png" for k in RECORDED_FRAMES]
     assert line_laser["intrinsics_from_pictures"]["rms_px"] < 0.36
     assert line_laser["intrinsics"]["fx"] == pytest.approx(2366, rel=0.01)
     assert line_laser["intrinsics"]["fy"] == pytest.approx(2372, rel=0.01)
@@ -77,37 +108,9 @@ def test_without_poses_the_camera_and_the_light_plane_are_had(tmp_path):
     assert any("pose" in note for note in found["notes"])
 
 
-def test_spoilt_frames_are_refused_one_by_one_with_the_reason(tmp_path):
-    source = recording("robot_line_laser")
-    for path in source.iterdir():
-        shutil.copyfile(path, tmp_path / path.name)
-
-    def spoil(number: int, of: int, picture: np.ndarray | None = None, data: bytes | None = None) -> None:
-        shutil.copyfile(source / f"pose{of:04d}.txt", tmp_path / f"pose{number:04d}.txt")
-        target = tmp_path / f"frame{number:04d}.png"
-        if data is None:
-            cv2.imwrite(str(target), picture)
-        else:
-            target.write_bytes(data)
-
-    def frame(number: int) -> np.ndarray:
-        return cv2.imread(str(source / f"frame{number:04d}.png"), cv2.IMREAD_GRAYSCALE)
-
-    spoil(20, 2, frame(2) // 30)
-    spoil(21, 2, np.full((1024, 1280), 255, np.uint8))
-    spoil(22, 3, data=(source / "frame0003.png").read_bytes()[:700_000])
-    spoil(23, 4, cv2.resize(frame(4), None, fx=0.5, fy=0.5))
-    spoil(24, 4, np.full((1024, 1280), 60, np.uint8))
-    spoil(25, 5, cv2.rotate(frame(5), cv2.ROTATE_180))
-    spoil(26, 6, np.ascontiguousarray(frame(6)[:, ::-1]))
-    spoil(27, 7, data=b"")
-    spoil(28, 8, frame(8))
-    (tmp_path / "pose0028.txt").write_text("((1.3, 0.1, 1.4), (0.0, 0.0, 0.0, 9.0))")
-    spoil(29, 8, frame(8))
-    (tmp_path / "pose0029.txt").write_text((source / "pose0008.txt").read_text().replace("((1.3101837", "((1.3601837"))
-    found = calibrate_folder(tmp_path, CHESS)
-    reasons = {f["name"]: f["reason"] for f in found["frames"] if not f["used"]}
-    assert reasons == {
+def test_spoilt_frames_are_refused_one_by_one_with_the_reason(line_laser):
+    refused = [f for f in line_laser["frames"] if not f["used"]]
+    assert {f["name"]: f["reason"] for f in refused} == {
         "frame0020.png": "black",
         "frame0021.png": "saturated",
         "frame0022.png": "cut",
@@ -119,8 +122,7 @@ def test_spoilt_frames_are_refused_one_by_one_with_the_reason(tmp_path):
         "frame0028.png": "no_pose",
         "frame0029.png": "no_pose",
     }
-    assert all(len(f["text"]) > 20 for f in found["frames"] if not f["used"])
-    assert found["flatness"]["leave_one_out"]["rms_mm"] < 0.448
+    assert all(len(f["text"]) > 20 for f in refused)
 
 
 def test_the_recorded_pose_pairs_give_the_expected_hand_eye():

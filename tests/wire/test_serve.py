@@ -202,6 +202,7 @@ def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
     [
         (["--level", "rough"], "ideal"),
         (["--surface", "vase"], "pot"),
+        (["--arm", "UR11"], "UR10e"),
         (["--speed", "0"], "within 0.05 and 50"),
         (["--speed", "nan"], "within 0.05 and 50"),
         (["--speed", "fast"], "--speed"),

@@ -113,9 +113,9 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
     by_point = by_middle @ by_centre
     jacobian = np.zeros((len(seen), 2, COLUMNS))
     jacobian[:, :, CAMERA] = by_camera
-    by_base = by_point @ to_camera
+    by_base = _times(by_point, to_camera)
     jacobian[:, :, RAIL] = -rail * by_point
-    by_flange_axes = by_point @ hand.rotation.T
+    by_flange_axes = _times(by_point, hand.rotation.T)
     jacobian[:, :, 15:18] = -by_flange_axes
     jacobian[:, :, 18:21] = cross(by_flange_axes, from_camera[:, None, :])
     jacobian[:, :, 21:24] = by_base
@@ -126,11 +126,17 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
     if view.dot_radius > 0:
         # An ellipse's centre moves with the circle's tilt too. It is little, but a turn of the camera and a shift of
         # its principal point are told apart by as little.
-        tilted = by_middle @ by_normal @ to_camera
-        jacobian[:, :, 18:21] += cross(tilted @ flange.rotation, flange.rotation.T @ normal)
-        jacobian[:, :, 24:27] += cross(normal, tilted)
-        jacobian[:, :, 30:33] += cross(tilted, normal)
+        tilted = _times(by_middle @ by_normal, to_camera)
+        about_normal = _times(tilted, pin.skew(normal))
+        jacobian[:, :, 18:21] += _times(about_normal, flange.rotation)
+        jacobian[:, :, 24:27] -= about_normal
+        jacobian[:, :, 30:33] += about_normal
     return view.pixels - pixels, jacobian
+
+
+def _times(rows: Array, matrix: Array) -> Array:
+    """Rows (n, 2, 3) times one matrix (3, 3), in one product instead of n."""
+    return np.asarray((rows.reshape(-1, 3) @ matrix).reshape(rows.shape), dtype=np.float64)
 
 
 def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:
@@ -143,7 +149,7 @@ def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> 
     rays, ray_by_pixel = camera.rays_with_jacobian(view.stripe)
     points, by_ray, by_normal, by_distance = plane.intersect_with_jacobians(rays)
     # A change of the camera's parameters moves a fixed pixel's ray as the opposite move of the pixel would.
-    _, _, by_camera = camera.project_with_jacobians(rays)
+    by_camera = camera.parameter_jacobian(rays)
     point_by_pixel = by_ray @ ray_by_pixel
     moved = points + rail * state.rail_direction
     turned = moved @ hand.rotation.T

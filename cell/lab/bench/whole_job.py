@@ -17,6 +17,7 @@ from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.sessions import arm_table
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
+from cell.devices.described import Described
 from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import Job
@@ -89,7 +90,8 @@ def run_whole_job(
     `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s
     before the job.
     """
-    cell = VirtualCell(config, seed, level, Path(job.surface.mesh).stem)
+    assert nominal.source is not None
+    cell = VirtualCell(config, seed, level, Described(job, nominal.source))
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:

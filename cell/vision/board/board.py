@@ -201,9 +201,8 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
     normal = np.eye(6)
     for _ in range(STEPS):
         arm = points @ pose.rotation.T
-        _, by_point, _ = camera.project_with_jacobians(arm + pose.translation)
-        jacobian = np.concatenate([by_point, cross(arm[:, None, :], by_point)], axis=2)
-        jacobian = (factor[:, None, None] * jacobian).reshape(-1, 6)
+        by_point = factor[:, None, None] * camera.point_jacobian(arm + pose.translation)
+        jacobian = np.concatenate([by_point, cross(arm[:, None, :], by_point)], axis=2).reshape(-1, 6)
         normal = jacobian.T @ jacobian
         right = jacobian.T @ (factor[:, None] * residual).ravel()
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)

@@ -1,0 +1,61 @@
+"""The station of one scene as bodies: the surface as it is felt and as it is seen, and how far it reaches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.optics.mesh import Mesh
+from sim_backends.world.drawing import StationDrawing
+from sim_backends.world.nominal import inverse
+from sim_backends.world.own_surface import OwnSurface, own_surface
+from sim_backends.world.surfaces import Surface
+from sim_backends.world.surfaces import mesh as drawn_mesh
+from sim_backends.world.surfaces import surface as named_surface
+
+_KEPT = 4
+"""Meshes with their box trees, which take longer to make than all the rest of a world."""
+
+
+@dataclass(frozen=True, eq=False)
+class Station:
+    """`ground` is what a part meets, `seen` what cameras see, both in S; a ball about S of `radius`, m, holds it."""
+
+    ground: Surface
+    seen: Mesh
+    radius: float
+
+    @classmethod
+    def of(cls, drawn: StationDrawing) -> Station:
+        """The station as drawn. Raises ValueError for an unknown surface or a file that is no mesh."""
+        if not drawn.mesh:
+            ground, seen = named_surface(drawn.surface), _closed_form(drawn.surface)
+        else:
+            table = _plane(inverse(drawn.place_from_surface))
+            own = own_surface(drawn.mesh, drawn.mesh_unit)
+            ground, seen = replace(own.ground, table=table), _own(own, table)
+        (x, y), low = ground.centre, min(0.0, float(seen.low[0, 2]))
+        reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
+        room = max(0.015, ground.top, -low)
+        return cls(ground, seen, float(reach) + room)
+
+
+def _plane(surface_from_place: NDArray[np.float64]) -> tuple[float, float, float]:
+    """The table z = a + b x + c y in S."""
+    normal, point = surface_from_place[:3, 2], surface_from_place[:3, 3]
+    return float(normal @ point / normal[2]), float(-normal[0] / normal[2]), float(-normal[1] / normal[2])
+
+
+@lru_cache(maxsize=_KEPT)
+def _closed_form(name: str) -> Mesh:
+    made = drawn_mesh(name)
+    return Mesh(made.vertices, made.triangles)
+
+
+@lru_cache(maxsize=_KEPT)
+def _own(own: OwnSurface, table: tuple[float, float, float]) -> Mesh:
+    made = own.walled(table)
+    return Mesh(made.vertices, made.triangles)
