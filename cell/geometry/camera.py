@@ -111,8 +111,8 @@ class CameraModel:
     def normalised(self, pixels: ArrayLike) -> Array:
         """Ideal image coordinates (n, 2) at unit distance of pixels (n, 2), by Newton's method on `distort`.
 
-        NaN where the model has no inverse: a pixel beyond the fold of a strong distortion. Points beyond the fold, which
-        are seen at such a pixel by the formula only, are none.
+        NaN where the model has no inverse: a pixel beyond the fold of a strong distortion. Points beyond the fold, seen
+        at such a pixel by the formula only, are none.
         """
         target = (np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not any(self.dist):

@@ -129,8 +129,8 @@ def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
     A lens that is not known yet may have no rays for the outermost points: the others do for a start.
     """
     ideal = camera.normalised(view.pixels)
-    known = np.isfinite(ideal).all(axis=1)
-    if known.sum() < max(LEAST_POINTS, len(known) / 2):
+    known = np.flatnonzero(np.isfinite(ideal).all(axis=1))
+    if len(known) < max(LEAST_POINTS, len(ideal) / 2):
         return []
     _, turns, shifts, _ = cv2.solvePnPGeneric(
         view.object_points[known], ideal[known].reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
