@@ -62,7 +62,7 @@ def test_it_is_stored_and_what_is_no_turn_is_not_read() -> None:
 
 def verified(calibration: CellCalibration, seed: int, folder: Path) -> Verification:
     """The cell of `seed` after it has stood for an hour."""
-    cell = VirtualCell(CONFIG, seed, LEVEL, "pot")
+    cell = VirtualCell(CONFIG, seed, LEVEL)
     cell.world.stand(STOOD_S)
     devices = cell.devices
 

@@ -152,7 +152,7 @@ def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
 
 def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> Timing:
     """What the simulated cell of `seed` finds."""
-    cell = VirtualCell(CONFIG, seed, level, "pot")
+    cell = VirtualCell(CONFIG, seed, level)
     job, _ = load_job("pot")
 
     def look(hands: Hands) -> Timing:

@@ -1,4 +1,4 @@
-"""`cell jog`, `cell home` and `cell diag`: one device at a time; `cell devices`: which makes are installed."""
+"""`cell jog`, `cell home`, `cell diag`: one device at a time; `cell find`: what is there; `cell devices`: makes."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from cell.cli.options import (
 
 if TYPE_CHECKING:
     from cell.devices.diagnosis import Diagnosis
+    from cell.devices.local_devices import Found
+    from drivers.interfaces import Reading
 
 
 def register(app: typer.Typer) -> None:
@@ -29,6 +31,7 @@ def register(app: typer.Typer) -> None:
     app.command(context_settings={"ignore_unknown_options": True})(jog)
     app.command()(home)
     app.command()(diag)
+    app.command()(find)
     app.command()(devices)
 
 
@@ -97,7 +100,7 @@ def diag(
     speed: SpeedOption = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Ask the devices how they are: connection, identity, round trips, errors, state. Exit code 1 if any fails.
+    """Ask the devices how they are: identity, state, errors, figures with their limits. Exit code 1 if any is not well.
 
     Looks only: nothing on a device is set, started or ended.
     """
@@ -110,6 +113,48 @@ def diag(
         _print_table(rows)
     if not all(row.ok for row in rows):
         raise typer.Exit(1)
+
+
+def find(
+    ports: Annotated[
+        list[str] | None, typer.Argument(help="Ask these serial ports for a TMCL module's version.")
+    ] = None,
+    ask: Annotated[bool, typer.Option("--ask", help="Ask every serial port that was found and is free.")] = False,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """List what answers here, and what to write into cell.toml for it. Exit code 1 if nothing can be used.
+
+    Serial ports, CAN interfaces and cameras of this computer, and the addresses that are configured. No broadcast is
+    sent, nothing moves, and no port is opened that is not asked.
+    """
+    from cell.devices.finding import NEXT
+    from cell.devices.finding import find as look
+
+    found = look(config, ports or (), ask=ask)
+    if json:
+        print_json([row.as_dict() for row in found])
+    else:
+        _print_found(found)
+        local = [row for row in found if not row.what.startswith("config")]
+        for line in () if local else ("nothing was found on this computer; check", *NEXT):
+            typer.echo(line)
+    if not any(row.ok for row in found):
+        raise typer.Exit(1)
+
+
+def _print_found(found: list[Found]) -> None:
+    if not found:
+        return
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_lines=True)
+    for name in ("what", "where", "state", "for cell.toml"):
+        table.add_column(name, overflow="fold")
+    for row in found:
+        table.add_row(row.what, row.where, Text(row.state, style="" if row.ok else "red"), Text(row.write))
+    wide_console().print(table)
 
 
 def devices(json: JsonOption = False) -> None:
@@ -135,6 +180,7 @@ def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    console = Console()
     table = Table(title="devices", show_lines=True)
     for name in ("device", "identity", "address", "ms p50\np99", "errors", "state"):
         table.add_column(name, overflow="fold", justify="right" if name.startswith("ms") else "left")
@@ -149,4 +195,31 @@ def _print_table(rows: list[Diagnosis]) -> None:
             row.errors_text,
             row.state,
         )
-    Console().print(table)
+    console.print(table)
+    figures = Table(title="figures and what they may be")
+    for name in ("device", "figure", "value", "unit", "allowed", ""):
+        figures.add_column(name, overflow="fold", justify="right" if name in ("value", "allowed") else "left")
+    outside: list[str] = []
+    for row in rows:
+        for reading in row.readings:
+            mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
+            told = f"{reading.value:.4g}", reading.unit, _allowed(reading)
+            figures.add_row(row.device, reading.what, *told, mark if told[-1] else "")
+            if not reading.ok:
+                outside.append(f"{row.device}, {reading.what} {told[0]} {told[1]}, allowed {told[2]}: {reading.remedy}")
+    if figures.row_count:
+        console.print(figures)
+    for line in outside:
+        console.print(line, style="red", markup=False, soft_wrap=True)
+
+
+def _allowed(reading: Reading) -> str:
+    match reading.least, reading.most:
+        case None, None:
+            return ""
+        case None, most:
+            return f"≤ {most:g}"
+        case least, None:
+            return f"≥ {least:g}"
+        case least, most:
+            return f"{least:g} to {most:g}"

@@ -266,7 +266,7 @@ BUILT_IN: tuple[AnyMake, ...] = (
     Make("camera", "stream", StreamCameraConfig, _camera, OPTICS, simulated=_with("address")),
     Make(
         "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),
-        calibrated_since=frozenset(("witness",)), simulated=_with(), on_arm=True,
+        simulated=_with(), on_arm=True,
     ),
     Make("claw", "arm_output", ArmOutputClawConfig, _claw, simulated=_with(), on_arm=True),
     GIGE, USB3, V4L2, FOLDER,

@@ -1,4 +1,4 @@
-"""How every device is: connected, who it is, round trips, errors, state. One device's failure hides no other."""
+"""How every device is: connected, who it is, figures with their limits, errors, state. One's failure hides no other."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ import numpy as np
 
 from cell.config import DEVICES, CellConfig, config_to_open
 from cell.devices import assembly
+from cell.devices.examination import examine
 from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vehicle, why_untold
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, Vehicle, why_untold
 
 PINGS = 100
 
 
 @dataclass
 class Diagnosis:
-    """One device's row. Round trips in ms on the wall."""
+    """One device's row. Round trips in ms on the wall. `ok`: it answers, and no figure is outside its limits."""
 
     device: str
     ok: bool
@@ -37,6 +38,7 @@ class Diagnosis:
     p99_ms: float | None = None
     errors: dict[str, int] = field(default_factory=dict)
     state: str = ""
+    readings: list[Reading] = field(default_factory=list)
 
     @property
     def p50_text(self) -> str:
@@ -55,7 +57,11 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self)
+        told = asdict(self)
+        for row, reading in zip(told["readings"], self.readings, strict=True):
+            row["value"] = reading.value if math.isfinite(reading.value) else None
+            row["ok"] = reading.ok
+        return told
 
 
 def diagnose(
@@ -94,7 +100,7 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
                 rows.append(Diagnosis(name, False, record.place, state="the arm that it hangs on is not connected"))
                 continue
             connect = partial(assembly.connect_one, config, name, clock, arm=arm, look=True)
-            row, device = _open_and_ask(name, record.place, connect, STATES[name])
+            row, device = _open_and_ask(name, record.place, connect, clock)
             if name == "arm":
                 arm = device
             if device is not None and not config.make(name).on_arm:
@@ -104,25 +110,24 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     return rows
 
 
-def _open_and_ask(
-    name: str, address: str, build: Callable[[], Any], state: Callable[[Any], str]
-) -> tuple[Diagnosis, Any]:
+def _open_and_ask(name: str, address: str, build: Callable[[], Any], clock: Clock) -> tuple[Diagnosis, Any]:
     try:
         device = build()
     except CellError as error:
         return Diagnosis(name, False, address, state=str(error)), None
-    return _ask(name, address, device, state), device
+    return _ask(name, address, device, clock), device
 
 
-def _ask(name: str, address: str, device: Device, state: Callable[[Any], str]) -> Diagnosis:
+def _ask(name: str, address: str, device: Device, clock: Clock) -> Diagnosis:
     row = Diagnosis(name, False, address)
     try:
         identity = device.identity()
         row.model, row.serial, row.firmware = identity.model, identity.serial, identity.firmware
-        times = [1e3 * device.ping() for _ in range(PINGS)]
-        row.p50_ms, row.p99_ms = (float(v) for v in np.percentile(times, [50, 99]))
-        row.state = state(device)
-        row.ok = True
+        trips = [device.ping() for _ in range(PINGS)]
+        row.p50_ms, row.p99_ms = (1e3 * float(v) for v in np.percentile(trips, [50, 99]))
+        row.state = STATES[name](device)
+        row.readings = examine(DEVICES[name], device, trips, clock)
+        row.ok = all(reading.ok for reading in row.readings)
     except CellError as error:
         row.state = str(error)
     row.errors = dict(device.statistics.errors)

@@ -31,7 +31,7 @@ class CellLock:
 
     def __enter__(self) -> CellLock:
         for device, address in self._addresses.items():
-            name = "\0assembly-cell." + hashlib.sha256(f"{device} {address}".encode()).hexdigest()
+            name = _name(device, address)
             held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             try:
                 held.bind(name)
@@ -54,6 +54,24 @@ class CellLock:
     ) -> None:
         while self._held:
             self._held.pop().close()
+
+
+def who_holds(device: str, address: str) -> str:
+    """The process that holds this device (its name in the configuration, its address), in words; "" when none does."""
+    name = _name(device, address)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+        link.settimeout(1.0)
+        try:
+            link.connect(name)
+        except (ConnectionRefusedError, FileNotFoundError):
+            return ""
+        except OSError:
+            return "another process"
+    return _holder(name)
+
+
+def _name(device: str, address: str) -> str:
+    return "\0assembly-cell." + hashlib.sha256(f"{device} {address}".encode()).hexdigest()
 
 
 def _holder(name: str) -> str:

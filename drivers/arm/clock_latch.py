@@ -10,69 +10,20 @@ Source: the maker's RTDE guide, version 2; docs/protocols.md, section 1.
 
 from __future__ import annotations
 
-import socket
 import struct
 
 from drivers.arm.faults import fault
+from drivers.arm.rtde_link import PORT, RATE_HZ, VERSION, RtdeLink
 from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import DeadlineError, NotConnectedError
 
-PORT = 30004
 _REGISTER = "input_int_register_47"
 """The last of those that are left to clients like this one; ur-rtde uses the first 24."""
-_VERSION, _RATE_HZ, _PERIOD_S = 2, 500.0, 0.002
+_PERIOD_S = 0.002
 _QUESTIONS, _LONG_S, _TIMEOUT_S = 20, 0.3, 3.0
 """So many are asked, unless that takes longer than `_LONG_S` on the wall; all has to end within `_TIMEOUT_S`."""
-_HEADER = struct.Struct(">HB")
 _STATE, _NUMBER = struct.Struct(">Bdi"), struct.Struct(">Bi")
-
-
-class _Link:
-    """One RTDE connection of its own; packets one at a time, until the deadline on the host's clock."""
-
-    def __init__(self, address: str, clock: Clock) -> None:
-        self._clock = clock
-        self._deadline = clock.now() + _TIMEOUT_S * clock.rate
-        self._rest = b""
-        self._socket = socket.create_connection((address, PORT), timeout=_TIMEOUT_S)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def __enter__(self) -> _Link:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._socket.close()
-
-    def send(self, kind: str, payload: bytes) -> None:
-        """One packet to the controller."""
-        self._socket.sendall(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)
-
-    def receive(self, kind: str) -> bytes:
-        """The payload of the next packet of this kind; others are passed over."""
-        while True:
-            size, got = _HEADER.unpack(self._take(_HEADER.size))
-            payload = self._take(size - _HEADER.size)
-            if chr(got) == kind:
-                return payload
-
-    def ask(self, kind: str, payload: bytes) -> bytes:
-        """The reply to a packet, which is of its kind."""
-        self.send(kind, payload)
-        return self.receive(kind)
-
-    def _take(self, size: int) -> bytes:
-        while len(self._rest) < size:
-            left = self._clock.wall(self._deadline - self._clock.now())
-            if left <= 0:
-                raise TimeoutError
-            self._socket.settimeout(left)
-            data = self._socket.recv(65536)
-            if not data:
-                raise ConnectionResetError("the arm closed the connection")
-            self._rest += data
-        taken, self._rest = self._rest[:size], self._rest[size:]
-        return taken
 
 
 def latch_clock(name: str, address: str, clock: Clock) -> Latch:
@@ -82,7 +33,7 @@ def latch_clock(name: str, address: str, clock: Clock) -> Latch:
     register; `name` is the arm's in them.
     """
     try:
-        with _Link(address, clock) as link:
+        with RtdeLink(address, clock, _TIMEOUT_S) as link:
             return _shortest(name, link, clock)
     except TimeoutError as error:
         raise DeadlineError(name, f"no answer within {_TIMEOUT_S:g} s when its clock was asked for") from error
@@ -92,10 +43,10 @@ def latch_clock(name: str, address: str, clock: Clock) -> Latch:
         ) from error
 
 
-def _shortest(name: str, link: _Link, clock: Clock) -> Latch:
-    states = struct.pack(">d", _RATE_HZ) + f"timestamp,{_REGISTER}".encode()
+def _shortest(name: str, link: RtdeLink, clock: Clock) -> Latch:
+    states = struct.pack(">d", RATE_HZ) + f"timestamp,{_REGISTER}".encode()
     for what, kind, payload in (
-        ("RTDE version 2", "V", struct.pack(">H", _VERSION)),
+        ("RTDE version 2", "V", struct.pack(">H", VERSION)),
         (f"{_REGISTER} in its states", "O", states),
         (f"a value for {_REGISTER}; end the program that holds it", "I", _REGISTER.encode()),
         ("a start of its states", "S", b""),

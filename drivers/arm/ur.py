@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.arm import health
 from drivers.arm.clock_latch import latch_clock
 from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.limits import ArmLimits
@@ -27,7 +28,7 @@ from drivers.arm.wrong_arm import Forward
 from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
-from drivers.interfaces import ArmSafety, ArmState, Identity, Vector
+from drivers.interfaces import ArmSafety, ArmState, Identity, Reading, Vector
 from drivers.link_table import LinkTable
 from drivers.quantities import check_positive, shown
 
@@ -133,6 +134,11 @@ class UrArm:
         seconds = time.monotonic() - begun
         self.statistics.add_round_trip(seconds)
         return seconds
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """How its states come in `seconds`, its supply and its temperatures; see `drivers.arm.health`."""
+        self._session.require_link()
+        return health.examine(self.name, self._session.setup.address, self._clock, seconds)
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """The newest state, at most `max_age` s old (or received after the call), else `DeadlineError`."""

@@ -12,7 +12,7 @@ leaves the device safe and is idempotent.
 from drivers.clock_map import Latch
 from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
-from drivers.interfaces.device import Device, Identity, LinkStatistics, Motion, Vector
+from drivers.interfaces.device import Device, Examined, Identity, LinkStatistics, Motion, Reading, Vector
 from drivers.interfaces.rail import Rail, RailState, Sweep
 from drivers.interfaces.switches import Claw, Laser
 from drivers.interfaces.vehicle import Vehicle, VehicleState
@@ -26,6 +26,7 @@ __all__ = [
     "Camera",
     "Claw",
     "Device",
+    "Examined",
     "Frame",
     "FrameStream",
     "Identity",
@@ -37,6 +38,7 @@ __all__ = [
     "Motion",
     "Rail",
     "RailState",
+    "Reading",
     "SaysWhyUntold",
     "Sweep",
     "Vector",

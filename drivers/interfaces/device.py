@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,35 @@ class LinkStatistics:
     def count(self, name: str) -> None:
         """Add one to the error counter `name`."""
         self.errors[name] = self.errors.get(name, 0) + 1
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One figure of a device's health: `value` in `unit`, good from `least` to `most`; None where there is no limit.
+
+    `remedy` is what a person does when it is outside. A value that is not a number is outside of any limit.
+    """
+
+    what: str
+    value: float
+    unit: str
+    least: float | None = None
+    most: float | None = None
+    remedy: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the value is inside its limits."""
+        above = self.least is None or self.value >= self.least
+        return above and (self.most is None or self.value <= self.most)
+
+
+@runtime_checkable
+class Examined(Protocol):
+    """What a device may offer besides `Device`: figures of its health."""
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """Watch the device for `seconds` of the clock: nothing on it is set, started or ended. Errors as of `ping`."""
 
 
 class Device(Protocol):

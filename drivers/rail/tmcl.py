@@ -12,14 +12,15 @@ from collections.abc import Callable
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, ConfigError, InterlockError
-from drivers.interfaces import Identity, LinkStatistics, RailState
+from drivers.interfaces import Identity, LinkStatistics, RailState, Reading
 from drivers.quantities import check_positive, check_range, shown
+from drivers.rail import health
 from drivers.rail.arrival import Arrival, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_ramp
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
 from drivers.rail.tmcl_codec import Axis, Reference
-from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import ZeroMark
 
 _AT_START_M = 20e-6
@@ -97,6 +98,15 @@ class TmclRail:
     def ping(self) -> float:
         """Read the position once; returns the round trip in wall seconds."""
         return self._clock.wall(self._link.get_stamped(Axis.POSITION)[2])
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """What the module tells of its motor driver, at once; see `drivers.rail.health`."""
+        try:
+            return health.readings(self._link.get(Axis.DRIVER_ERRORS))
+        except CommandRefused as refused:
+            if refused.status == NO_SUCH_TYPE:
+                return []
+            raise
 
     def state(self) -> RailState:
         """Read position, velocity, switches and whether it is homed now.

@@ -17,8 +17,10 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from drivers.interfaces import Identity, LinkStatistics, VehicleState
+from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
 from drivers.quantities import check_range
+from drivers.vehicle import health
+from drivers.vehicle.can_interface import can_interface
 from drivers.vehicle.can_link import CanLink, load_database
 from drivers.vehicle.faults import OUT_OF_COMMAND
 from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, Feedback, patience
@@ -60,6 +62,8 @@ class AgilexVehicle:
         self.name = name
         self.statistics = LinkStatistics()
         self._address = f"{interface}:{channel}"
+        self._bitrate, self._database = bitrate, load_database()
+        self._system_name = channel if interface == "socketcan" else None
         self._max_speed = max_speed
         self._max_yaw_rate = max_yaw_rate
         self._clock = clock
@@ -82,7 +86,7 @@ class AgilexVehicle:
             channel,
             bitrate=bitrate,
             options=dict(bus_options or {}),
-            database=load_database(),
+            database=self._database,
             wanted=WANTED,
             receive=self._feedback.take,
             idle=self._feedback.idle,
@@ -125,6 +129,16 @@ class AgilexVehicle:
         taken = self._clock.wall(self._feedback.get("MotionState")[0] - before)
         self.statistics.add_round_trip(taken)
         return taken
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """How the bus is used in `seconds`, how evenly the vehicle tells, and what; see `drivers.vehicle.health`."""
+        with self._link.listening() as frames:
+            self._clock.wait(self._closed, seconds)
+        self._link.check()
+        heard = [(stamp * self._clock.rate, frame) for stamp, frame in frames]
+        interface = None if self._system_name is None else can_interface(self._system_name)
+        judged = self._clock.rate <= 1.0
+        return health.readings(heard, seconds, self._bitrate, self._database, interface, judged)
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old (see `Feedback.state`), else `DeadlineError`."""

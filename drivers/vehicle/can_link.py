@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from importlib.resources import as_file, files
 from typing import Any, cast
 
@@ -71,6 +71,7 @@ class CanLink:
         self._sending = threading.Lock()
         self._closing = threading.Event()
         self._failure: str | None = None
+        self._heard: list[tuple[float, can.Message]] | None = None
         self._bus = self._open(interface, channel, bitrate, options)
         self._interface = interface
         self._last_words: LastWords | None = None
@@ -95,6 +96,17 @@ class CanLink:
                 recoverable=True,
                 hint="Check the adapter and its cable, then enable() the vehicle, which opens the bus again.",
             )
+
+    @contextmanager
+    def listening(self) -> Iterator[list[tuple[float, can.Message]]]:
+        """Every frame that comes while the context is open, whoever sent it, with its time on the system's monotonic
+        clock, in a list that grows. One at a time."""
+        heard: list[tuple[float, can.Message]] = []
+        self._heard = heard
+        try:
+            yield heard
+        finally:
+            self._heard = None
 
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
@@ -184,6 +196,8 @@ class CanLink:
                 # Also while others talk on the bus. A thread that was not run did not wait any longer.
                 self._idle(min(time.monotonic() - begun, RECEIVE_TIMEOUT_S))
                 if frame is not None:
+                    if (heard := self._heard) is not None:
+                        heard.append((time.monotonic(), frame))
                     self._handle(frame)
             except (ValueError, IndexError):
                 self._statistics.count("malformed")

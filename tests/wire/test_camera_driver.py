@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cell.devices.examination import examine
 from drivers.camera.folder import FolderCamera, image_files, read_image
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
@@ -73,6 +74,24 @@ def bench() -> Iterator[Bench]:
 
 
 # --- clocks ---
+
+
+def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy() -> None:
+    world = WorldClock(1.0)
+    peer = FramePeer("scan_camera", world, render, SPEC)
+    peer.start()
+    camera = StreamCamera("scan_camera", peer.address, clock=Clock())
+    later = threading.Timer(0.4, peer.fault, ("camera.frame_loss",))
+    try:
+        later.start()
+        found = {reading.what: reading for reading in examine("camera", camera, [0.001], Clock())}
+    finally:
+        later.cancel()
+        camera.close()
+        peer.stop()
+    assert found["frames lost"].value == 1.0
+    assert not found["frames lost"].ok
+    assert "cable" in found["frames lost"].remedy
 
 
 def test_clocks_are_mapped_by_the_shortest_round_trip() -> None:

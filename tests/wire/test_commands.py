@@ -66,6 +66,14 @@ def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_doe
     rows = json.loads(out)
     assert set(rows) == {"arm", "rail", "vehicle", "scan_camera", "target_camera", "laser", "claw"}
     assert all(row["ok"] and np.isfinite(row["p99_ms"]) for row in rows.values())
+    figures = {(name, figure["what"]): figure for name, row in rows.items() for figure in row["readings"]}
+    told = {key: figures[key]["value"] for key in figures}
+    assert told["arm", "supply"] == 48.0
+    assert told["arm", "hottest joint"] == 30.0
+    assert told["vehicle", "battery"] == pytest.approx(26.4)
+    assert 0.0 < told["vehicle", "bus load, at most"] < 50.0
+    assert told["rail", "driver too hot"] == 0.0
+    assert told["scan_camera", "frame rate by its clock"] == pytest.approx(10.0, rel=0.01)
     assert "brake unknown" in rows["vehicle"]["state"]
     assert rows["rail"]["state"].startswith("not homed")
     for name in STAYS:
@@ -75,6 +83,27 @@ def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_doe
     code, out, _ = typed("diag", "--json")
     assert code == 1
     assert not json.loads(out)["rail"]["ok"]
+
+
+def test_find_tells_which_configured_addresses_answer_and_touches_nothing(
+    endpoints: dict[str, Any], typed: Typed
+) -> None:
+    before = truth(endpoints)
+    code, out, error = typed("find", "--json")
+    after = truth(endpoints)
+    assert code == 0, error
+    rows = {row["what"]: row for row in json.loads(out)}
+    for name in ("arm", "rail", "vehicle", "scan_camera", "target_camera"):
+        assert rows[f"configured {name}"]["ok"], rows
+    assert rows["configured arm"]["state"] == "answers on 29999, 30001, 30004"
+    for name in STAYS:
+        assert after[name] == before[name], name
+    url = load_config(Path("cell.toml")).rail.place
+    code, out, error = typed("find", url, "--json")
+    assert (code, [row["state"] for row in json.loads(out) if row["what"] == "TMCL module"]) == (
+        0,
+        ["version 1260V112"],
+    )
 
 
 def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any], typed: Typed) -> None:

@@ -1,0 +1,101 @@
+"""How the vehicle's CAN bus is used, how evenly its feedback comes, and what it tells of voltages and temperatures.
+
+Limits that nobody publishes are ours. Source: docs/protocols.md, section 3; error counters: ISO 11898-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import can
+import numpy as np
+from cantools.database.can import Database
+
+from drivers.interfaces import Reading
+from drivers.vehicle.can_interface import CanInterface
+
+EVEN = "MotionState"
+LONGEST_PERIOD_S = 0.060
+"""Three of its cycles; a state may be 0.2 s old."""
+MOST_LOAD = 70.0
+LEAST_CHARGE = 20.0
+WARNING_COUNT = 96
+"""From here on a CAN controller is in its warning state."""
+HOTTEST_DEG_C = 80.0
+_WIRING = (
+    "Measure 60 ohm between CAN high and low (two ends of 120 ohm), look at the plugs, and see that all have one bit "
+    "rate."
+)
+
+Heard = Sequence[tuple[float, can.Message]]
+"""Frames with the host time of their arrival, s of the clock."""
+
+
+def readings(
+    heard: Heard, seconds: float, bitrate: float, database: Database, interface: CanInterface | None, judge_times: bool
+) -> list[Reading]:
+    """Figures of what was heard in `seconds` of the clock, and of the computer's `interface`, where it has one.
+
+    Without `judge_times`, on a clock that is not the wall's, times and load have no limits.
+    """
+    own = database.get_message_by_name(EVEN).frame_id
+    arrived = [stamp for stamp, frame in heard if frame.arbitration_id == own and not frame.is_error_frame]
+    period = float(np.percentile(np.diff(arrived), 99)) if len(arrived) > 1 else np.nan
+    bits = sum(most_bits(frame) for _, frame in heard)
+    found = [
+        Reading(
+            "feedback period, p99", 1e3 * period, "ms",
+            most=1e3 * LONGEST_PERIOD_S if judge_times else None,
+            remedy="End programs that keep this computer busy; see whether others load the CAN bus.",
+        ),
+        Reading(
+            "bus load, at most", 100.0 * bits / (bitrate * seconds), "%",
+            most=MOST_LOAD if judge_times else None, remedy="Take others off the CAN bus, or raise its bit rate.",
+        ),
+        Reading(
+            "error frames", float(sum(frame.is_error_frame for _, frame in heard)), "",
+            most=0.0, remedy=_WIRING,
+        ),
+    ]  # fmt: skip
+    if interface is not None:
+        for what, count in (("sending", interface.sent_errors), ("receiving", interface.received_errors)):
+            if count is not None:
+                found.append(
+                    Reading(f"error counter, {what}", float(count), "", most=WARNING_COUNT - 1.0, remedy=_WIRING)
+                )
+    return found + _told(heard, database)
+
+
+def _told(heard: Heard, database: Database) -> list[Reading]:
+    """Of the newest frames of each kind; a vehicle that does not send them tells nothing."""
+    newest = {frame.arbitration_id: frame for _, frame in heard if not frame.is_error_frame}
+    told: dict[str, dict[str, float]] = {}
+    for message in database.messages:
+        frame = newest.get(message.frame_id)
+        wanted = message.name.startswith(("Battery", "System", "MotorDriver"))
+        if wanted and frame is not None and len(frame.data) == message.length:
+            signals = message.decode(bytes(frame.data), decode_choices=False)
+            told[message.name] = cast(dict[str, float], signals)
+    found: list[Reading] = []
+    if (system := told.get("SystemState")) is not None:
+        # How many cells it has, and what is too low for them, the vehicle knows, and says in its error bits.
+        found.append(Reading("battery", system["BatteryVoltage"], "V"))
+    if (battery := told.get("BatteryState")) is not None:
+        charge, warm = battery["StateOfCharge"], battery["Temperature"]
+        found.append(Reading("charge", charge, "%", least=LEAST_CHARGE, remedy="Charge the vehicle."))
+        found.append(Reading("battery's temperature", warm, "°C", 0.0, 50.0, "Let the battery cool down or warm up."))
+    motors = [signals for name, signals in told.items() if name.startswith("MotorDriver")]
+    if motors:
+        hottest = max(max(motor["DriverTemperature"], motor["MotorTemperature"]) for motor in motors)
+        found.append(
+            Reading("hottest motor or its driver", hottest, "°C", most=HOTTEST_DEG_C, remedy="Let the vehicle stand.")
+        )
+    return found
+
+
+def most_bits(frame: can.Message) -> int:
+    """Bits of a data frame on the bus with as many stuffed bits as there can be, and the pause behind it."""
+    header, stuffed = (64, 54) if frame.is_extended_id else (44, 34)
+    data = 0 if frame.is_remote_frame else 8 * len(frame.data)
+    return header + data + (stuffed + data - 1) // 4 + 3
