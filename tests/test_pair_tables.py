@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from cell.calibration.recorded.attach import Options
 from cell.calibration.recorded.command import calibrate_folder
+from cell.calibration.recorded.pair_tables import _inverse
 from cell.cli.app import app
 from drivers.errors import ConfigError, RefusedError
 from tests.recorded_scenes import FLANGE_FROM_CAMERA, scene
@@ -43,6 +44,18 @@ def test_degrees_in_mm_and_rotation_vectors_in_m_are_told_apart(tmp_path):
     found, sigma = result["hand_eye"], np.array(result["hand_eye"]["sigma_mm"])
     assert found["setup"] == "eye_in_hand"
     assert np.all(np.abs(np.array(found["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation) < 4 * sigma + 0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "inverse"),
+    [
+        *[(name, True) for name in ("cam2board", "T_board_cam", "cameraToBoard", "camera_in_board", "cam_wrt_target")],
+        *[(name, False) for name in ("board2cam", "T_cam_board", "cam_T_board", "target2cam", "camera_from_board")],
+        *[(name, None) for name in ("camera_board_poses", "board_poses", "chessboard_camera")],
+    ],
+)
+def test_which_way_a_table_goes_is_told_by_its_name_or_not_at_all(name, inverse):
+    assert _inverse(f"{name}.csv") is inverse
 
 
 @pytest.mark.parametrize("name", ["cam2board.txt", "T_board_from_camera.txt"])

@@ -57,6 +57,25 @@ def test_the_touch_is_where_the_force_begins_flat_on_an_edge_or_round(
     assert FELT_M <= max(one.sigma for one in found if one is not None) < 0.1e-3
 
 
+@pytest.mark.parametrize("follows", [0.9, 0.97])
+def test_force_errors_that_last_are_stated(follows: float, still: ArmState) -> None:
+    """Friction and filters hold an error over many readings: taken for white noise, it was off by 5 deviations."""
+    off = []
+    for seed in range(12):
+        drawn = np.random.default_rng(seed).normal(0.0, NOISE_N * np.sqrt(1 - follows**2), len(HEIGHTS) + 200)
+        lasting = np.array([drawn[: k + 1] @ follows ** np.arange(k, -1, -1) for k in range(len(drawn))])[200:]
+        forces = 20e3 * np.maximum(0.0, 0.1e-3 - HEIGHTS)
+        made = states(forces, still, seed)
+        found = felt_touch(
+            [replace(s, wrench=np.concatenate([(f + more) * UP, np.zeros(3)])) for s, f, more in
+             zip(made, forces, lasting, strict=False)], ORIGIN, UP
+        )  # fmt: skip
+        assert found is not None
+        off.append((found.height - 0.1e-3) / found.sigma)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
+    assert np.abs(off).max() < 3.5
+
+
 def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState) -> None:
     assert felt_touch(states(np.zeros(300), still)[:10], ORIGIN, UP) is None
 

@@ -111,14 +111,15 @@ class CameraModel:
     def normalised(self, pixels: ArrayLike) -> Array:
         """Ideal image coordinates (n, 2) at unit distance of pixels (n, 2), by Newton's method on `distort`.
 
-        NaN where the model has no inverse (a pixel beyond the fold of a strong distortion).
+        NaN where the model has no inverse: a pixel beyond the fold of a strong distortion. Points beyond the fold, seen
+        at such a pixel by the formula only, are none.
         """
         target = (np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not any(self.dist):
             return target
         k1, k2, p1, p2, k3 = self.dist
         to_x, to_y = target.T
-        x, y, off = to_x, to_y, np.full(len(target), np.inf)
+        x, y, off, determinant = to_x, to_y, np.full(len(target), np.inf), np.ones(len(target))
         # Written out, because every solve of a calibration comes through here many times.
         with np.errstate(divide="ignore", invalid="ignore"):
             for _ in range(UNDISTORT_STEPS):
@@ -140,8 +141,25 @@ class CameraModel:
                 x = x - (by_y * off_x - both * off_y) / determinant
                 y = y - (by_x * off_y - both * off_x) / determinant
         found = np.column_stack([x, y])
-        found[~(off < 1e-9)] = np.nan
+        r2 = x * x + y * y
+        with np.errstate(invalid="ignore"):
+            fold = self._fold(float(np.fmax.reduce(r2, initial=0.0)))
+            found[~((off < 1e-9) & (determinant > 0) & (r2 < fold))] = np.nan
         return found
+
+    def _fold(self, farthest: float) -> float:
+        """Squared distance from the axis, at unit distance, where the picture folds: what is farther out is seen
+        farther in. By the radial terms, infinite where they do not fold up to the squared distance `farthest`.
+        """
+        k1, k2, _, _, k3 = self.dist
+        # With s the squared distance, the slope of the radius is 1 + 3 k1 s + 5 k2 s² + 7 k3 s³. Most lenses are far
+        # from a fold, which costs less to see than to solve.
+        least = 3 * min(k1, 0.0) + farthest * (5 * min(k2, 0.0) + farthest * 7 * min(k3, 0.0))
+        if farthest * least > -1.0:
+            return float("inf")
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+        folds = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return float(folds.min(initial=np.inf))
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (n, 3) in the camera frame through pixels (n, 2)."""

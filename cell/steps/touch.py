@@ -24,6 +24,8 @@ FELT_M = 30e-6
 LEAST_STATES = 20
 LEAST_FORCE_N = 0.01
 """No force is told finer."""
+LONGEST_FOLLOWS = 0.99
+"""Correlation of the errors of two readings, one after the other, at most."""
 STEEPEST = 0.3
 """Cosine of the slope beyond which a wall is no ground to touch."""
 GRID_M = 5e-6
@@ -146,20 +148,31 @@ def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> To
     tried = np.arange(heights.min(), heights.max(), GRID_M)
     if len(tried) < LEAST_STATES:
         return None
-    left = np.array([_left(heights, forces, touch) for touch in tried])
+    left = np.array([np.sum(_left(heights, forces, touch) ** 2) for touch in tried])
     best = int(np.argmin(left))
     # How fast the squares grow away from the best tells how far off the touch may be.
-    noise = max(float(left[best]) / (len(heights) - 4), LEAST_FORCE_N**2)
+    noise = max(float(left[best]) / (len(heights) - 4), LEAST_FORCE_N**2) * _repeats(
+        _left(heights, forces, float(tried[best]))
+    )
     weights = np.exp(-0.5 * (left - left[best]) / noise)
     mean = float(weights @ tried / weights.sum())
     spread = float(weights @ (tried - mean) ** 2 / weights.sum())
     return Touch(mean, float(np.sqrt(spread + FELT_M**2)))
 
 
-def _left(heights: Vector, forces: Vector, touch: float) -> float:
-    """Sum of the squares, N², that a force from this touch on leaves."""
+def _repeats(left: Vector) -> float:
+    """So many readings one after the other say what one does: friction and a filtered sensor hold their errors on."""
+    scale = float(left @ left)
+    # What was fitted takes some of it out: four numbers, each of which looks like one swing the other way.
+    follows = float(left[1:] @ left[:-1]) / scale + 4 / len(left) if scale > 0 else 0.0
+    follows = min(max(follows, 0.0), LONGEST_FOLLOWS)
+    return (1 + follows) / (1 - follows)
+
+
+def _left(heights: Vector, forces: Vector, touch: float) -> Vector:
+    """The force (n,), N, that one which begins at this touch leaves."""
     beyond = np.maximum(0.0, touch - heights)
     columns = np.column_stack([np.ones(len(beyond)), beyond, beyond**2])
     scale = np.maximum(np.abs(columns).max(axis=0), 1e-12)
     found = np.linalg.lstsq(columns / scale, forces, rcond=None)[0]
-    return float(np.sum((forces - columns / scale @ found) ** 2))
+    return np.asarray(forces - columns / scale @ found)

@@ -125,16 +125,21 @@ def _words(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Seen:
-    """How the board's table is read: the numbers, their unit, and whether the poses are those of the camera."""
+    """How the board's table is read: the numbers, their unit, and whether the poses are those of the camera.
+
+    `inverse` is None where the table's name does not say it: then they are taken for the board's.
+    """
 
     reading: Reading
     unit: str
-    inverse: bool
+    inverse: bool | None
 
     @property
     def text(self) -> str:
         """In words."""
-        return f"{self.reading.text} in {self.unit}, {'board_from_camera' if self.inverse else 'camera_from_board'}"
+        side = "board_from_camera" if self.inverse else "camera_from_board"
+        unsaid = " (its name does not say; else call it cam2board)" if self.inverse is None else ""
+        return f"{self.reading.text} in {self.unit}, {side}{unsaid}"
 
     def poses(self, board: Series) -> dict[int, pin.SE3]:
         """camera_from_board in m by row."""
@@ -161,14 +166,23 @@ def _likely(arm: Series, board: Series, wanted: str | None) -> list[Seen]:
     return kept
 
 
-def _inverse(name: str) -> bool:
-    """Whether a table holds board_from_camera, as its name says (cam2board, camera_wrt_target).
+def _inverse(name: str) -> bool | None:
+    """Whether a table holds board_from_camera, as its name says (cam2board, camera_wrt_target); None where it does not.
 
-    The poses do not: with the board's inverse a camera on the flange looks like one that stands, and both agree.
+    The poses do not say it: with the board's inverse a camera on the flange looks like one that stands, and both agree.
     """
-    words = _words(name)
+    words = re.findall(r"[a-z]+|2", " ".join(re.split(r"[_\W]", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())))
     board, camera = ([k for k, word in enumerate(words) if re.fullmatch(kind, word)] for kind in (BOARD, CAMERA))
-    return len(board) == len(camera) == 1 and (camera[0] < board[0]) != ("from" in words)
+    if len(board) != 1 or len(camera) != 1:
+        return None
+    first, second = sorted((board[0], camera[0]))
+    between = words[first + 1 : second]
+    if any(word in ("2", "to", "wrt", "in", "rel", "relative") for word in between):
+        return camera[0] < board[0]
+    # As in T_cam_board, cam_T_board, cam_from_board: what is right of it goes into what is left of it.
+    if any(word in ("from", "t", "h") for word in [*between, *words[max(0, first - 1) : first]]):
+        return board[0] < camera[0]
+    return None
 
 
 def _same(a: Seen, b: Seen, board: Series) -> bool:

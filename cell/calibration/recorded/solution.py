@@ -17,6 +17,7 @@ from cell.calibration.recorded.stops import by_stop, counted, merged
 from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.checks import Check, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
+from cell.calibration.solve.foreign import FOREIGN, foreign_view
 from cell.calibration.solve.given_camera import against_pictures
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
 from cell.calibration.solve.plane_checks import (
@@ -49,8 +50,10 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
     while True:
         kept = used(frames)
         views = _views(kept)
+        stops = by_stop(kept)
+        apart = _views([merged(s) for s in stops])
         if given is None:
-            chosen, plain = (_of_all(c, views) for c in choose_lens(_views([merged(s) for s in by_stop(kept)])))
+            chosen, plain = (_of_all(c, views) for c in choose_lens(apart))
         else:
             chosen, plain = (given_camera(given, views),) * 2
         worst = int(np.argmax(chosen.view_rms))
@@ -61,6 +64,16 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
                 f"the board's points miss their places by {math.sqrt(2) * chosen.view_rms[worst]:.2f} px, in the other "
                 f"frames by {math.sqrt(2) * typical:.2f} px: is it another board, bent, or moved in the exposure?",
             )
+            continue
+        foreign = foreign_view(chosen, apart) if given is None else None
+        if foreign is not None:
+            for frame in stops[foreign[0]]:
+                frame.refuse(
+                    Reason.RESIDUAL,
+                    f"with a camera of its own its points fit {foreign[1]:.0f} times better than chance would have it "
+                    f"(usual below {FOREIGN:.0f}), and those of no other picture do: was it taken by another camera, "
+                    "or with another zoom, focus or crop?",
+                )
             continue
         oblique = False
         for frame in kept:

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
-from cell.calibration.solve.blocks import BOARD, CAMERA, HAND, SHARED, State, ViewData
+from cell.calibration.solve.blocks import CAMERA, SHARED, State, ViewData
 from cell.calibration.solve.board_shape import Bend, bend_of
 from cell.calibration.solve.left_out import LeftOut, leave_out
 from cell.calibration.solve.starts import zhang
@@ -179,12 +179,20 @@ def _clearly_better(more: _Fit, less: _Fit) -> bool:
     return bool(gain.sum() > CLEAR_DEVIATIONS * np.sqrt(len(gain)) * gain.std(ddof=1))
 
 
-def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
+def adjustment_of(model: LensModel, start: CameraModel, views: Sequence[BoardView]) -> tuple[Adjustment, State]:
+    """The adjustment of a camera with such a lens and of each view's pose, and where it starts."""
+    return _adjustment(model, start, _data(views, start))
+
+
+def _adjustment(model: LensModel, start: CameraModel, data: list[ViewData]) -> tuple[Adjustment, State]:
     free = np.zeros(SHARED, dtype=np.bool_)
     free[CAMERA] = model.free
-    free[HAND] = free[BOARD] = False
-    adjustment = Adjustment(data, free, model.priors(UNKNOWN))
     at = State(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
+    return Adjustment(data, free, model.priors(UNKNOWN)), at
+
+
+def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
+    adjustment, at = _adjustment(model, start, data)
     result = adjustment.solve(at, ROUNDS)
     left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
     bend = bend_of(adjustment, result.state) if left is not None else None

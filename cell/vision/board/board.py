@@ -25,6 +25,7 @@ from cell.vision.board.view import BoardView
 from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30
+LEAST_POINTS = 4
 SETTLED = 1e-7
 # The second pose that a flat board allows must fit worse by this much in χ².
 CLEAR_CHI2 = 16.0
@@ -123,12 +124,16 @@ def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_
 
 
 def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
-    """The one or two poses that a flat board allows in closed form."""
+    """The one or two poses that a flat board allows in closed form.
+
+    A lens that is not known yet may have no rays for the outermost points: the others do for a start.
+    """
     ideal = camera.normalised(view.pixels)
-    if not np.isfinite(ideal).all():
+    known = np.flatnonzero(np.isfinite(ideal).all(axis=1))
+    if len(known) < max(LEAST_POINTS, len(ideal) / 2):
         return []
     _, turns, shifts, _ = cv2.solvePnPGeneric(
-        view.object_points, ideal.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        view.object_points[known], ideal[known].reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     return [
         from_parts(np.asarray(t, dtype=np.float64).ravel(), np.asarray(cv2.Rodrigues(r)[0], dtype=np.float64))
