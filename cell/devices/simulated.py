@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from cell.devices.described import Described
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
-COMPILED_START_S = 4.0  # a start that takes longer is most likely the first one
 
 
 class Simulation(Protocol):
@@ -118,12 +117,6 @@ class SimulatedCell:
         deadline = time.monotonic() + START_TIMEOUT_S
         line = b""
         descriptor = self._process.stdout.fileno()
-        if not select.select([descriptor], [], [], COMPILED_START_S)[0]:
-            # While that process compiles its optics, this one has a core for what it reads their pictures with. Only
-            # then is it loaded: a cell that starts at once may have no need of it.
-            from cell.vision.stripe.rehearsal import rehearse_reading
-
-            rehearse_reading()
         while not line.endswith(b"\n"):
             ready, _, _ = select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))
             chunk = os.read(descriptor, 65536) if ready else b""

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.wire
 
 
 def test_a_rendered_scene_comes_unchanged_and_a_trigger_tells_the_time() -> None:
-    world = World(7, "ideal", 1.0, "pot")
+    world = World(7, "ideal", 1.0)
     world.warm_up()
     scene = world.render("scan", 0.0, 0.005)
     assert len(np.unique(scene)) > 4, "the same grey everywhere would not show whether pixels stay in their places"

@@ -1,4 +1,4 @@
-"""Drawn stripes, read and let go: what is loaded or compiled on first use is so before anything waits for it."""
+"""Drawn stripes, to be read and let go: what is loaded or compiled on first use is so before anything waits."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-
-from cell.vision.stripe.stream import StripeStream
 
 
 def drawn(height: int, width: int) -> Iterator[NDArray[np.uint8]]:
@@ -17,9 +15,3 @@ def drawn(height: int, width: int) -> Iterator[NDArray[np.uint8]]:
     grain = np.random.default_rng(0).normal(0.0, 2.0, away.shape)
     for stripe in (np.exp(-0.5 * (away / 2) ** 2), 1 / (1 + np.exp(2 * (np.abs(away) - 6)))):
         yield np.clip(12.5 + 140 * stripe + grain, 0, 255).astype(np.uint8)
-
-
-def rehearse_reading() -> None:
-    """Read both: takes a second where the loops are compiled, and some ten where they are not yet."""
-    for picture in drawn(240, 320):
-        StripeStream().extract(picture)
