@@ -39,12 +39,23 @@ def cell(*arguments: str, folder: Path, timeout: float = 240.0) -> subprocess.Co
     return subprocess.run(command(*arguments), cwd=folder, capture_output=True, text=True, timeout=timeout)
 
 
+def _heard() -> None:
+    """Signals that whoever started the tests ignores (`nohup`, a background job) end a command all the same."""
+    for number in (signal.SIGHUP, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @contextmanager
 def started(*arguments: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A `cell` command that is going on; killed at the end if it still is."""
     # In the tests' own session: Linux shares a machine among sessions first, whatever is nice within one.
     process = subprocess.Popen(
-        command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command(*arguments),
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_heard,
     )
     try:
         yield process
