@@ -23,7 +23,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """A failure says nothing when the machine stood still meanwhile: such a test, and no other, is repeated."""
     config.stash[_heartbeat] = Heartbeat()
     for item in items:
-        if item.get_closest_marker("wire") is not None:
+        if item.get_closest_marker("wire") is not None and item.get_closest_marker("flaky") is None:
             item.add_marker(pytest.mark.flaky(reruns=3, condition=config.stash[_heartbeat].missed))
 
 
