@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def examine(kind: str, device: Device, trips_s: Sequence[float], clock: Clock) -
     if isinstance(device, Examined):
         found += device.examine(WATCHED_S)
     if kind == "camera":
-        found += _camera_figures(device, clock, judged)  # type: ignore[arg-type]
+        found += _camera_figures(cast(Camera, device), clock, judged)
     return found
 
 

@@ -48,7 +48,6 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         "set_payload_cog": lambda cog: _payload(e, e.context.model.payload[0], cog),
         "zero_ftsensor": lambda: e.context.model.zero_force(),
         "protective_stop": lambda: e.context.model.protective_stop("triggered by the program"),
-        "powerdown": _no_effect,
     }
 
 
