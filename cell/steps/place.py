@@ -39,7 +39,9 @@ class PlaceResult:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
-        return () if self.touch is None else self.touch.notes
+        if self.touch is None:
+            return ("the first touch was not held against the scan: the arm told too few states on the way down",)
+        return self.touch.notes
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
