@@ -1,0 +1,64 @@
+"""Whether the planned sweeps tell where the surface is, before anything is swept; and which motion they leave open.
+
+The same inversion that a job does, on the points that the sweeps will see of the drawn surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config import CellConfig
+from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.inversion.observability import Verdict, judge
+from cell.job import Job
+from cell.new_job.rays import Array
+from cell.new_job.sweeps import Seen, as_cloud
+from cell.reconstruction import flange_motions
+
+
+def prior_of(job: Job) -> Array:
+    """Covariance (6, 6) of where the board puts the surface, S, m² and rad²."""
+    surface = job.surface
+    return np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
+
+
+def shared_by_all(config: CellConfig) -> Array:
+    """Covariance (6, 6) of what all points have in common: the arm's geometry as configured, m² and rad²."""
+    arm = config.arm
+    return np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+
+
+def verdict(information: Array, points: int, radius: float, job: Job, config: CellConfig) -> Verdict:
+    """What a scan of this information (6, 6) in `points` points leaves open; quick, for choosing between sweeps."""
+    known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
+    gain = known @ information
+    covariance = known + gain @ shared_by_all(config) @ gain.T
+    # The mean variance of a point, as far as its share of the information tells.
+    variance = 3.0 * points / max(float(np.trace(information[:3, :3])), 1e-9) / 3.0
+    return judge(covariance, information, variance, points, radius, _tolerance(job))
+
+
+def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
+    """The place as the job's own inversion would tell it from these sweeps, without noise.
+
+    Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
+    too little of the surface.
+    """
+    cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
+    arm = config.arm
+    rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+    return invert_pose(
+        cloud,
+        nominal,
+        Prior(pin.SE3.Identity(), prior_of(job)),
+        _tolerance(job),
+        systematic=shared_by_all(config),
+        sweeps=lambda lines, rows: flange_motions(cloud, lines, rows, [rest] * len(seen)),
+    )
+
+
+def _tolerance(job: Job) -> Tolerance:
+    return Tolerance(job.place.tolerance, job.place.tolerance_angle)
