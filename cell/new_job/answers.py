@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from cell.geometry.poses import from_parts
 from cell.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.new_job.mesh_file import Body, Drawn
 from cell.new_job.questions import Asker, checked, choice, pose, pose_words, three
-from cell.new_job.surface import UP, Laid, faces_down, lay, turned_over
+from cell.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
 from cell.new_job.text import deg, mm
 from cell.new_job.units import METRES, possible_units, size_words, told_by_size
 from cell.steps.camera_poses import centre_of
@@ -42,8 +43,7 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
     turn = asker.get("turn", "Turn about it, or auto: the longer side along the sweep", "auto", _turn)
     laid = lay(bodies, unit, up, turn)
     if up == "z" and 0.0 <= (lowest := _lowest(bodies) * METRES[unit]) <= ON_TABLE and lowest > 1e-6:
-        raised = from_parts((0.0, 0.0, lowest))
-        laid = Laid(laid.vertices + raised.translation, laid.faces, raised * laid.surface_from_mesh)
+        laid = replace(raised(laid, lowest), foot=0.0)
         asker.tell(
             f"height: the mesh's own z = 0 is taken as the table's top, its lowest point is {1e3 * lowest:.4g} mm above"
         )
@@ -52,7 +52,7 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
         if asker.get("flip", words, None, choice("yes", "no")) == "yes":
             laid = turned_over(laid)
             asker.tell("triangles: all turned round")
-    return laid, unit
+    return centred(laid), unit
 
 
 def _bodies(asker: Asker, drawn: Drawn) -> list[Body]:
@@ -115,15 +115,17 @@ def template(asker: Asker) -> Job:
     return like
 
 
-def station(asker: Asker, like: Job, name: str, mesh: str, box: tuple[np.ndarray, np.ndarray]) -> Job:
+def station(asker: Asker, like: Job, name: str, mesh: str, laid: Laid) -> Job:
     """The job at its board and place, with its part, but with the scan of `like`."""
+    box = open_side(laid).box
     spec = asker.get("board", "The board beside the place", like.board.spec, checked(BoardSection, "spec"))
     where = asker.get(
         "board-place", "Where the board is, in the place frame", pose_words(_same_centre(like, spec)), pose(Pose)
     )
-    on_place = asker.get(
-        "place", "Where the surface's origin is, in the place frame (table's top, z up)", "0 mm, 0 mm, 0 mm", pose(Pose)
+    stands = asker.get(
+        "place", "Where the middle of the mesh stands on the table, in the place frame", "0 mm, 0 mm, 0 mm", pose(Pose)
     )
+    on_place = as_pose(stands.se3() * from_parts((0.0, 0.0, laid.foot)))
     prior = asker.get("prior", "How exactly the board tells where the surface is, 1 sigma",
                       _bare(mm(like.surface.prior_sigma)), checked(SurfaceSection, "prior_sigma"))  # fmt: skip
     angle = _bare(deg(like.surface.prior_sigma_angle))
@@ -132,7 +134,7 @@ def station(asker: Asker, like: Job, name: str, mesh: str, box: tuple[np.ndarray
     )
     grasp = _grasp(asker, like, box)
     seat = asker.get("part-place", "Where the part's origin is when it is placed, in the surface frame",
-                     pose_words(_seat(box)), pose(Pose))  # fmt: skip
+                     pose_words(_seat(box, laid.foot)), pose(Pose))  # fmt: skip
     tolerance = asker.get("tolerance", "How exactly it has to be placed", _bare(mm(like.place.tolerance)),
                           checked(PlaceSection, "tolerance"))  # fmt: skip
     tolerance_angle = asker.get("tolerance-angle", "And turned", f"{1e3 * like.place.tolerance_angle:g} mrad",
@@ -167,9 +169,9 @@ def _grasp(asker: Asker, like: Job, box: tuple[np.ndarray, np.ndarray]) -> Grasp
     return GraspSection.model_construct(flange_from_part=held, size=size, sigma=sigma, sigma_angle=sigma_angle)
 
 
-def _seat(box: tuple[np.ndarray, np.ndarray]) -> Pose:
-    """The part's origin at the surface's, or higher where the surface would reach into the claw's fingers."""
-    height = math.ceil(1e3 * max(0.0, float(box[1][2]) - FINGERS_FREE)) / 1e3
+def _seat(box: tuple[np.ndarray, np.ndarray], foot: float) -> Pose:
+    """The part's origin as low as the surface's highest point lets the claw's fingers be, but on the table."""
+    height = max(-foot, math.ceil(1e3 * (float(box[1][2]) - FINGERS_FREE)) / 1e3)
     return Pose.model_construct(translation=(0.0, 0.0, height), rotation=(0.0, 0.0, 0.0))
 
 
@@ -179,9 +181,14 @@ def _same_centre(like: Job, spec: str) -> Pose:
         return like.board.place_from_board
     moved = from_parts(centre_of(parse_board(like.board.spec)) - centre_of(parse_board(spec)))
     where: pin.SE3 = like.place_from_board * moved
-    return Pose.model_construct(
-        translation=tuple(where.translation.tolist()), rotation=like.board.place_from_board.rotation
-    )
+    return as_pose(where)
+
+
+def as_pose(where: pin.SE3) -> Pose:
+    """A pose as a job's record has it."""
+    roll, pitch, yaw = (float(angle) for angle in pin.rpy.matrixToRpy(where.rotation))
+    x, y, z = (float(value) for value in where.translation)
+    return Pose.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
 
 
 def job_name(asker: Asker, mesh: Path) -> str:

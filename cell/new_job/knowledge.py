@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from cell.config import CellConfig
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.inversion.observability import Verdict, judge
+from cell.inversion.observability import FREE, Verdict, judge
 from cell.job import Job
 from cell.new_job.rays import Array
 from cell.new_job.sweeps import Seen, as_cloud
@@ -32,13 +32,23 @@ def shared_by_all(config: CellConfig) -> Array:
 
 
 def verdict(information: Array, points: int, radius: float, job: Job, config: CellConfig) -> Verdict:
-    """What a scan of this information (6, 6) in `points` points leaves open; quick, for choosing between sweeps."""
+    """What a scan of this information (6, 6) in `points` points leaves open. A motion that the scan hardly determines
+    is left to the board altogether: what there is of it may be noise, or the drawing's facets."""
+    length = np.array([1.0] * 3 + [radius] * 3)
+    variance = points / max(float(np.trace(information[:3, :3])), 1e-9)
+    spectrum, ways = np.linalg.eigh(information / np.outer(length, length))
+    spectrum = np.where(spectrum * variance / points < FREE, 0.0, spectrum)
+    information = (ways * spectrum) @ ways.T * np.outer(length, length)
     known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
     gain = known @ information
     covariance = known + gain @ shared_by_all(config) @ gain.T
-    # The mean variance of a point, as far as its share of the information tells.
-    variance = 3.0 * points / max(float(np.trace(information[:3, :3])), 1e-9) / 3.0
     return judge(covariance, information, variance, points, radius, _tolerance(job))
+
+
+def known(seen: Sequence[Seen], radius: float, job: Job, config: CellConfig) -> Verdict:
+    """What these sweeps leave open of a surface of this rms radius, m."""
+    information = sum((each.information() for each in seen), np.zeros((6, 6)))
+    return verdict(information, sum(int(each.valid.sum()) for each in seen), radius, job, config)
 
 
 def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
@@ -47,6 +57,7 @@ def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: 
     Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
     too little of the surface.
     """
+    known(seen, nominal.radius, job, config).require()
     cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
     arm = config.arm
     rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)

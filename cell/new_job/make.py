@@ -10,23 +10,20 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import pinocchio as pin
-
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config import CellConfig
-from cell.device_config import Pose
 from cell.devices.described import Described
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
-from cell.new_job.answers import job_name, laid_mesh, station, template
+from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
 from cell.new_job.knowledge import place_from
 from cell.new_job.mesh_file import read_drawing
 from cell.new_job.picture import draw_proposal
-from cell.new_job.proposal import Proposal, propose, seen_share
+from cell.new_job.proposal import Proposal, propose
 from cell.new_job.questions import Asker, choice
 from cell.new_job.sight import sight_problems
-from cell.new_job.surface import Laid, open_side, written
+from cell.new_job.surface import written
 from cell.new_job.text import job_text, pose_text
 from cell.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
@@ -60,18 +57,18 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     targets = (targets[0], _beside(targets[1], mesh), targets[2])
     _require_room(asker, targets, overwrite)
     like = template(asker)
-    job = station(asker, like, name, targets[1].name, open_side(laid).box)
+    job = station(asker, like, name, targets[1].name, laid)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
-    def reachable(tried: Job, surface: Laid) -> str | None:
-        return next(iter(sweep_problems(tried, config, surface.box)), None)
+    def reachable(tried: Job) -> str | None:
+        return next(iter(sweep_problems(tried, config, laid.box)), None)
 
     asker.tell("choosing sweeps …")
     proposal = propose(laid, job, config, step, reachable)
     heading = [
         f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
         f"Of the mesh, in {unit}, what the sweeps see is in {targets[1].name}: surface_from_mesh =",
-        "  " + pose_text(_as_pose(laid)),
+        "  " + pose_text(as_pose(laid.surface_from_mesh)),
         *proposal.notes,
     ]
     with tempfile.TemporaryDirectory() as place:
@@ -87,8 +84,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in targets[:2]:
             _copied(there / target.name, target).replace(target)
-    share = seen_share(proposal.surface, proposal.seen)
-    return Made(targets[0], targets[1], targets[2], name, share, found, (*proposal.notes, *notes))
+    return Made(targets[0], targets[1], targets[2], name, proposal.share, found, (*proposal.notes, *notes))
 
 
 def _beside(target: Path, mesh: Path) -> Path:
@@ -158,10 +154,3 @@ def _copied(source: Path, target: Path) -> Path:
     near = target.with_name(f".{target.name}.new")
     near.write_bytes(source.read_bytes())
     return near
-
-
-def _as_pose(laid: Laid) -> Pose:
-    where = laid.surface_from_mesh
-    roll, pitch, yaw = (float(angle) for angle in pin.rpy.matrixToRpy(where.rotation))
-    x, y, z = (float(value) for value in where.translation)
-    return Pose.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))

@@ -26,6 +26,8 @@ STEP_CHORD = 0.005
 STEP_ANGLE = 0.1
 """And how far two neighbours may turn, rad."""
 MOST_TRIANGLES = 3_000_000
+SAME_PLACE = 1e-6
+"""Corners nearer than this share of the mesh's size are one."""
 LEAST_SHARE = 1e-12
 """A triangle smaller than this share of the square of the mesh's size has no area."""
 
@@ -69,6 +71,7 @@ def read_drawing(path: Path) -> Drawn:
     if bad := int((~np.isfinite(vertices)).any(axis=1).sum()):
         raise ConfigError(f"{bad} corners of the mesh {path} are no numbers; export it again")
     notes: list[str] = []
+    vertices, faces = _joined(vertices, faces)
     faces = _without_area(vertices, faces, notes)
     if not len(faces):
         raise ConfigError(f"no triangle of the mesh {path} has an area; export it again")
@@ -94,6 +97,13 @@ def _loaded(path: Path) -> tuple[Array, Faces]:
         return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # every reader of trimesh raises its own
         raise ConfigError(f"{path} cannot be read as a mesh; give an STL, PLY or STEP") from error
+
+
+def _joined(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """Corners at the same place are one: an STL has three for each triangle, a STEP some for each of its faces."""
+    grain = SAME_PLACE * float(np.ptp(vertices[faces.ravel()], axis=0).max())
+    _, first, one = np.unique(np.round(vertices / grain), axis=0, return_index=True, return_inverse=True)
+    return vertices[first], one.reshape(-1)[faces]
 
 
 def _without_area(vertices: Array, faces: Faces, notes: list[str]) -> Faces:

@@ -39,7 +39,7 @@ def draw_proposal(path: Path, made: Proposal, nominal: NominalSurface, config: C
     figure = Figure(figsize=(18.0, 11.0), dpi=90)
     figure.suptitle(title)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.15, 1.0], left=0.05, right=0.98, bottom=0.06, top=0.91,
-                               wspace=0.14, hspace=0.26)  # fmt: skip
+                               wspace=0.14, hspace=0.3)  # fmt: skip
     _draw_map(figure, figure.add_subplot(grid[0, 0]), made, nominal)
     _draw_cut(figure.add_subplot(grid[1, 0]), made)
     above, beside = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
@@ -74,14 +74,13 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
             (where[0] - x / 2, where[1] - y / 2), x, y, fill=False, linestyle=":", edgecolor="k", label="the part"
         )
     )
-    axes.annotate("", xy=(0.5, -0.02), xytext=(0.35, -0.02), xycoords="axes fraction", arrowprops={"arrowstyle": "->"})
     axes.autoscale()
     axes.set_aspect("equal")
-    axes.set_xlabel("x of the surface in mm, the way of the sweeps")
+    axes.set_xlabel("x of the surface in mm, the way of the sweeps →")
     axes.set_ylabel("y in mm")
     axes.set_title(f"from above: {100 * (1 - float(missed.mean())):.0f} % of the surface is seen", fontsize="medium")
-    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, location="left", pad=0.12)
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.02)
 
 
 def _outline(seen: Seen) -> Array:

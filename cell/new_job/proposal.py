@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +17,7 @@ from cell.check.fit import CALIBRATION_DEPTHS, RAMP_MARGIN
 from cell.config import CellConfig
 from cell.inversion import NominalSurface
 from cell.job import Job, ScanSection, SwathSection
-from cell.new_job.knowledge import verdict
+from cell.new_job.knowledge import known
 from cell.new_job.rays import ABOVE, Array, Rays
 from cell.new_job.surface import Laid, open_side
 from cell.new_job.sweeps import Seen, look
@@ -42,6 +42,10 @@ TILTS = tuple((math.radians(roll), math.radians(pitch)) for roll, pitch in (
     (25, 0), (-25, 0), (0, 15), (0, -15), (25, 12), (25, -12), (-25, 12), (-25, -12)))  # fmt: skip
 """Rolls about the sweep's way and pitches about the stripe that are tried, rad."""
 MOST_TILTED = 4
+BETTER, SEES_MORE, ENOUGH = 0.67, 0.05, 0.5
+"""A tilted sweep has to make the worst known motion so many times as large, or to see so much more of the surface;
+enough is known when that motion, at three standard deviations, is within this share of the tolerance."""
+LEAST_POINTS = 100
 SEEN_WITHIN = 0.0025
 """A place of the surface is seen when a point lies this near, m: as the inversion counts it."""
 UNSEEN = 0.10
@@ -57,21 +61,27 @@ class Proposal:
     seen: tuple[Seen, ...]
     notes: tuple[str, ...] = field(default=())
 
+    @property
+    def share(self) -> float:
+        """Share of the surface's area that is seen, 0 … 1."""
+        return seen_share(NominalSurface(self.surface.vertices, self.surface.faces), self.seen)
 
-def propose(
-    body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job, Laid], str | None]
-) -> Proposal:
+
+def propose(body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None]) -> Proposal:
     """A scan of what lies open of `body`, with lines `step` m apart.
 
     `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does. Raises `ConfigError`
     when the surface is too deep, too wide or too long for this scan head.
     """
-    surface = open_side(body)
-    scan, notes = _straight(surface, job.scan, config, step)
+    top = open_side(body)
+    scan, notes = _straight(top, job.scan, config, step)
+    search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable)
     straight = _with(job, scan)
-    seen = look(config, straight, Rays(surface.vertices, surface.faces))
-    made = Proposal(straight, surface, tuple(seen), tuple(notes))
-    return _tilted(made, body, config, reachable)
+    seen = look(config, straight, search.rays)
+    job, seen, more = search.tilted(straight, seen)
+    ways = [ABOVE, *(way(swath) for swath in job.scan.swath if swath.roll or swath.pitch)]
+    surface = top if len(ways) == 1 else open_side(body, ways)
+    return Proposal(job, surface, tuple(seen), (*notes, *more))
 
 
 def _with(job: Job, scan: ScanSection) -> Job:
@@ -82,7 +92,8 @@ def _straight(surface: Laid, like: ScanSection, config: CellConfig, step: float)
     low, high = surface.box
     notes = []
     stand_off = _stand_off(float(low[2]), float(high[2]))
-    length = float(high[0] - low[0]) - 2 * END
+    # The light comes aslant: what lies higher is lit earlier on the way.
+    length = float(high[0] - low[0]) - 2 * END + float(high[2] - low[2]) / config.laser.tan_theta
     width = float(high[1] - low[1])
     camera = config.scan_camera
     seen = camera.height * camera.pixel / camera.focal_length * (stand_off - float(high[2])) - 2 * BESIDE
@@ -143,57 +154,72 @@ def _pace(length: float, count: int, rate: float, step: float) -> tuple[float, f
     return speed, rate, count * (length / speed + PER_SWEEP_S)
 
 
-def _tilted(made: Proposal, body: Laid, config: CellConfig, reachable: Callable[[Job, Laid], str | None]) -> Proposal:
-    """Tilted sweeps, one after the other, as long as each makes the worst known motion better known by a third."""
-    worst = _excess(made, config)
-    missed = _missed(made)
-    if worst <= 1.0 and missed <= UNSEEN:
-        return made
-    why = (
-        f"straight sweeps leave {100 * missed:.0f} % of the surface unseen"
-        if worst <= 1.0
-        else "straight sweeps leave a motion of the surface open"
-    )
-    refused: dict[str, str] = {}
-    added: list[str] = []
-    while len(added) < MOST_TILTED:
-        tried = [(_excess(other, config), other, words) for other, words in _others(made, body, config)]
-        tried.sort(key=lambda each: each[0])
-        better = [each for each in tried if each[0] < 0.67 * worst or _missed(each[1]) < missed - 0.05]
-        for excess, other, words in better:
-            if (problem := reachable(other.job, other.surface)) is not None:
-                refused[words] = problem
-                continue
-            made, worst, missed = other, excess, _missed(other)
-            added.append(words)
-            break
-        else:
-            break
-        if worst <= 0.5 and missed <= UNSEEN:
-            break
-    notes = [*made.notes]
-    notes.append(f"{why}: " + (f"tilted ones added ({'; '.join(added)})" if added else "tilted ones tell no more"))
-    notes += [f"no sweep with {words}: {problem}" for words, problem in list(refused.items())[:2]]
-    return replace(made, notes=tuple(notes))
+@dataclass(eq=False)
+class _Search:
+    """Looks for tilted sweeps of the mesh that `rays` meet; `top` is what straight ones are to see of it."""
 
+    config: CellConfig
+    rays: Rays
+    top: NominalSurface
+    reachable: Callable[[Job], str | None]
 
-def _others(made: Proposal, body: Laid, config: CellConfig) -> list[tuple[Proposal, str]]:
-    """The proposal with one tilted sweep more, each."""
-    found = []
-    present = {(s.roll, s.pitch) for s in made.job.scan.swath}
-    for roll, pitch in TILTS:
-        if (roll, pitch) in present:
-            continue
-        swath = SwathSection.model_construct(across=0.0, roll=roll, pitch=pitch)
-        scan = made.job.scan.model_copy(update={"swath": (*made.job.scan.swath, swath)})
-        job = _with(made.job, scan)
-        surface = open_side(body, [ABOVE, *(way(s) for s in scan.swath)])
-        seen = look(config, job, Rays(surface.vertices, surface.faces))
-        words = " and ".join(
-            f"{name} {math.degrees(angle):.0f} deg" for name, angle in (("roll", roll), ("pitch", pitch)) if angle
+    def tilted(self, job: Job, seen: list[Seen]) -> tuple[Job, list[Seen], list[str]]:
+        """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
+        of the surface; and in words what was added and what was not."""
+        worst, missed = self._excess(job, seen), self._missed(seen)
+        if worst <= 1.0 and missed <= UNSEEN:
+            return job, seen, []
+        why = (
+            f"straight sweeps leave {100 * missed:.0f} % of the surface unseen"
+            if worst <= 1.0
+            else "straight sweeps leave a motion of the surface open"
         )
-        found.append((Proposal(job, surface, tuple(seen), made.notes), words))
-    return found
+        left = {tilt: self._one(job, *tilt) for tilt in TILTS}
+        refused: list[str] = []
+        added: list[str] = []
+        while left and len(added) < MOST_TILTED and (worst > ENOUGH or missed > UNSEEN):
+            tried = {tilt: (self._excess(job, [*seen, one]), self._missed([*seen, one])) for tilt, one in left.items()}
+            tilt = min(tried, key=lambda each: tried[each][0] if worst > ENOUGH else tried[each][1])
+            excess, unseen = tried[tilt]
+            if not (excess < BETTER * worst or unseen < missed - SEES_MORE):
+                break
+            with_it = _with(job, _and_tilted(job.scan, *tilt))
+            one = left.pop(tilt)
+            if (problem := self.reachable(with_it)) is not None:
+                refused.append(f"no sweep with {_words(*tilt)}: {problem}")
+                continue
+            job, seen, worst, missed = with_it, [*seen, one], excess, unseen
+            added.append(_words(*tilt))
+        told = f"tilted ones added ({'; '.join(added)})" if added else "tilted ones tell no more"
+        return job, seen, [f"{why}: {told}", *refused[:2]]
+
+    def _one(self, job: Job, roll: float, pitch: float) -> Seen:
+        """What the tilted sweep alone sees."""
+        swath = _and_tilted(job.scan, roll, pitch).swath[-1:]
+        return look(self.config, _with(job, job.scan.model_copy(update={"swath": swath})), self.rays)[0]
+
+    def _missed(self, seen: Sequence[Seen]) -> float:
+        """Share of the surface's area, 0 … 1, that no sweep sees."""
+        return 1.0 - seen_share(self.top, seen)
+
+    def _excess(self, job: Job, seen: Sequence[Seen]) -> float:
+        """3σ of the least known motion, in tolerances."""
+        points = sum(int(each.valid.sum()) for each in seen)
+        if points < LEAST_POINTS:
+            return math.inf
+        return known(seen, self.top.radius, job, self.config).worst.excess
+
+
+def _and_tilted(scan: ScanSection, roll: float, pitch: float) -> ScanSection:
+    swath = SwathSection.model_construct(across=0.0, roll=roll, pitch=pitch)
+    return scan.model_copy(update={"swath": (*scan.swath, swath)})
+
+
+def _words(roll: float, pitch: float) -> str:
+    """A tilt."""
+    return " and ".join(
+        f"{name} {math.degrees(angle):.0f} deg" for name, angle in (("roll", roll), ("pitch", pitch)) if angle
+    )
 
 
 def way(swath: SwathSection) -> Array:
@@ -201,24 +227,7 @@ def way(swath: SwathSection) -> Array:
     return np.asarray(pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0) @ ABOVE)
 
 
-def _excess(made: Proposal, config: CellConfig) -> float:
-    """3σ of the least known motion, in tolerances."""
-    points = np.concatenate([each.points[each.valid] for each in made.seen])
-    if len(points) < 100:
-        return math.inf
-    information = sum((each.information() for each in made.seen), np.zeros((6, 6)))
-    radius = float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))
-    return verdict(information, len(points), radius, made.job, config).worst.excess
-
-
-def _missed(made: Proposal) -> float:
-    """Share of the surface's area, 0 … 1, that no sweep sees."""
-    return 1.0 - seen_share(made.surface, made.seen)
-
-
-def seen_share(surface: Laid, seen: Sequence[Seen]) -> float:
+def seen_share(surface: NominalSurface, seen: Sequence[Seen]) -> float:
     """Share of the surface's area that has a point of a sweep near it."""
     points = np.concatenate([each.points[each.valid] for each in seen])
-    if not len(points):
-        return 0.0
-    return NominalSurface(surface.vertices, surface.faces).coverage(points, SEEN_WITHIN)
+    return surface.coverage(points, SEEN_WITHIN) if len(points) else 0.0

@@ -1,4 +1,4 @@
-"""What of a mesh is seen: first hits of rays, and which triangles lie open to a direction."""
+"""Rays against a mesh: what they meet first, and whether anything lies between an eye and a point of it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ Faces = NDArray[np.int64]
 
 ABOVE: Array = np.array([0.0, 0.0, 1.0])
 """The direction of an eye straight above, surface frame."""
+SMOOTH = 0.9
+"""Cosine of the angle (26 degrees) up to which neighbouring triangles are taken for one smooth surface."""
+MOST_MEETING = 400
+"""Triangles that meet in a corner, from which on it is taken as it is: the middle of a flat cap."""
 NEAR = 2e-5
 """Hits nearer to each other than this along a ray are one, m."""
 
@@ -26,7 +30,9 @@ class Rays:
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.normals: Array = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        self._first = corners[:, 0]
+        self._corners = corners
+        self._faces = faces
+        self._smooth: Array | None = None
         made: Any = trimesh.Trimesh(vertices, faces, process=False)
         self._rays: Any = RayMeshIntersector(made)
 
@@ -37,7 +43,7 @@ class Rays:
         distance = np.full(len(origins), np.inf)
         hit = np.flatnonzero(triangle >= 0)
         # By the triangle's own plane, in double precision: the library answers in single.
-        normal, first = self.normals[triangle[hit]], self._first[triangle[hit]]
+        normal, first = self.normals[triangle[hit]], self._corners[triangle[hit], 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = np.einsum("ni,ni->n", first - origins[hit], normal) / np.einsum("ni,ni->n", ways[hit], normal)
         distance[hit] = np.where(np.isfinite(found), found, np.inf)
@@ -50,45 +56,40 @@ class Rays:
         _, met = self.hits(eyes, ways / length[:, None])
         return np.asarray(met > length - NEAR)
 
+    def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
+        """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.
 
-def seen_from(vertices: Array, faces: Faces, towards: Array) -> NDArray[np.bool_]:
-    """(m,) which triangles' middles lie open to an eye far away in the unit direction `towards` (3,)."""
-    rays = Rays(vertices, faces)
-    middles = vertices[faces].mean(axis=1)
-    far = 2.0 * float(np.ptp(vertices, axis=0).max()) + 0.1
-    facing = rays.normals @ towards > 1e-3
-    seen = np.zeros(len(faces), dtype=np.bool_)
-    seen[facing] = rays.open_between(middles[facing], middles[facing] + far * towards)
-    return seen
-
-
-def refined(vertices: Array, faces: Faces, longest: float) -> tuple[Array, Faces]:
-    """The same surface in triangles whose sides are at most `longest` m. Neighbours keep sharing their corners."""
-    for _ in range(20):
-        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, owner = np.unique(sides, axis=0, return_inverse=True)
-        split = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
-        if not split.any():
-            break
-        number = np.full(len(edges), -1)
-        number[split] = len(vertices) + np.arange(int(split.sum()))
-        vertices = np.concatenate([vertices, vertices[edges[split]].mean(axis=1)])
-        faces = _divided(faces, number[owner].reshape(-1, 3))
-    return vertices, faces
+        By the flat triangles' own normals a round part would seem to tell how it is turned: only its facets do.
+        """
+        if self._smooth is None:
+            self._smooth = _corner_normals(self._corners, self._faces, self.normals)
+        a, b, c = self._corners[triangles].transpose(1, 0, 2)
+        whole = np.cross(b - a, c - a)
+        square = np.einsum("ni,ni->n", whole, whole)
+        second = np.einsum("ni,ni->n", np.cross(points - a, c - a), whole) / square
+        third = np.einsum("ni,ni->n", np.cross(b - a, points - a), whole) / square
+        shares = np.stack([1.0 - second - third, second, third], axis=1)
+        made = np.einsum("nk,nki->ni", shares, self._smooth[triangles])
+        return np.asarray(made / np.linalg.norm(made, axis=1, keepdims=True))
 
 
-def _divided(faces: Faces, middles: Faces) -> Faces:
-    """Triangles with a new corner `middles` (m, 3) in the side after each corner, −1 for a side that stays whole."""
-    made = [faces[(middles < 0).all(axis=1)]]
-    count = (middles >= 0).sum(axis=1)
-    for turn in range(3):
-        a, b, c = np.roll(faces, -turn, axis=1).T
-        ab, bc, ca = np.roll(middles, -turn, axis=1).T
-        one = (count == 1) & (ab >= 0)
-        made += [np.stack([a, ab, c], 1)[one], np.stack([ab, b, c], 1)[one]]
-        two = (count == 2) & (ca < 0)
-        made += [np.stack([ab, b, bc], 1)[two], np.stack([a, ab, c], 1)[two], np.stack([ab, bc, c], 1)[two]]
-    a, b, c = faces[count == 3].T
-    ab, bc, ca = middles[count == 3].T
-    made += [np.stack(each, 1) for each in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    return np.concatenate(made)
+def _corner_normals(corners: Array, faces: Faces, normals: Array) -> Array:
+    """(m, 3, 3) normals at the corners of each triangle: the mean of those that meet there and are nearly as steep,
+    weighted by their angles."""
+    sides = np.roll(corners, -1, axis=1) - corners
+    sides /= np.linalg.norm(sides, axis=2, keepdims=True)
+    angles = np.arccos(np.clip(-np.einsum("nki,nki->nk", sides, np.roll(sides, 1, axis=1)), -1.0, 1.0)).ravel()
+    at = faces.ravel()
+    order = np.argsort(at, kind="stable")
+    count = np.bincount(at)
+    begin = np.cumsum(count) - count
+    few = np.where(count[at] <= MOST_MEETING, count[at], 0)
+    mine = np.repeat(np.arange(len(at)), few)
+    place = np.arange(len(mine)) - np.repeat(np.cumsum(few) - few, few)
+    other = order[begin[at[mine]] + place]
+    near = np.einsum("ni,ni->n", normals[mine // 3], normals[other // 3]) > SMOOTH
+    made = np.array(np.repeat(1e-9 * normals, 3, axis=0))
+    for k in range(3):
+        made[:, k] += np.bincount(mine[near], angles[other[near]] * normals[other[near] // 3, k], minlength=len(at))
+    made[few == 0] = normals[np.flatnonzero(few == 0) // 3]
+    return np.asarray((made / np.linalg.norm(made, axis=1, keepdims=True)).reshape(-1, 3, 3))

@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from cell.geometry.poses import from_parts
 from cell.new_job.mesh_file import Body
-from cell.new_job.rays import ABOVE, Array, Faces, refined, seen_from
+from cell.new_job.rays import ABOVE, Array, Faces, Rays
 from cell.new_job.units import METRES
 from drivers.errors import ConfigError
 
@@ -24,21 +23,27 @@ UP = {"z": (0, 0, 1), "-z": (0, 0, -1), "x": (1, 0, 0), "-x": (-1, 0, 0), "y": (
 STEEPEST = 0.2
 """Least cosine between a triangle's normal and the way it is seen: a stripe on steeper ones is a smear."""
 FINEST, PIECES = 0.001, 150
-"""Triangles that are seen in part are divided until no side is longer, m, or than the surface's size over `PIECES`."""
+"""Triangles that are seen in part are halved until no side is longer, m, or than the surface's size over `PIECES`."""
+MOST_PLACES = 40
+"""Places along a triangle's longest side that are looked at, at most."""
+FAR = 2.0
+"""How far away the eye is, m."""
 LEAST_SEEN = 1e-4
 """Area, m², below which there is no surface to place anything onto: a centimetre squared."""
 
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """A mesh in the surface frame S: z up, its lowest point at z = 0, the middle of its box at x = y = 0. m.
+    """A mesh in the surface frame S: z up, the middle of its box at x = y = 0. m.
 
-    `surface_from_mesh` says where the file's own frame is, after its unit was turned into m.
+    `surface_from_mesh` says where the file's own frame is, after its unit was turned into m; `foot` how far the table's
+    top is below the origin, m.
     """
 
     vertices: Array
     faces: Faces
     surface_from_mesh: pin.SE3
+    foot: float = 0.0
 
     @property
     def box(self) -> tuple[Array, Array]:
@@ -85,36 +90,73 @@ def faces_down(laid: Laid) -> bool:
 
 def turned_over(laid: Laid) -> Laid:
     """The same triangles, facing the other way."""
-    return Laid(laid.vertices, laid.faces[:, ::-1].copy(), laid.surface_from_mesh)
+    return replace(laid, faces=laid.faces[:, ::-1].copy())
+
+
+def raised(laid: Laid, height: float) -> Laid:
+    """The same mesh with its origin `height` m lower, the table where it is."""
+    up = from_parts((0.0, 0.0, height))
+    return Laid(laid.vertices + up.translation, laid.faces, up * laid.surface_from_mesh, laid.foot - height)
+
+
+def centred(laid: Laid) -> Laid:
+    """The same mesh with its origin half-way up what is seen of it from above, in whole mm: there the scan head is set
+    up, and tilted about."""
+    low, high = open_side(laid).box
+    return raised(laid, -round(0.5 * float(low[2] + high[2]), 3))
 
 
 def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,)) -> Laid:
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
-    Raises `ConfigError` when that is next to nothing.
+    A triangle that is hidden in part is halved until its pieces are small. Raises `ConfigError` when next to nothing is
+    seen.
     """
-    triangles, every = _seen(laid.vertices, laid.faces, ways)
-    if not every:
-        longest = max(FINEST, float(np.ptp(laid.vertices, axis=0).max()) / PIECES)
-        vertices, faces = refined(laid.vertices, laid.faces, longest)
-        seen, _ = _seen(vertices, faces, ways)
-        return _required(Laid(vertices, faces[seen], laid.surface_from_mesh))
-    return _required(Laid(laid.vertices, laid.faces[triangles], laid.surface_from_mesh))
+    rays = Rays(laid.vertices, laid.faces)
+    finest = max(FINEST, float(np.ptp(laid.vertices, axis=0).max()) / PIECES)
+    corners, normals = laid.vertices[laid.faces], rays.normals
+    towards = np.array(ways)
+    facing = (normals @ towards.T > STEEPEST).any(axis=1)
+    pieces, normals = corners[facing], normals[facing]
+    kept = []
+    while len(pieces):
+        share = _seen_share(pieces, normals, rays, towards, finest)
+        longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
+        mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
+        kept.append(pieces[~mixed & (share > 0.5)])
+        pieces, normals = _halved(pieces[mixed]), np.repeat(normals[mixed], 2, axis=0)
+    triangles = np.concatenate(kept) if kept else np.empty((0, 3, 3))
+    vertices, numbers = np.unique(np.round(triangles.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    return _required(replace(laid, vertices=vertices, faces=numbers.reshape(-1, 3)))
 
 
-def _seen(vertices: Array, faces: Faces, ways: Sequence[Array]) -> tuple[NDArray[np.bool_], bool]:
-    """Which triangles are seen, and whether none that faces an eye is hidden from it, all or in part."""
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    seen = np.zeros(len(faces), dtype=np.bool_)
-    every = True
-    for way in ways:
-        facing = normals @ way > STEEPEST
-        this = seen_from(vertices, faces, way) & facing
-        every = every and bool(this[facing].all()) and bool((normals @ way > -1e-3).all())
-        seen |= this
-    return seen, every
+def _seen_share(pieces: Array, normals: Array, rays: Rays, ways: Array, step: float) -> Array:
+    """(n,) which share of places `step` m apart on each triangle (n, 3, 3) is seen from one of the ways (k, 3)."""
+    longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
+    divisions = np.clip(np.ceil(longest / step), 1, MOST_PLACES).astype(np.intp)
+    share = np.zeros(len(pieces))
+    for n in np.unique(divisions):
+        mine = np.flatnonzero(divisions == n)
+        i, j = np.nonzero(np.add.outer(np.arange(n), np.arange(n)) < n)
+        weights = np.column_stack([i + 1 / 3, j + 1 / 3]) / n
+        weights = np.column_stack([1.0 - weights.sum(axis=1), weights])
+        points = np.einsum("sk,nki->nsi", weights, pieces[mine])
+        seen = np.zeros(points.shape[:2], dtype=np.bool_)
+        for way in ways:
+            ask = np.flatnonzero(normals[mine] @ way > STEEPEST)
+            places = points[ask].reshape(-1, 3)
+            seen[ask] |= rays.open_between(places, places + FAR * way).reshape(len(ask), len(weights))
+        share[mine] = seen.mean(axis=1)
+    return share
+
+
+def _halved(pieces: Array) -> Array:
+    """Each triangle (n, 3, 3) as two, (2 n, 3, 3): its longest side is divided."""
+    sides = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
+    first = np.argmax(sides, axis=1)
+    a, b, c = (np.take_along_axis(pieces, ((first + k) % 3)[:, None, None], axis=1)[:, 0] for k in range(3))
+    middle = 0.5 * (a + b)
+    return np.stack([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)], axis=1).reshape(-1, 3, 3)
 
 
 def _required(laid: Laid) -> Laid:

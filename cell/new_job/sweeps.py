@@ -88,7 +88,7 @@ def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> Seen:
     met = np.flatnonzero(triangle >= 0)
     line = met // ROWS
     points = origins[met] + distance[met, None] * ways.reshape(-1, 3)[met]
-    normals = rays.normals[triangle[met]]
+    normals = rays.smooth_normals(triangle[met], points)
     local = np.einsum("nij,ni->nj", turns[line], points - eyes[line])
     pixels = head.camera.project(local)
     sight = (eyes[line] - points) / np.linalg.norm(eyes[line] - points, axis=1, keepdims=True)
