@@ -25,8 +25,9 @@ from drivers.errors import ConfigError
 
 PART_HEIGHT = 0.02
 """How thick a part is taken to be whose size nobody gave, m."""
-WIDEST_PART = (0.2, 0.1)
-"""How long and wide such a part is at most, m: wider ones hide the board from the camera beside the claw."""
+WIDEST_PART = (0.1, 0.07)
+"""How long and wide such a part is at most, m: wider ones come near the deck while the cell is
+calibrated, or hide the board from the camera."""
 FINGERS_FREE = 0.010
 """How far the surface may rise above the part's origin, m: the fingers hold the part a little above it."""
 ON_TABLE = 0.05

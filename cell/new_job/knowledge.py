@@ -18,6 +18,11 @@ from cell.new_job.rays import Array
 from cell.new_job.sweeps import Seen, as_cloud
 from cell.reconstruction import flange_motions
 
+OVER = 1e-4
+"""How far points of the drawing may lie from the surface that was cut out of it, m."""
+BARELY = 1.5
+"""So many times what the inversion takes for no information counts as none here: a scan may bring less than drawn."""
+
 
 def prior_of(job: Job) -> Array:
     """Covariance (6, 6) of where the board puts the surface, S, m² and rad²."""
@@ -37,7 +42,7 @@ def verdict(information: Array, points: int, radius: float, job: Job, config: Ce
     length = np.array([1.0] * 3 + [radius] * 3)
     variance = points / max(float(np.trace(information[:3, :3])), 1e-9)
     spectrum, ways = np.linalg.eigh(information / np.outer(length, length))
-    spectrum = np.where(spectrum * variance / points < FREE, 0.0, spectrum)
+    spectrum = np.where(spectrum * variance / points < BARELY * FREE, 0.0, spectrum)
     information = (ways * spectrum) @ ways.T * np.outer(length, length)
     known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
     gain = known @ information
@@ -45,10 +50,16 @@ def verdict(information: Array, points: int, radius: float, job: Job, config: Ce
     return judge(covariance, information, variance, points, radius, _tolerance(job))
 
 
-def known(seen: Sequence[Seen], radius: float, job: Job, config: CellConfig) -> Verdict:
-    """What these sweeps leave open of a surface of this rms radius, m."""
-    information = sum((each.information() for each in seen), np.zeros((6, 6)))
-    return verdict(information, sum(int(each.valid.sum()) for each in seen), radius, job, config)
+def known(seen: Sequence[Seen], surface: NominalSurface, job: Job, config: CellConfig) -> Verdict:
+    """What these sweeps leave open, by the points that the inversion uses: those over `surface`, not at its borders."""
+    used = [each.valid for each in seen]
+    for mask, each in zip(used, seen, strict=True):
+        index, feet = surface.feet(each.points[mask], OVER)
+        over = np.zeros(int(mask.sum()), dtype=np.bool_)
+        over[index] = feet.inner
+        mask[mask] = over
+    information = sum((each.information(mask) for each, mask in zip(seen, used, strict=True)), np.zeros((6, 6)))
+    return verdict(information, sum(int(mask.sum()) for mask in used), surface.radius, job, config)
 
 
 def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
@@ -57,7 +68,7 @@ def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: 
     Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
     too little of the surface.
     """
-    known(seen, nominal.radius, job, config).require()
+    known(seen, nominal, job, config).require()
     cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
     arm = config.arm
     rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
@@ -22,8 +24,10 @@ from cell.new_job.mesh_file import read_drawing
 from cell.new_job.picture import draw_proposal
 from cell.new_job.proposal import Proposal, propose
 from cell.new_job.questions import Asker, choice
+from cell.new_job.rays import Array
+from cell.new_job.rivals import rivals
 from cell.new_job.sight import sight_problems
-from cell.new_job.surface import written
+from cell.new_job.surface import about, written
 from cell.new_job.text import job_text, pose_text
 from cell.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
@@ -65,6 +69,14 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
 
     asker.tell("choosing sweeps …")
     proposal = propose(laid, job, config, step, reachable)
+    if proposal.open and asker.given.get("turn") is None:
+        # The light comes aslant from behind: from the other side it falls on other flanks.
+        other = propose(about(laid), job, config, step, reachable)
+        if not other.open:
+            laid, proposal = (
+                about(laid),
+                replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks")),
+            )
     heading = [
         f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
         f"Of the mesh, in {unit}, what the sweeps see is in {targets[1].name}: surface_from_mesh =",
@@ -126,6 +138,7 @@ def _checked(asker: Asker, path: Path, config: CellConfig, proposal: Proposal) -
 def _place(asker: Asker, proposal: Proposal, nominal: NominalSurface, config: CellConfig) -> PlacePose:
     job = proposal.job
     try:
+        _require_single(rivals(proposal.seen, nominal, job), job)
         return place_from(proposal.seen, nominal, job, config)
     except NotObservable as error:
         angle = 1e3 * job.place.tolerance_angle / 3
@@ -142,6 +155,24 @@ def _place(asker: Asker, proposal: Proposal, nominal: NominalSurface, config: Ce
         raise RefusedError(
             f"the proposed scan would be refused: {error}. Nothing was written. Again: {_again(asker)}"
         ) from error
+
+
+def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
+    """Refuse a surface that looks the same somewhere else, where the board does not tell which place it is."""
+    if not others:
+        return
+    (x, y, z), turned = 1e3 * others[0][0], others[0][1]
+    away = float(np.linalg.norm(others[0][0]))
+    limit = (
+        f'--prior "{1e3 * away / 6:.2g} mm"'
+        if away > job.place.tolerance
+        else f'--prior-angle "{1e3 * turned / 6:.2g} mrad"'
+    )
+    raise RefusedError(
+        f"the surface repeats itself: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by {1e3 * turned:.0f} mrad "
+        f"it fits as well ({len(others)} such places), and the board leaves that open. Take in an end or a feature that "
+        f"comes once; or, where it is fixed to the board as exactly, say {limit} or less"
+    )
 
 
 def _again(asker: Asker) -> str:

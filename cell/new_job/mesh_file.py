@@ -139,17 +139,17 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> Body:
     made: Any = trimesh.Trimesh(vertices[used], renumbered.reshape(-1, 3), process=False)
     edges = np.sort(made.edges, axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
-    closed, crowded = bool((count == 2).all()), int((count > 2).sum())
+    lone, crowded = int((count == 1).sum()), int((count > 2).sum())
     before = made.faces.copy()
     if not made.is_winding_consistent:
         repair.fix_winding(made)
+    closed = lone == 0
     if closed and made.volume < 0.0:
         made.invert()
     # The same triangle begins with another corner at will: whether it was turned over is told by its normal.
     if turned := int((_facing(made.vertices, before) * _facing(made.vertices, made.faces)).sum(axis=1).__lt__(0).sum()):
         notes.append(f"{turned} triangles turned round: they faced against their neighbours, or into the body")
     if not closed:
-        lone = int((count == 1).sum())
         notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
     if crowded:
         notes.append(f"{crowded} edges belong to more than two triangles")

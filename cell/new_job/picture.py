@@ -30,6 +30,8 @@ from cell.steps.camera_poses import base_from_place_at_target, scan_plans
 from cell.steps.moves import HOME
 
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:olive", "tab:cyan", "tab:pink")
+PLACES = 6000
+"""Places drawn evenly over the surface, at which it is looked whether they are seen."""
 SHADES = {"part": "tab:red", "surface": "tab:green", "table": "0.75", "board": "tab:blue", "scan head": "tab:orange",
           "target camera": "tab:purple", "deck": "0.6"}  # fmt: skip
 
@@ -49,11 +51,15 @@ def draw_proposal(path: Path, made: Proposal, nominal: NominalSurface, config: C
 
 def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurface) -> None:
     """The surface from above by its height, what no sweep sees of it in red, the strips of the sweeps, the part."""
-    samples = nominal.samples[:: max(1, len(nominal.samples) // 40_000)]
+    corners = 1e3 * nominal.vertices[nominal.triangles]
+    order = np.argsort(corners[:, :, 2].mean(axis=1))
+    shown = PolyCollection(list(corners[order][:, :, :2]), array=corners[order][:, :, 2].mean(axis=1), cmap="viridis")
+    axes.add_collection(shown)
+    shares = nominal.areas[nominal.sample_triangles] / np.bincount(nominal.sample_triangles)[nominal.sample_triangles]
+    drawn = np.random.default_rng(0).choice(len(nominal.samples), PLACES, p=shares / shares.sum())
+    samples = nominal.samples[drawn]
     points = np.concatenate([each.points[each.valid] for each in made.seen])
     missed = np.asarray(cKDTree(points).query(samples, distance_upper_bound=SEEN_WITHIN)[0] > SEEN_WITHIN)
-    seen = 1e3 * samples[~missed]
-    shown = axes.scatter(seen[:, 0], seen[:, 1], c=seen[:, 2], s=3, cmap="viridis", linewidths=0)
     hidden = 1e3 * samples[missed]
     axes.scatter(hidden[:, 0], hidden[:, 1], color="tab:red", s=3, linewidths=0, label="not seen by any sweep")
     for k, each in enumerate(made.seen):
@@ -79,7 +85,7 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     axes.set_xlabel("x of the surface in mm, the way of the sweeps →")
     axes.set_ylabel("y in mm")
     axes.set_title(f"from above: {100 * (1 - float(missed.mean())):.0f} % of the surface is seen", fontsize="medium")
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3)
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
     figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.02)
 
 

@@ -17,15 +17,12 @@ from cell.check.fit import CALIBRATION_DEPTHS, RAMP_MARGIN
 from cell.config import CellConfig
 from cell.inversion import NominalSurface
 from cell.job import Job, ScanSection, SwathSection
-from cell.new_job.knowledge import known
+from cell.new_job.knowledge import verdict
 from cell.new_job.rays import ABOVE, Array, Rays
 from cell.new_job.surface import Laid, open_side
-from cell.new_job.sweeps import Seen, look
+from cell.new_job.sweeps import FARTHEST, NEAREST, Seen, look
 from drivers.errors import ConfigError
 
-NEAREST, FARTHEST = 0.100, 0.165
-"""How near and how far, m, a surface may be from the scan camera: beyond, its stripe is too broad, and too far from the
-depths at which the head is calibrated."""
 OVERLAP = 0.008
 """How much neighbouring sweeps see twice, m: what the surface may lie beside its place, and what ties them together."""
 BESIDE = 0.001
@@ -39,7 +36,7 @@ LONGEST_S, PER_SWEEP_S = 90.0, 4.0
 MOST_FRAMES_HZ = 60.0
 MOST_SWEEPS = 20
 TILTS = tuple((math.radians(roll), math.radians(pitch)) for roll, pitch in (
-    (25, 0), (-25, 0), (0, 15), (0, -15), (25, 12), (25, -12), (-25, 12), (-25, -12)))  # fmt: skip
+    (25, 0), (-25, 0), (0, 15), (0, -20), (25, 12), (25, -18), (-25, 12), (-25, -18)))  # fmt: skip
 """Rolls about the sweep's way and pitches about the stripe that are tried, rad."""
 MOST_TILTED = 4
 BETTER, SEES_MORE, ENOUGH = 0.67, 0.05, 0.5
@@ -60,6 +57,8 @@ class Proposal:
     surface: Laid
     seen: tuple[Seen, ...]
     notes: tuple[str, ...] = field(default=())
+    open: bool = False
+    """Whether a motion of the surface stays open, as far as the choice between sweeps tells."""
 
     @property
     def share(self) -> float:
@@ -78,10 +77,10 @@ def propose(body: Laid, job: Job, config: CellConfig, step: float, reachable: Ca
     search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable)
     straight = _with(job, scan)
     seen = look(config, straight, search.rays)
-    job, seen, more = search.tilted(straight, seen)
+    job, seen, more, excess = search.tilted(straight, seen)
     ways = [ABOVE, *(way(swath) for swath in job.scan.swath if swath.roll or swath.pitch)]
     surface = top if len(ways) == 1 else open_side(body, ways)
-    return Proposal(job, surface, tuple(seen), (*notes, *more))
+    return Proposal(job, surface, tuple(seen), (*notes, *more), excess > 1.0)
 
 
 def _with(job: Job, scan: ScanSection) -> Job:
@@ -163,12 +162,12 @@ class _Search:
     top: NominalSurface
     reachable: Callable[[Job], str | None]
 
-    def tilted(self, job: Job, seen: list[Seen]) -> tuple[Job, list[Seen], list[str]]:
+    def tilted(self, job: Job, seen: list[Seen]) -> tuple[Job, list[Seen], list[str], float]:
         """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
-        of the surface; and in words what was added and what was not."""
+        of the surface; in words what was added and what was not; and the worst known motion, in tolerances."""
         worst, missed = self._excess(job, seen), self._missed(seen)
         if worst <= 1.0 and missed <= UNSEEN:
-            return job, seen, []
+            return job, seen, [], worst
         why = (
             f"straight sweeps leave {100 * missed:.0f} % of the surface unseen"
             if worst <= 1.0
@@ -191,7 +190,7 @@ class _Search:
             job, seen, worst, missed = with_it, [*seen, one], excess, unseen
             added.append(_words(*tilt))
         told = f"tilted ones added ({'; '.join(added)})" if added else "tilted ones tell no more"
-        return job, seen, [f"{why}: {told}", *refused[:2]]
+        return job, seen, [f"{why}: {told}", *refused[:2]], worst
 
     def _one(self, job: Job, roll: float, pitch: float) -> Seen:
         """What the tilted sweep alone sees."""
@@ -204,10 +203,11 @@ class _Search:
 
     def _excess(self, job: Job, seen: Sequence[Seen]) -> float:
         """3σ of the least known motion, in tolerances."""
-        points = sum(int(each.valid.sum()) for each in seen)
-        if points < LEAST_POINTS:
+        used = [each.solid for each in seen]
+        if (points := sum(int(mask.sum()) for mask in used)) < LEAST_POINTS:
             return math.inf
-        return known(seen, self.top.radius, job, self.config).worst.excess
+        information = sum((each.information(mask) for each, mask in zip(seen, used, strict=True)), np.zeros((6, 6)))
+        return verdict(information, points, self.top.radius, job, self.config).worst.excess
 
 
 def _and_tilted(scan: ScanSection, roll: float, pitch: float) -> ScanSection:

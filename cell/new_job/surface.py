@@ -80,6 +80,12 @@ def _upright(up: str) -> Array:
     return np.stack([x, np.cross(axis, x), axis])
 
 
+def about(laid: Laid) -> Laid:
+    """The same, turned by half a turn about z."""
+    turn = from_parts(np.zeros(3), np.diag([-1.0, -1.0, 1.0]))
+    return replace(laid, vertices=laid.vertices @ turn.rotation.T, surface_from_mesh=turn * laid.surface_from_mesh)
+
+
 def faces_down(laid: Laid) -> bool:
     """Whether more of the surface faces down than up: an open mesh whose triangles are turned, or that lies upside
     down. A closed body faces both ways alike."""

@@ -16,8 +16,9 @@ from cell.check.reach import nominal_scan
 from cell.config import CellConfig
 from cell.geometry.light_plane import triangulate
 from cell.geometry.poses import from_parts
+from cell.inversion.correspondences import SIGMA_FLOOR
 from cell.job import Job
-from cell.new_job.rays import Array, Rays
+from cell.new_job.rays import SMOOTH, Array, Rays
 from cell.reconstruction.cloud import Cloud
 from cell.steps.camera_poses import ScanPlan, scan_plans
 
@@ -25,6 +26,11 @@ STRIPE_PX = 0.12
 """One standard deviation of a stripe's centre, px: what speckle leaves on a matt surface."""
 LINE_STEP, ROWS = 0.001, 160
 """Lines of the sweep that are looked at, m apart, and places along each stripe."""
+PATCH = 2
+"""Places along the stripe to each side, about half a millimetre, that a point needs around it to count."""
+NEAREST, FARTHEST = 0.100, 0.165
+"""How near and how far, m, a surface may be from the scan camera: beyond, its stripe is too broad, and too far from the
+depths at which the head is calibrated."""
 GRAZING = 0.2
 """Cosine beyond which light or sight graze the surface too much for a stripe."""
 
@@ -51,13 +57,28 @@ class Seen:
         """(lines, rows) where there is a point."""
         return np.isfinite(self.points[:, :, 0])
 
-    def information(self) -> Array:
-        """(6, 6) of the surface's pose (translation m, rotation rad; S) that these points give."""
+    @property
+    def solid(self) -> NDArray[np.bool_]:
+        """(lines, rows) the points that lie within a smooth patch: along the stripe and in a neighbouring line the
+        surface goes on as it is. On a narrower one a stripe is bent, and at an edge it is mixed."""
         valid = self.valid
-        points, normals = self.points[valid], self.normals[valid]
-        sigma = np.hypot(np.einsum("ni,ni->n", self.spread[valid], normals), 3e-6)
+        same = np.ones(valid.shape, dtype=np.bool_)
+        for step in (-PATCH, PATCH):
+            same &= _alike(self.normals, np.roll(self.normals, step, axis=1))
+        beside = [_alike(self.normals, np.roll(self.normals, step, axis=0)) for step in (-1, 1)]
+        same[:, :PATCH] = same[:, -PATCH:] = False
+        return np.asarray(valid & same & (beside[0] | beside[1]))
+
+    def information(self, used: NDArray[np.bool_]) -> Array:
+        """(6, 6) of the surface's pose (translation m, rotation rad; S) that the points `used` (lines, rows) give."""
+        points, normals = self.points[used], self.normals[used]
+        sigma = np.hypot(np.einsum("ni,ni->n", self.spread[used], normals), SIGMA_FLOOR)
         rows = np.concatenate([normals, np.cross(points, normals)], axis=1) / sigma[:, None]
         return np.asarray(rows.T @ rows)
+
+
+def _alike(normals: Array, others: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.einsum("lri,lri->lr", normals, others) > SMOOTH)
 
 
 def look(config: CellConfig, job: Job, rays: Rays) -> list[Seen]:
@@ -93,6 +114,7 @@ def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> Seen:
     pixels = head.camera.project(local)
     sight = (eyes[line] - points) / np.linalg.norm(eyes[line] - points, axis=1, keepdims=True)
     keep = ((pixels >= 0) & (pixels <= (head.camera.width - 1, head.camera.height - 1))).all(axis=1)
+    keep &= (local[:, 2] >= NEAREST) & (local[:, 2] <= FARTHEST)
     keep &= np.einsum("ni,ni->n", normals, sight) > GRAZING
     keep &= -np.einsum("ni,ni->n", normals, ways.reshape(-1, 3)[met]) > GRAZING
     keep[keep] = rays.open_between(points[keep], eyes[line[keep]])
