@@ -68,7 +68,6 @@ def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: 
     Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
     too little of the surface.
     """
-    known(seen, nominal, job, config).require()
     cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
     arm = config.arm
     rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)

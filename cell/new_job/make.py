@@ -19,7 +19,7 @@ from cell.devices.described import Described
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
 from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
-from cell.new_job.knowledge import place_from
+from cell.new_job.knowledge import known, place_from
 from cell.new_job.mesh_file import read_drawing
 from cell.new_job.picture import draw_proposal
 from cell.new_job.proposal import Proposal, propose
@@ -138,6 +138,7 @@ def _checked(asker: Asker, path: Path, config: CellConfig, proposal: Proposal) -
 def _place(asker: Asker, proposal: Proposal, nominal: NominalSurface, config: CellConfig) -> PlacePose:
     job = proposal.job
     try:
+        known(proposal.seen, nominal, job, config).require()
         _require_single(rivals(proposal.seen, nominal, job), job)
         return place_from(proposal.seen, nominal, job, config)
     except NotObservable as error:
@@ -170,8 +171,8 @@ def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
     )
     raise RefusedError(
         f"the surface repeats itself: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by {1e3 * turned:.0f} mrad "
-        f"it fits as well ({len(others)} such places), and the board leaves that open. Take in an end or a feature that "
-        f"comes once; or, where it is fixed to the board as exactly, say {limit} or less"
+        f"it fits as well ({len(others)} such places), and the board leaves that open. Take in an end or a feature "
+        f"that comes once; or, where it is fixed to the board as exactly, say {limit} or less"
     )
 
 

@@ -132,37 +132,49 @@ def _parts(faces: Faces, corners: int) -> list[Faces]:
 
 def _turned(vertices: Array, faces: Faces, notes: list[str]) -> Body:
     """A body whose triangles all face the same way, outwards where it is closed."""
-    import trimesh
-
-    repair: Any = trimesh.repair
     used, renumbered = np.unique(faces, return_inverse=True)
-    made: Any = trimesh.Trimesh(vertices[used], renumbered.reshape(-1, 3), process=False)
-    edges = np.sort(made.edges, axis=1)
-    _, count = np.unique(edges, axis=0, return_counts=True)
+    corners, before = vertices[used], renumbered.reshape(-1, 3)
+    ways = before[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, edge, count = np.unique(np.sort(ways, axis=1), axis=0, return_inverse=True, return_counts=True)
     lone, crowded = int((count == 1).sum()), int((count > 2).sum())
-    before = made.faces.copy()
-    if not made.is_winding_consistent:
-        repair.fix_winding(made)
-    closed = lone == 0
-    if closed and made.volume < 0.0:
-        made.invert()
-    # The same triangle begins with another corner at will: whether it was turned over is told by its normal.
-    if turned := int((_facing(made.vertices, before) * _facing(made.vertices, made.faces)).sum(axis=1).__lt__(0).sum()):
-        notes.append(f"{turned} triangles turned round: they faced against their neighbours, or into the body")
-    if not closed:
+    over = _turned_over(ways, edge.reshape(-1), count, len(before))
+    if lone == 0 and _volume(corners, np.where(over[:, None], before[:, ::-1], before)) < 0.0:
+        over = ~over
+    if over.any():
+        notes.append(f"{int(over.sum())} triangles turned round: they faced against their neighbours, or into the body")
+    if lone:
         notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
     if crowded:
         notes.append(f"{crowded} edges belong to more than two triangles")
-    return Body(np.array(made.vertices, dtype=np.float64), np.array(made.faces, dtype=np.int64), closed)
+    return Body(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
+
+
+def _turned_over(ways: Faces, edge: Faces, count: Faces, faces: int) -> NDArray[np.bool_]:
+    """(faces,) which triangles to turn over so that neighbours face the same way, as few as possible.
+
+    `ways` (3 faces, 2) are their sides from corner to corner, `edge` the number of each and `count` how many share it.
+    Each triangle is there twice, as it is and turned over; what faces the same way is linked.
+    """
+    order = np.argsort(edge, kind="stable")
+    first = (np.cumsum(count) - count)[count == 2]
+    one, two = order[first], order[first + 1]
+    against = ways[one, 0] == ways[two, 0]
+    a, b = one // 3, two // 3
+    links = np.concatenate([np.stack([a, b + faces * against]), np.stack([a + faces, b + faces * ~against])], axis=1)
+    made = coo_matrix((np.ones(links.shape[1]), (links[0], links[1])), shape=(2 * faces, 2 * faces))
+    _, label = connected_components(made, directed=False)
+    whole = np.bincount(label[:faces], minlength=2 * faces)
+    as_is, turned = label[:faces], label[faces:]
+    return np.asarray((whole[turned] > whole[as_is]) | ((whole[turned] == whole[as_is]) & (turned < as_is)))
+
+
+def _volume(vertices: Array, faces: Faces) -> float:
+    a, b, c = (vertices - vertices.mean(axis=0))[faces].transpose(1, 0, 2)
+    return float(np.einsum("ni,ni->", a, np.cross(b, c)))
 
 
 def _as_expected(lone: int, edges: int) -> str:
     return " (a surface with a border, or holes in a body)" if lone < 0.5 * edges else " (triangles that do not join)"
-
-
-def _facing(vertices: Array, faces: Faces) -> Array:
-    corners = vertices[faces]
-    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def _summed(notes: list[str]) -> list[str]:

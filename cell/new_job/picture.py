@@ -20,6 +20,7 @@ from cell.check.reach import nominal_scan, station_planner
 from cell.config import CellConfig
 from cell.geometry.poses import transform
 from cell.inversion import NominalSurface
+from cell.job import SwathSection
 from cell.motion.bodies import Body
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import Unreachable
@@ -53,7 +54,13 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     """The surface from above by its height, what no sweep sees of it in red, the strips of the sweeps, the part."""
     corners = 1e3 * nominal.vertices[nominal.triangles]
     order = np.argsort(corners[:, :, 2].mean(axis=1))
-    shown = PolyCollection(list(corners[order][:, :, :2]), array=corners[order][:, :, 2].mean(axis=1), cmap="viridis")
+    shown = PolyCollection(
+        list(corners[order][:, :, :2]),
+        array=corners[order][:, :, 2].mean(axis=1),
+        cmap="viridis",
+        edgecolors="face",
+        linewidths=0.3,
+    )
     axes.add_collection(shown)
     shares = nominal.areas[nominal.sample_triangles] / np.bincount(nominal.sample_triangles)[nominal.sample_triangles]
     drawn = np.random.default_rng(0).choice(len(nominal.samples), PLACES, p=shares / shares.sum())
@@ -64,15 +71,7 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     axes.scatter(hidden[:, 0], hidden[:, 1], color="tab:red", s=3, linewidths=0, label="not seen by any sweep")
     for k, each in enumerate(made.seen):
         outline = _outline(each)
-        if len(outline):
-            swath = made.job.scan.swath[k]
-            tilt = "".join(
-                f", {name} {np.degrees(angle):.0f}°"
-                for name, angle in (("roll", swath.roll), ("pitch", swath.pitch))
-                if angle
-            )
-            label = f"sweep {k + 1}: {1e3 * swath.across:+.1f} mm across{tilt}"
-            axes.plot(*1e3 * outline.T, color=COLOURS[k % len(COLOURS)], linewidth=1.6, label=label if k < 8 else None)
+        axes.plot(*1e3 * outline.T, color=COLOURS[k % len(COLOURS)], linewidth=1.6)
     x, y, _ = 1e3 * np.array(made.job.grasp.size)
     where = 1e3 * made.job.place.surface_from_part.se3().translation
     axes.add_patch(
@@ -85,7 +84,7 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     axes.set_xlabel("x of the surface in mm, the way of the sweeps →")
     axes.set_ylabel("y in mm")
     axes.set_title(f"from above: {100 * (1 - float(missed.mean())):.0f} % of the surface is seen", fontsize="medium")
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3)
+    axes.legend(fontsize=7, loc="lower left")
     figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.02)
 
 
@@ -102,6 +101,7 @@ def _draw_cut(axes: Axes, made: Proposal) -> None:
     """Across the sweeps: the surface's points, and from where each sweep's camera looks at them."""
     for k, each in enumerate(made.seen):
         colour = COLOURS[k % len(COLOURS)]
+        axes.plot([], [], color=colour, label=_sweep_words(k, made.job.scan.swath[k]))
         middle = len(each.rail) // 2
         points = each.points[each.valid]
         some = 1e3 * points[:: max(1, len(points) // 3000)]
@@ -122,6 +122,13 @@ def _draw_cut(axes: Axes, made: Proposal) -> None:
         f"{1e3 * scan.length:.0f} mm by the {scan.mode}, lines {1e3 * scan.speed / scan.frame_rate:.2f} mm apart",
         fontsize="medium",
     )
+    axes.legend(fontsize=7, loc="upper left")
+
+
+def _sweep_words(k: int, swath: SwathSection) -> str:
+    tilts = (("roll", swath.roll), ("pitch", swath.pitch))
+    tilt = "".join(f", {name} {np.degrees(angle):.0f}°" for name, angle in tilts if angle)
+    return f"sweep {k + 1}: {1e3 * swath.across:+.1f} mm across{tilt}"
 
 
 def _draw_cell(above: Axes, beside: Axes, made: Proposal, config: CellConfig, nominal: NominalSurface) -> None:
