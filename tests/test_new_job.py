@@ -42,8 +42,8 @@ def relief(path: Path, height: object, half: float = 25.0) -> Path:
 
 def dish(path: Path, facets: int) -> Path:
     """A surface of revolution about z, its circles drawn with so many facets."""
-    r, turn = np.meshgrid(np.linspace(1.0, 25.0, 40), np.linspace(0.0, 2 * np.pi, facets + 1), indexing="ij")
-    corners = np.stack([r * np.cos(turn), r * np.sin(turn), 6.0 + 4.0 * np.cos(r / 6.0)], -1)
+    r, turn = np.meshgrid(np.linspace(1.0, 14.0, 25), np.linspace(0.0, 2 * np.pi, facets + 1), indexing="ij")
+    corners = np.stack([r * np.cos(turn), r * np.sin(turn), 6.0 + 3.0 * np.cos(r / 4.0)], -1)
     k = np.arange(r.size).reshape(r.shape)
     a, b, c, d = (corner.ravel() for corner in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
     trimesh.Trimesh(corners.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])).export(

@@ -20,7 +20,7 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
 from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
 from cell.new_job.knowledge import known, place_from
-from cell.new_job.mesh_file import read_drawing
+from cell.new_job.mesh_file import Drawn, read_drawing
 from cell.new_job.picture import draw_proposal
 from cell.new_job.proposal import Proposal, propose
 from cell.new_job.questions import Asker, choice
@@ -53,8 +53,8 @@ class Made:
 def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) -> Made:
     """Ask, propose, check, draw, write. Raises `ConfigError` for answers that fit neither each other nor the cell,
     `NotObservable` when the surface does not tell where it is."""
-    mesh = asker.get("mesh", "The mesh of the surface (STL, PLY, STEP)", None, lambda text: Path(text).expanduser())
-    drawn = read_drawing(mesh)
+    drawn = asker.get("mesh", "The mesh of the surface (STL, PLY, STEP)", None, _read)
+    mesh = drawn.path
     laid, unit = laid_mesh(asker, drawn)
     name = job_name(asker, mesh)
     targets = Path(folder / f"{name}.toml"), Path(folder / f"{name}.stl"), Path(folder / f"{name}.png")
@@ -97,6 +97,10 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         for target in targets[:2]:
             _copied(there / target.name, target).replace(target)
     return Made(targets[0], targets[1], targets[2], name, proposal.share, found, (*proposal.notes, *notes))
+
+
+def _read(text: str) -> Drawn:
+    return read_drawing(Path(text.strip()).expanduser())
 
 
 def _beside(target: Path, mesh: Path) -> Path:
