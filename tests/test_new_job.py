@@ -116,7 +116,7 @@ def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_pat
 
 def test_a_surface_that_repeats_itself_is_refused_by_its_pitch(tmp_path: Path) -> None:
     pattern = relief(tmp_path / "p.stl", lambda x, y: 6 + np.cos(2 * np.pi * x / 6) + np.cos(2 * np.pi * y / 6))
-    with pytest.raises(RefusedError, match=r"repeats itself.*6\.0") as refused:
+    with pytest.raises(RefusedError, match=r"looks the same elsewhere: shifted by .*6\.0") as refused:
         from_options(tmp_path, mesh=str(pattern))
     assert '--prior "1 mm"' in str(refused.value)
 

@@ -25,7 +25,7 @@ from cell.new_job.picture import draw_proposal
 from cell.new_job.proposal import Proposal, propose
 from cell.new_job.questions import Asker, choice
 from cell.new_job.rays import Array
-from cell.new_job.rivals import rivals
+from cell.new_job.rivals import FITS, rivals
 from cell.new_job.sight import sight_problems
 from cell.new_job.surface import about, written
 from cell.new_job.text import job_text, pose_text
@@ -174,9 +174,10 @@ def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
         else f'--prior-angle "{1e3 * turned / 6:.2g} mrad"'
     )
     raise RefusedError(
-        f"the surface repeats itself: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by {1e3 * turned:.0f} mrad "
-        f"it fits as well ({len(others)} such places), and the board leaves that open. Take in an end or a feature "
-        f"that comes once; or, where it is fixed to the board as exactly, say {limit} or less"
+        f"the surface looks the same elsewhere: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by "
+        f"{1e3 * turned:.0f} mrad, {100 * FITS:.0f} % or more of what the sweeps see fits as well ({len(others)} such "
+        f"places), and the board leaves that open. Take in an end or a feature that comes once; or, where it is fixed "
+        f"to the board as exactly, say {limit} or less"
     )
 
 

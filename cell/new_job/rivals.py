@@ -1,4 +1,4 @@
-"""Other places at which the sweeps would fit the surface as well: teeth, patterns of holes, ribs that repeat.
+"""Other places at which the sweeps would fit the surface as well: teeth, patterns of holes, little that tells.
 
 An inversion that begins near such a place ends there, with small residuals and a small sigma, and is wrong. So the
 points that the sweeps will see are laid onto the surface from every place that the board leaves open.
@@ -21,7 +21,7 @@ from cell.new_job.sweeps import Seen
 POINTS = 600
 """Of the sweeps, that are laid onto the surface."""
 MOST_PLACES = 24
-FITS, ON = 0.9, 1e-4
+FITS, ON = 0.98, 1e-4
 """Share of the points that lie this near, m, to the surface at a place that cannot be told from the true one."""
 OVER = 0.6
 """Share of the points that has to lie over the surface there at all, as a job demands it."""
