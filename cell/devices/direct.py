@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 from cell.config import CellConfig
-from cell.device_config import MOST_PAYLOAD, of_make
+from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.described import Described
 from cell.devices.devices import Devices
+from cell.devices.rail_makes import ModbusRailConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
@@ -77,7 +78,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
-    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
+    arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
             ArmLimits(
@@ -92,8 +93,7 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         RailSetup(
             rail.lead,
-            rail.steps_per_turn,
-            rail.microsteps,
+            *_counted(rail),
             rail.travel,
             rail.max_speed,
             rail.acceleration,
@@ -108,3 +108,11 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         CameraSetup(ClockMap, Latch),
     )
+
+
+def _counted(rail: RailConfig) -> tuple[int, int]:
+    """Steps of a turn and microsteps of a step that positions are counted in."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn, 1
+    counted = of_make(rail, TmclRailConfig)
+    return counted.steps_per_turn, counted.microsteps
