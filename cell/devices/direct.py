@@ -20,6 +20,7 @@ from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
+from drivers.quantities import UNTOLD
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
@@ -98,6 +99,7 @@ def setup_of(config: CellConfig) -> Setup:
             rail.max_speed,
             rail.acceleration,
             EvenMotion.of,
+            _serial(rail),
         ),
         VehicleSetup(
             vehicle.max_speed,
@@ -116,3 +118,10 @@ def _counted(rail: RailConfig) -> tuple[int, int]:
         return rail.counts_per_turn, 1
     counted = of_make(rail, TmclRailConfig)
     return counted.steps_per_turn, counted.microsteps
+
+
+def _serial(rail: RailConfig) -> str | None:
+    """What the driver would tell for a drive that does not tell its serial number; None for one that does."""
+    if isinstance(rail, ModbusRailConfig) and rail.registers.serial is None:
+        return rail.serial or UNTOLD
+    return None

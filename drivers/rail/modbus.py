@@ -8,7 +8,7 @@ from __future__ import annotations
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Identity, RailState, Reading
-from drivers.quantities import shown
+from drivers.quantities import UNTOLD, shown
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.modbus_link import ModbusLink
 from drivers.rail.motion import patience
@@ -102,12 +102,12 @@ class ModbusRail(RailAxis):
     def identity(self) -> Identity:
         """The serial number from its register, if the map has one, else that of the configuration."""
         number = self.registers.serial
-        serial = self._serial or "not told"
+        serial = self._serial or UNTOLD
         if number is not None:
             serial = str(number.decode(self._link.read(number.address, number.words, input=number.input), signed=False))
         else:
             self._read(self.registers.position)
-        return Identity("Modbus RTU drive", serial, "not told", self._link.url)
+        return Identity("Modbus RTU drive", serial, UNTOLD, self._link.url)
 
     def ping(self) -> float:
         """Read the position once; returns the round trip in wall seconds."""
