@@ -172,6 +172,15 @@ def test_a_stop_goes_before_whatever_was_not_sent_yet(drive: Drive) -> None:
     rail.close()
 
 
+def test_what_was_decided_before_a_stop_is_not_sent_after_it(drive: Drive) -> None:
+    rail = drive.homed()
+    decided = rail._link.stops
+    rail.stop()
+    with pytest.raises(Aborted):
+        rail._link.do(rail.registers.start, issued=decided, moves=True)
+    rail.close()
+
+
 def test_a_zero_that_another_program_found_is_not_this_ones(drive: Drive) -> None:
     drive.homed().close()
     rail = drive.rail()

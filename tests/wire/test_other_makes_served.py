@@ -1,4 +1,4 @@
-"""A cell with a Modbus rail, a laser on a relay board and a Robotiq-style claw, served as docs/other-makes.md has it."""
+"""A cell with a Modbus rail, a laser on a relay board and a Robotiq-style claw, as docs/other-makes.md has it."""
 
 from __future__ import annotations
 
