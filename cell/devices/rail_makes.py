@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import StringConstraints, model_validator
 
 from cell.addresses import Port
-from cell.device_config import RailConfig
+from cell.device_config import Late, RailConfig
 from cell.devices.make import AnyMake, Make, Surroundings
 from cell.toml_file import Table
 from cell.units import whole
@@ -123,6 +123,7 @@ class ModbusRailConfig(RailConfig):
     counts_per_turn: Annotated[int, whole(20, 10_000_000, meaning=" of the position register in one turn of the motor")]
     in_position: Annotated[int, whole(0, 1000, meaning=" counts off its target at which a drive may settle")] = 0
     serial: Annotated[str, StringConstraints(max_length=40)] = ""
+    late: Late = 0.001
     registers: RegistersConfig
 
     @model_validator(mode="after")
