@@ -19,7 +19,7 @@ from cell.devices.contracts import Bench, Faults
 from cell.devices.contracts.rail import RailContract
 from cell.devices.rail_makes import ModbusRailConfig, register_map
 from drivers.clock import Clock
-from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError
+from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Rail
 from drivers.rail.modbus import ModbusRail
 from drivers.rail.modbus_link import ModbusRefused
@@ -210,6 +210,9 @@ def test_an_obstacle_is_an_alarm_with_its_number() -> None:
     with pytest.raises(DeviceFault, match="alarm 0x00e0") as met:
         rail.move_to(0.115).wait(60.0)
     assert met.value.code == "rail.alarm"
+    assert not rail.state().homed
+    with pytest.raises(InterlockError):
+        rail.move_to(0.01)
     assert [reading.ok for reading in rail.examine(0.0)] == [False]
     rail.close()
     drive.peer.stop()
