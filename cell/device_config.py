@@ -53,9 +53,13 @@ def real_path(address: str) -> str:
 
 
 class DeviceConfig(Table):
-    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is."""
+    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is.
+
+    `CAUTION` is what a person has to know of devices of this make before relying on them; `cell check` says it.
+    """
 
     ADDRESS: ClassVar[str] = "address"
+    CAUTION: ClassVar[str] = ""
 
     driver: str
 

@@ -113,6 +113,9 @@ class ModbusRailConfig(RailConfig):
     """A rail on a drive that speaks Modbus RTU on a serial line; `unit` is the drive's number on it."""
 
     ADDRESS: ClassVar[str] = "url"
+    CAUTION: ClassVar[str] = (
+        "a drive whose cable is cut goes on to its target: set its own communication timeout, if it has one"
+    )
 
     driver: Literal["modbus"] = "modbus"
     url: Annotated[str, Port]
