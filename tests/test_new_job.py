@@ -109,7 +109,7 @@ def test_a_unit_that_the_size_does_not_tell_is_asked_for(longest: float) -> None
 def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_path: Path) -> None:
     """Facets of the drawing are no relief of the part."""
     with pytest.raises(NotObservable, match="rotation about the z axis") as refused:
-        from_options(tmp_path, mesh=str(dish(tmp_path / "dish.stl", 24)))
+        from_options(tmp_path, mesh=str(dish(tmp_path / "dish.stl", 12)))
     assert "--prior-angle" in str(refused.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dish.stl"]
 

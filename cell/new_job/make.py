@@ -182,8 +182,8 @@ def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
 
 
 def _again(asker: Asker) -> str:
-    words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option not in ("write",)]
-    return " ".join(["cell new-job", *words])
+    words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option != "write"]
+    return " ".join(["cell new-job", *words, *(["--yes"] if asker.ask is None else [])])
 
 
 def _copied(source: Path, target: Path) -> Path:
