@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from cell.geometry.poses import perturbed
 from cell.inversion import NominalSurface
+from cell.inversion.observability import FREE
 from cell.inversion.search import MOST_SHIFT, candidates
 from cell.job import Job
 from cell.new_job.rays import Array
@@ -25,6 +26,8 @@ FITS, ON = 0.98, 1e-4
 """Share of the points that lie this near, m, to the surface at a place that cannot be told from the true one."""
 OVER = 0.6
 """Share of the points that has to lie over the surface there at all, as a job demands it."""
+LEAST_TOLD = 3 * FREE
+"""Least information of a motion, in those of a point along its normal, for it to lead to another place."""
 STEPS, GATE = 12, 0.002
 
 
@@ -39,6 +42,7 @@ def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tupl
         return []
     points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
     shift, turn = min(6 * job.surface.prior_sigma, MOST_SHIFT), 6 * job.surface.prior_sigma_angle
+    information = sum((each.information(each.solid) for each in seen), np.zeros((6, 6)))
     found: list[tuple[Array, float]] = []
     for start in candidates(pin.SE3.Identity(), points, nominal, shift, turn, MOST_PLACES):
         where = _settled(start, points, nominal)
@@ -46,9 +50,17 @@ def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tupl
         middle = where.act(nominal.centre) - nominal.centre
         same = np.linalg.norm(middle) < job.place.tolerance and turned < job.place.tolerance_angle
         near = np.linalg.norm(middle) <= np.sqrt(2) * shift and turned <= turn
-        if near and not same and _fit(where, points, nominal) > FITS:
+        if near and not same and _told(where, information, nominal.radius) and _fit(where, points, nominal) > FITS:
             found.append((np.asarray(middle), turned))
     return sorted(found, key=lambda each: float(np.linalg.norm(each[0])))
+
+
+def _told(where: pin.SE3, information: Array, radius: float) -> bool:
+    """Whether the scan tells this motion at all: along one that it leaves to the board there are no separate places."""
+    length = np.array([1.0] * 3 + [radius] * 3)
+    motion = np.concatenate([where.translation, pin.log3(where.rotation)]) * length
+    scaled = information / np.outer(length, length)
+    return bool(motion @ scaled @ motion > LEAST_TOLD * float(motion @ motion) * np.trace(scaled[:3, :3]))
 
 
 def _settled(pose: pin.SE3, points: Array, nominal: NominalSurface) -> pin.SE3:
