@@ -6,6 +6,8 @@ be proven there as well. Everything above the devices' interfaces is the product
 
 from __future__ import annotations
 
+from typing import Any
+
 from cell.config import CellConfig
 from cell.device_config import MOST_PAYLOAD, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
@@ -23,6 +25,7 @@ from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+from sim_backends.direct.switches import DirectClaw, DirectLaser
 
 
 class VirtualCell(DirectCell):
@@ -42,10 +45,16 @@ class VirtualCell(DirectCell):
         except ValueError as error:
             raise ConfigError(str(error)) from error
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
-        laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
+        laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         self.devices: Devices = behind_gate(
             config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
         )
+
+    def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
+        """What hangs on the arm is the product's own driver; anything else is a switch of the world."""
+        if self._config.make(name).on_arm:
+            return connect_one(self._config, name, self.clock, arm=self.arm)
+        return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
         """Raise `ConfigError` for a fault that only a wire can have."""

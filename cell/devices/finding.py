@@ -19,6 +19,7 @@ from cell.config import DEVICES, CellConfig, find_config, load_config
 from cell.device_config import DeviceConfig
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
+from cell.devices.switch_makes import OnBoard
 from cell.run.lock import who_holds
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
@@ -99,7 +100,7 @@ def configured(config: CellConfig, root: Path = ROOT) -> list[Found]:
 
 
 def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
-    place = record.place
+    place = record.url if isinstance(record, OnBoard) else record.place
     if record.driver == "fixed":
         return "nothing to connect", True
     if held := who_holds(name, record.held):
