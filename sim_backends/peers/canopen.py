@@ -73,6 +73,11 @@ class CanopenPeer:
         self._t = clock.now()
         model.set_mode(self._t, Mode.CAN)
 
+    @property
+    def endpoint(self) -> dict[str, str]:
+        """Where python-can finds it."""
+        return {"interface": self.interface, "channel": self.channel}
+
     def start(self) -> None:
         """Begin to serve."""
         self._bus.start()
