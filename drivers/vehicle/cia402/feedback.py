@@ -14,6 +14,7 @@ from drivers.vehicle.cia402.faults import command_lost, drive_error, wrong_units
 from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
 from drivers.vehicle.cia402.objects import STATUS
 from drivers.vehicle.cia402.states import DriveState, may_turn
+from drivers.vehicle.cia402.units import UnitCheck
 from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback
 from drivers.vehicle.travel import Travel
 
@@ -27,11 +28,7 @@ UNHEARD = 8
 """A drive that drives and was asked so many times for its state without an answer is lost."""
 STILL = 0.0035
 """Speeds up to this, m/s and rad/s, count as standstill."""
-UNIT_WAY_M, UNIT_RATIO = 0.05, 1.5
-"""Over this way a wheel's speed and its counts may differ by this factor; beyond it one is in another unit."""
 _RELEASED_WALL_S = 0.3
-_CREEPS = 0.02
-"""Below this, m/s, speed and counts are not compared."""
 _FAST_AGE_WALL_S = 0.2
 _PAIR_WALL_S = 0.006
 """Both drives answer one SYNC within this; the next comes after 10 ms at the earliest."""
@@ -71,9 +68,11 @@ class Feedback:
         )
         self._news = threading.Condition(threading.RLock())
         self._single: tuple[int, float] | None = None
-        self._units = [_Units(wheels), _Units(wheels)]
+        self._units = [UnitCheck(clock, wheels), UnitCheck(clock, wheels)]
         self.mismatch = ""
         """How a wheel's speed and its counts contradict each other."""
+        self.proving = False
+        """The drives' watchdog is being tried: that it stops them is no fault."""
 
     # --- what comes ---
 
@@ -233,8 +232,11 @@ class Feedback:
         """An emergency stop, or a drive's fault."""
         if self._stopped():
             return emergency_stop(self._name)
-        trouble = tuple(word for drive in self.drives for word in drive.trouble())
+        trouble = self._trouble()
         return drive_error(self._name, trouble, driven=self._travel.driven) if trouble else None
+
+    def _trouble(self) -> tuple[str, ...]:
+        return () if self.proving else tuple(word for drive in self.drives for word in drive.trouble())
 
     def _contradicted(self) -> DeviceFault | None:
         """What a vehicle that obeys must not show: another master, or units that do not fit."""
@@ -279,7 +281,7 @@ class Feedback:
                 emergency_stop=self._stopped(),
                 error_bits=max(drive.code for drive in self.drives),
                 battery_volts=round(1e-3 * min(volts), 1) if volts else None,
-                trouble=tuple(word for drive in self.drives for word in drive.trouble()),
+                trouble=self._trouble(),
                 warnings=tuple(word for drive in self.drives for word in drive.warnings()),
                 interruptions=travel.interruptions,
                 interruption=travel.interruption,
@@ -313,36 +315,3 @@ class Feedback:
         if in_command and lost is not None:
             self.interrupt(lost.message)
             raise lost
-
-
-class _Units:
-    """Whether one wheel's speed and its counts tell of the same way."""
-
-    def __init__(self, wheels: WheelDrives) -> None:
-        self._count, self._step = wheels.count_length, wheels.velocity_step
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew."""
-        self._last: tuple[float, int, int] | None = None
-        self._counted = self._told = 0.0
-
-    def contradiction(self, now: float, position: int, velocity: int) -> float:
-        """Take a reading; the ratio of both ways where it is wrong by more than `UNIT_RATIO`, else 0."""
-        last, self._last = self._last, (now, position, velocity)
-        if last is None:
-            return 0.0
-        turned = ((position - last[1] + 2**31) % 2**32 - 2**31) * self._count
-        took = now - last[0]
-        if abs(velocity) * self._step < _CREEPS and abs(turned) < _CREEPS * max(took, 0.005):
-            # It stands: an offset of its speed must not add up.
-            self._counted = self._told = 0.0
-            return 0.0
-        self._counted += turned
-        self._told += 0.5 * (velocity + last[2]) * self._step * took
-        if max(abs(self._counted), abs(self._told)) < UNIT_WAY_M:
-            return 0.0
-        counted, told = self._counted, self._told
-        self._counted = self._told = 0.0
-        ratio = told / counted if counted else math.inf
-        return 0.0 if 1.0 / UNIT_RATIO < ratio < UNIT_RATIO else ratio

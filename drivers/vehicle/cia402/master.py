@@ -139,8 +139,12 @@ class Master:
         """Both drives to operation enabled, at speed 0; for the first time their watchdog is tried."""
         self._operate()
         if not self._proved:
-            self._prove_watchdog()
-            self._operate()
+            self._feedback.proving = True
+            try:
+                self._prove_watchdog()
+                self._operate()
+            finally:
+                self._feedback.proving = False
 
     def switch_on(self) -> None:
         """Both drives to switched on, where no motor turns; faults are reset."""
