@@ -65,8 +65,8 @@ class Value:
 class CanopenNode:
     """The node `number` with its owner's `values` and `texts`, by index and subindex; `send` puts a frame on the bus.
 
-    `lost` is called when its master's heartbeat or guarding stays away. Times are seconds on the wall, because
-    watching a link is a matter of the wall also in a world that runs fast.
+    `lost` is called when its master's heartbeat or guarding stays away, and when it is stopped or reset by NMT. Times
+    are seconds on the wall, because watching a link is a matter of the wall also in a world that runs fast.
     """
 
     def __init__(
@@ -157,7 +157,10 @@ class CanopenNode:
     def _manage(self, command: int) -> None:
         if command in (0x01, 0x02, 0x80):
             self.state = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PREPARING}[command]
+            if command == 0x02:
+                self._lost()
         elif command in (0x81, 0x82):
+            self._lost()
             self.boot()
 
     # --- PDOs ---

@@ -41,6 +41,7 @@ _TRIES = 2
 _ABSENT = (0x06020000, 0x06090011, 0x06010000)
 """Abort codes of a value that a drive does not have."""
 _READ_ONLY = 0x06010002
+_SET_TWO_BYTES = 0x2B
 _FROM_DRIVES = (EMERGENCY, STATUS, MOTION, HEALTH, HEARTBEAT)
 _FROM_MASTERS = (COMMAND, 0x300, 0x400, 0x500)
 
@@ -164,6 +165,11 @@ class CanopenBus:
     def write(self, node: int, entry: Entry, value: int) -> None:
         """Set a value of a drive. Raises as `read` does; `Absent` also for one that cannot be written."""
         self._ask(node, f"{entry} = {value}", lambda sdo: sdo.download(entry.index, entry.sub, entry.pack(value)))
+
+    def post(self, node: int, entry: Entry, value: int) -> None:
+        """Set a value of two bytes without waiting for the answer. Raises as `check` does."""
+        request = struct.pack("<BHB2s2x", _SET_TWO_BYTES, entry.index, entry.sub, entry.pack(value))
+        self.send(SDO_REQUEST + node, request)
 
     def _ask(self, node: int, what: str, ask: Callable[[Any], Any]) -> Any:
         for tries in range(_TRIES):

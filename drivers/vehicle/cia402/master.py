@@ -112,12 +112,12 @@ class Master:
         self._feedback.require_released()
 
     def set_up(self) -> None:
-        """Set up the drives that are not set up, and start those that left the operational state."""
+        """Set up the drives that are not set up, and start the others, which may have left the operational state."""
         for drive in self._drives:
             if not drive.configured:
                 set_up(self.bus, drive, self._wheels, self._watchdog)
                 self.armed = False
-            elif drive.nmt not in (None, od.OPERATIONAL):
+            else:
                 self.bus.command(drive.node, od.START)
 
     def require_feedback(self) -> None:
@@ -198,8 +198,9 @@ class Master:
             self._mute = False
         took = self._clock.wall(self._clock.now() - begun)
         if self._feedback.may_turn():
-            self._send_words(states.DISABLE_VOLTAGE)
             who = " and ".join(d.side for d in self._drives if states.may_turn(d.state))
+            self._send_words(states.DISABLE_VOLTAGE)
+            self._feedback.wait_for(partial(self._feedback.all_but, states.may_turn), WALK_TIMEOUT_S, self._alive)
             raise unguarded(self._name, who, took, self._watchdog.seconds)
         _log.info("%s: without our heartbeat the drives stopped after %.2f s", self._name, took)
         self._proved = True
@@ -247,7 +248,12 @@ class Master:
         _log.warning("%s: quick stop: %s", self._name, why)
         self._statistics.count("quick_stop")
         self.enabled = False
-        self._send_words(states.QUICK_STOP)
+        with self.command:
+            for drive in self._drives:
+                # A drive that another master took out of the operational state takes no PDO, but answers by SDO.
+                self.bus.command(drive.node, od.START)
+                self.bus.post(drive.node, od.CONTROLWORD, states.QUICK_STOP)
+            self._send_words(states.QUICK_STOP)
 
     def _send_words(self, word: int) -> None:
         with self.command:
