@@ -240,5 +240,8 @@ def test_drives_that_ignore_a_halt_are_stopped_with_the_quick_stop(bench: Bench)
 def test_nobody_there_is_named(apart: Bench) -> None:
     for drive in apart.peer.drives:
         drive.node.silent = True
-    with pytest.raises(DeadlineError, match=r"node 1 does not answer.*bit rate"):
-        apart.connect()
+    with apart.other() as other:
+        sender = other.send_periodic(frame(0x709, b"\5"), 0.05)
+        with pytest.raises(DeadlineError, match=r"node 1 does not answer.*nodes heard on this bus: 9.*bit rate"):
+            apart.connect()
+        sender.stop()

@@ -82,6 +82,8 @@ class CanopenBus:
         self._nodes = nodes
         self._take_from, self._other = take, other
         self._statistics = statistics
+        self._heard: set[int] = set()
+        """Nodes that have said something."""
         self._asking = threading.Lock()
         self._network = _Network(self)
         self._clients: dict[int, SdoClient] = {}
@@ -184,10 +186,12 @@ class CanopenBus:
                 self._link.check()
                 self._statistics.count("timeouts")
                 if tries == _TRIES - 1:
+                    heard = ", ".join(map(str, sorted(self._heard))) or "none"
                     raise DeadlineError(
                         self.name,
-                        f"node {node} does not answer for {what} within {ANSWER_S} s ({silence}). See that the drive "
-                        "is on, its node number and bit rate are those of cell.toml, and no second master asks it",
+                        f"node {node} does not answer for {what} within {ANSWER_S} s; nodes heard on this bus: "
+                        f"{heard}. See that the drive is on, its node number and bit rate are those of cell.toml, and "
+                        "no second master asks it",
                     ) from silence
         raise AssertionError
 
@@ -198,6 +202,8 @@ class CanopenBus:
             return
         identifier, data = frame.arbitration_id, bytes(frame.data)
         service, node = identifier & 0x780, identifier & 0x7F
+        if node and service in _FROM_DRIVES:
+            self._heard.add(node)
         if frame.is_remote_frame:
             if service == HEARTBEAT and node in self._nodes:
                 self._other(f"somebody else guards node {node}")

@@ -12,7 +12,7 @@ from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.cia402.drive import Drive
 from drivers.vehicle.cia402.faults import command_lost, drive_error, wrong_units
 from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
-from drivers.vehicle.cia402.objects import STATUS
+from drivers.vehicle.cia402.objects import OPERATIONAL, STATUS
 from drivers.vehicle.cia402.states import DriveState, may_turn
 from drivers.vehicle.cia402.units import UnitCheck
 from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback
@@ -192,6 +192,10 @@ class Feedback:
     def newer(self, time: float) -> bool:
         """True when both drives have told status and motion after host time `time`."""
         return all(min(drive.told, drive.moved) > time for drive in self.drives)
+
+    def operational(self) -> bool:
+        """Whether both drives are, as far as they have told."""
+        return all(drive.nmt in (None, OPERATIONAL) for drive in self.drives)
 
     def all_in(self, *states: DriveState) -> bool:
         """Whether both drives are in one of these states."""

@@ -36,6 +36,7 @@ FIRST_FEEDBACK_S = 1.0
 LISTEN_S = 0.3
 """On the wall: before anything is set, whether somebody else commands these drives."""
 _STEP_WALL_S = 0.1
+_HEARTBEAT_WALL_S = 0.3
 
 _log = logging.getLogger(__name__)
 
@@ -145,6 +146,8 @@ class Master:
                 self._operate()
             finally:
                 self._feedback.proving = False
+        # What a drive told of itself before it was started may still be on its way.
+        self._feedback.wait_for(self._feedback.operational, 0.0, self._alive, _HEARTBEAT_WALL_S)
 
     def switch_on(self) -> None:
         """Both drives to switched on, where no motor turns; faults are reset."""
