@@ -34,9 +34,8 @@ from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
-from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
-from sim_backends.peers.wired import switch_peers
+from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.peers.wired_vehicle import vehicle_peer
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.hardware import camera_spec
@@ -89,7 +88,7 @@ class ServedCell:
         clock = world.clock
         with contextlib.ExitStack() as bound:
             self._arm = _bound(bound, RtdePeer(world.arm, clock))
-            self._rail = _bound(bound, TmclPeer(world.rail, clock))
+            self._rail = _bound(bound, rail_peer(world))
             self._vehicle = _bound(bound, vehicle_peer(world))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(

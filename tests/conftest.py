@@ -52,6 +52,7 @@ GROUPS = (
         "wire/test_sim_rail.py",
         "wire/test_sim_vehicle.py",
         "wire/test_sim_frames.py",
+        "wire/test_modbus_rail.py",
         "wire/test_relay_boards.py",
         "wire/test_robotiq_claw.py",
         "wire/test_last_words.py",

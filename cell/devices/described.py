@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, VehicleConfig
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig, of_make
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
+from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
 from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.geometry.poses import from_parts, transform
@@ -73,7 +74,6 @@ class Described:
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:
     arm, rail, laser, claw = config.arm, config.rail, config.laser, config.claw
-    assert isinstance(rail, TmclRailConfig)
     low, high = rail.travel
     margin = 0.1 * (high - low)
     return drawn.CellDrawing(
@@ -81,7 +81,7 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         payload=arm.payload,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=_turning_track(config.vehicle),
-        rail=drawn.RailDrawing(rail.lead, rail.steps_per_turn, rail.travel, (low + margin, high - margin)),
+        rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,
@@ -95,14 +95,23 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         deck_board=config.calibration.large.board,
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
         wires=_vehicle(config.vehicle)
-        | {name: wire for name in ("laser", "claw") if (wire := _wire(config.device(name)))},
+        | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
     )
+
+
+def _steps(rail: RailConfig) -> int:
+    """Steps of a turn that a drive counts at its coarsest."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn
+    return of_make(rail, TmclRailConfig).steps_per_turn
 
 
 def _wire(record: DeviceConfig) -> dict[str, Any]:
     """How a device is wired that does not hang on the arm, as its peer takes it."""
     wire: dict[str, Any] = {"make": record.driver}
     match record:
+        case ModbusRailConfig():
+            return wire | record.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
         case RobotiqClawConfig():
             return wire | {"place": record.address}
         case NumatoClawConfig():

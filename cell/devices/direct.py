@@ -9,17 +9,19 @@ from __future__ import annotations
 from typing import Any
 
 from cell.config import CellConfig
-from cell.device_config import MOST_PAYLOAD, of_make
+from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.described import Described
 from cell.devices.devices import Devices
+from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
+from drivers.quantities import UNTOLD
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
@@ -85,7 +87,7 @@ class VirtualCell(DirectCell):
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
     count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
-    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
+    arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
             ArmLimits(
@@ -100,12 +102,12 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         RailSetup(
             rail.lead,
-            rail.steps_per_turn,
-            rail.microsteps,
+            *_counted(rail),
             rail.travel,
             rail.max_speed,
             rail.acceleration,
             EvenMotion.of,
+            _serial(rail),
         ),
         VehicleSetup(
             vehicle.max_speed,
@@ -118,3 +120,18 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         CameraSetup(ClockMap, Latch),
     )
+
+
+def _counted(rail: RailConfig) -> tuple[int, int]:
+    """Steps of a turn and microsteps of a step that positions are counted in."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn, 1
+    counted = of_make(rail, TmclRailConfig)
+    return counted.steps_per_turn, counted.microsteps
+
+
+def _serial(rail: RailConfig) -> str | None:
+    """What the driver would tell for a drive that does not tell its serial number; None for one that does."""
+    if isinstance(rail, ModbusRailConfig) and rail.registers.serial is None:
+        return rail.serial or UNTOLD
+    return None

@@ -45,6 +45,10 @@ class OnBoard(DeviceConfig):
 class NumatoLaserConfig(OnBoard, LaserConfig):
     """A laser on a relay of a Numato board."""
 
+    CAUTION: ClassVar[str] = (
+        "nothing switches the laser off when the cable to its board is cut and the board has a supply of its own"
+    )
+
     driver: Literal["numato"] = "numato"
     relay: NumatoRelay
     baud: Annotated[int, whole(9600, 921600, *NUMATO_BAUDS)] = 19200
@@ -53,6 +57,11 @@ class NumatoLaserConfig(OnBoard, LaserConfig):
 class LcusLaserConfig(OnBoard, LaserConfig):
     """A laser on a relay of an LCUS board, which cannot be asked what its relays show."""
 
+    CAUTION: ClassVar[str] = (
+        "this board cannot be asked what its relay shows: the laser counts as off when it was told so; and nothing "
+        "switches it off when the cable is cut and the board has a supply of its own"
+    )
+
     driver: Literal["lcus"] = "lcus"
     relay: Annotated[int, whole(1, 8, meaning=": relays as the board counts them, from 1")] = 1
     baud: Annotated[int, whole(9600, 115200, 9600, 115200)] = 9600
@@ -60,6 +69,10 @@ class LcusLaserConfig(OnBoard, LaserConfig):
 
 class NumatoClawConfig(OnBoard, ClawConfig):
     """A claw that a relay of a Numato board closes; one of its inputs shows a held part, by the level `held_is`."""
+
+    CAUTION: ClassVar[str] = (
+        "a board that loses its supply opens its relay, and the claw with it, unless a spring holds"
+    )
 
     driver: Literal["numato"] = "numato"
     relay: NumatoRelay

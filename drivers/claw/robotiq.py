@@ -13,6 +13,7 @@ from drivers.claw.robotiq_link import RobotiqLink
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, Reading
+from drivers.quantities import UNTOLD
 
 ACTIVE = 3
 """STA of a gripper that is activated and knows its fingers' way."""
@@ -80,7 +81,7 @@ class RobotiqClaw:
     def identity(self) -> Identity:
         """The gripper tells neither model nor serial number on this socket."""
         self._link.get("STA")
-        return Identity("Robotiq gripper", "not told", "not told", self._link.address)
+        return Identity("Robotiq gripper", UNTOLD, UNTOLD, self._link.address)
 
     def ping(self) -> float:
         """Read its status once; returns the round trip in wall seconds."""

@@ -1,6 +1,6 @@
 """Two families of relay boards: one that can be asked for its relays and inputs, and one that only listens.
 
-Sources: docs/protocols.md, section 6.
+Sources: docs/other-makes.md, section 2.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import Protocol
 
 from drivers.errors import DeviceFault
 from drivers.interfaces import Identity
+from drivers.quantities import UNTOLD
 from drivers.relay.port import BadReply, RelayPort
 
-UNTOLD = "not told"
 _DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUV"
 """Relays and inputs as a Numato board counts them: those from 10 on by letters."""
 _PROMPT = b">"

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sim_backends.peers.relays import LcusPeer, NumatoPeer, RelayBoard
 from sim_backends.peers.robotiq import RobotiqPeer
+from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.world.world import World
+
+if TYPE_CHECKING:
+    from sim_backends.peers.modbus_drive import ModbusPeer
 
 
 class Peer(Protocol):
@@ -26,6 +30,22 @@ class Peer(Protocol):
 
 BOARDS = {"numato": (NumatoPeer, 0), "lcus": (LcusPeer, 1)}
 """Relay boards: their peer, and the number of their first relay."""
+
+
+def rail_peer(world: World) -> TmclPeer | ModbusPeer:
+    """The peer of the rail. Raises ValueError for one on Modbus where pymodbus is not installed."""
+    wire = world.scene.drawing.cell.wires.get("rail")
+    if wire is None:
+        return TmclPeer(world.rail, world.clock)
+    try:
+        # Only who simulates such a drive needs the library.
+        from sim_backends.peers.modbus_drive import ModbusDrive, ModbusPeer
+    except ImportError as error:
+        raise ValueError(
+            f"a rail on Modbus is simulated with pymodbus, which is not installed ({error}): pip install "
+            "'assembly-cell[modbus]'"
+        ) from error
+    return ModbusPeer(ModbusDrive(world.rail, world.clock, wire), wire["unit"])
 
 
 def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, Any]]]:
