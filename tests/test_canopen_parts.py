@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -124,6 +127,19 @@ def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
     assert ratio(57300, period=0.15) == 0.0
 
 
+def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
+    page = (Path(__file__).parent.parent / "docs" / "canopen.md").read_text(encoding="utf-8")
+    printed = page.split("```toml\n")[1].split("```")[0]
+    text = default_toml()
+    path = tmp_path / "cell.toml"
+    path.write_text(text[: text.index("[vehicle]")] + printed + "\n" + text[text.index("[scan_camera]") :])
+    record = load_config(path).vehicle
+    assert isinstance(record, CanopenVehicleConfig)
+    assert record.wheels() == replace(WHEELS, stop_input=3)
+    keys = set(re.findall(r"`(\w+)`", page))
+    assert set(CanopenVehicleConfig.model_fields) - {"lean_sigma"} <= keys | set(re.findall(r"(?m)^(\w+) =", printed))
+
+
 def table(**changed: str) -> str:
     keys = {
         "driver": '"canopen"', "interface": '"socketcan"', "channel": '"can0"', "bitrate": '"500 kbit/s"',
@@ -134,19 +150,17 @@ def table(**changed: str) -> str:
     return "[vehicle]\n" + "\n".join(f"{key} = {value}" for key, value in (keys | changed).items()) + "\n\n"
 
 
-def config(tmp_path: object, **changed: str) -> CanopenVehicleConfig:
-    from pathlib import Path
-
+def config(tmp_path: Path, **changed: str) -> CanopenVehicleConfig:
     text = default_toml()
     begin, end = text.index("[vehicle]"), text.index("[scan_camera]")
-    path = Path(str(tmp_path)) / "cell.toml"
+    path = tmp_path / "cell.toml"
     path.write_text(text[:begin] + table(**changed) + text[end:])
     record = load_config(path).vehicle
     assert isinstance(record, CanopenVehicleConfig)
     return record
 
 
-def test_a_configuration_describes_the_drives(tmp_path: object) -> None:
+def test_a_configuration_describes_the_drives(tmp_path: Path) -> None:
     assert config(tmp_path).wheels() == WHEELS
     assert config(tmp_path, stop_input="3").wheels().stop_input == 3
     output = config(tmp_path, brake='"output"', brake_bit="17", brake_locks='"high"').wheels()
@@ -166,6 +180,6 @@ def test_a_configuration_describes_the_drives(tmp_path: object) -> None:
         ({"wheel_radius": "100"}, "mm"),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_range(tmp_path: object, changed: dict[str, str], told: str) -> None:
+def test_what_cannot_be_is_refused_with_its_range(tmp_path: Path, changed: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         config(tmp_path, **changed)

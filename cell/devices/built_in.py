@@ -101,6 +101,10 @@ class FixedVehicleConfig(VehicleConfig):
 
     ADDRESS: ClassVar[str] = "driver"
     DRIVES: ClassVar[bool] = False
+    CAUTION: ClassVar[str] = (
+        "nothing drives; drive_to_target looks whether the station stands where approach.target has it, within "
+        "approach.tolerance, and refuses otherwise"
+    )
 
     driver: Literal["fixed"] = "fixed"
     track: Annotated[float, quantity("mm", 100, 3000)] = 1.0
