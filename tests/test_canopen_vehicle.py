@@ -11,7 +11,9 @@ from dataclasses import replace
 import pytest
 
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError
+from drivers.vehicle.cia402.last_words import last_words
 from sim_backends.models.wheel_drive import State
+from sim_backends.peers.canopen_node import WRONG_VALUE, Abort
 from tests.canopen_bench import SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 
 RAMP_WALL_S = 0.3
@@ -209,6 +211,34 @@ def test_a_brake_on_an_output_follows_it(locks: bool) -> None:
         bench.vehicle.brake()
         bench.until(bench.braked)
         assert {drive._outputs >> 17 & 1 for drive in bench.peer.drives} == {locks}
+
+
+def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_brakes() -> None:
+    """Sooner than the drives' own watchdog would."""
+    settings, wheels = with_output_brake(locks=True)
+    with at_bench(settings, wheels=wheels) as bench, bench.other() as other:
+        bench.drive_until_fast()
+        bench.vehicle._master._closed.set()
+        bench.vehicle._master._keeper.join()
+        for identifier, data in last_words(wheels):
+            other.send(frame(identifier, data))
+        bench.until(lambda: all(drive.wheel.state is not State.ENABLED for drive in bench.peer.drives), 0.15)
+        assert {drive._outputs >> 17 for drive in bench.peer.drives} == {1}
+        bench.until(lambda: bench.speed() == 0.0)
+        bench.vehicle._master.bus.close()
+        bench.vehicle._closed.set()
+
+
+def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart: Bench) -> None:
+    def refuse(value: int) -> None:
+        raise Abort(WRONG_VALUE)
+
+    apart.peer.drives[0].node._values[0x605D, 0].write = refuse
+    apart.connect().close()
+    apart.peer.drives[0].node._values[0x6085, 0].write = refuse
+    with pytest.raises(DeviceFault, match=r"node number 1 refuses 6085h \(quick stop deceleration\)") as met:
+        apart.connect()
+    assert met.value.code == "vehicle.setup"
 
 
 def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench) -> None:

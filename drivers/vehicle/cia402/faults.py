@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.errors import DeviceFault
 
+SETUP = "vehicle.setup"
 TOLD_ONCE = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.units")
 """Codes of faults that end command: whoever is in charge afterwards is no fault of the vehicle."""
 
@@ -56,7 +57,7 @@ def unfit(name: str, what: str) -> DeviceFault:
     """A drive that cannot be used as it is."""
     return DeviceFault(
         name,
-        "vehicle.setup",
+        SETUP,
         what,
         recoverable=False,
         hint="Compare the drive's manual with docs/canopen.md, which lists what a drive must have.",

@@ -13,7 +13,7 @@ from drivers.errors import ConfigError, DeviceFault
 from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402.bus import Absent, CanopenBus
 from drivers.vehicle.cia402.drive import Drive
-from drivers.vehicle.cia402.faults import unfit
+from drivers.vehicle.cia402.faults import SETUP, unfit
 from drivers.vehicle.cia402.geometry import SI_UNITS, WheelDrives
 from drivers.vehicle.cia402.objects import Entry
 from drivers.vehicle.cia402.states import DISABLE_VOLTAGE, may_turn, state_of
@@ -67,6 +67,8 @@ def set_up(bus: CanopenBus, drive: Drive, wheels: WheelDrives, watchdog: Watchdo
     if watchdog.guarding == "node":
         _set(bus, drive, od.PRODUCER_HEARTBEAT, 0, needed=False)
     else:
+        # A node does either.
+        _set(bus, drive, od.GUARD_TIME, 0, needed=False)
         _set(bus, drive, od.PRODUCER_HEARTBEAT, DRIVES_HEARTBEAT_MS)
     watchdog.disarm(bus, drive)
     _set(bus, drive, od.ABORT_CONNECTION, 1, needed=False)  # a fault; that it stops is proved by trial
@@ -166,12 +168,16 @@ def _map(
 
 
 def _set(bus: CanopenBus, drive: Drive, entry: Entry, value: int, *, needed: bool = True) -> None:
-    """Write and read back; what is not `needed` may be absent or fixed, not different after it was taken."""
+    """Write and read back; what is not `needed` may be absent or refused, not different after it was taken."""
     try:
         bus.write(drive.node, entry, value)
     except Absent as absent:
         if needed and _told(bus, drive, entry) != value:
             raise _unfit(bus, drive, f"lets {entry} not be set to {value}: {absent}") from absent
+        return
+    except DeviceFault as refusal:
+        if needed or refusal.code != SETUP:
+            raise
         return
     if (kept := _told(bus, drive, entry)) not in (value, None):
         raise _unfit(bus, drive, f"took {entry} = {value} and keeps {kept}")
