@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from cell.calibration import ScanCalibration
 from cell.calibration.collect.witness import require_witness
+from cell.calibration.timing import Timing, changed, link_of
 from cell.calibration.witness import Pointing
 from cell.calibration.witness import pointing as pointing_since
+from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
@@ -117,6 +120,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
     head, pointing = here.calibration.scan, _pointing(here, context)
+    timing, doubts = times_known(head, here.config)
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
     record = laser_sweep(
@@ -129,7 +133,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
             here.config.scan_camera.late,
-            head.timing,
+            timing,
         ),
         here.mover,
         devices,
@@ -137,10 +141,29 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.check,
         context.progress,
     )
-    record = replace(record, pointing=pointing)
+    record = replace(record, pointing=pointing, doubts=doubts)
     for note in record.notes:
         context.note(text=note)
     return record
+
+
+def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | None, tuple[str, ...]]:
+    """How late the camera's stamps come, if that was measured with the settings of now; and for people what of the
+    camera's times is not known."""
+    timing, doubts = head.timing, list(head.unread)
+    if timing is not None and (doubt := timing.doubt(config)):
+        doubts.append(
+            f"how late the scan camera's time stamps come is kept since {timing.date}, but {doubt}; the sweep goes on "
+            "with scan_camera.late. Run `cell calibrate timing`"
+        )
+        timing = None
+    seen = timing is not None or (head.shutter is not None and not changed(head.shutter.link, link_of(config)))
+    if not seen:
+        doubts.append(
+            "whether the scan camera has a rolling shutter is not known: nobody looked with these settings of it, and "
+            "a sweep does not show it. Run `cell calibrate timing`"
+        )
+    return timing, tuple(doubts)
 
 
 def _pointing(here: Workplace, context: StepContext) -> Pointing | None:

@@ -1,15 +1,17 @@
-"""Sweeps to and fro over the fine board, laser off: what the lateness of the camera's time stamps is found from."""
+"""Sweeps to and fro over the fine board, laser off: they tell how late the camera's stamps come, and its shutter."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
 from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing
-from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_timing
+from cell.calibration.timing import Timing, link_of
+from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_shutter, find_timing, refuse_rolling
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
@@ -44,27 +46,74 @@ def collect_timing(
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
     """
+    fast, (short, long) = config.rail.max_speed, (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    slow = SLOW_SHARE * fast
+    # The clocks are compared before each sweep, and differ by what that leaves open: many short sweeps, not few long.
+    pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
+    pairs.append((fast, short))
+
+    def tell(k: int, count: int) -> None:
+        check()
+        progress(k / count, f"fine board, sweep {k + 1} of {count}")
+
+    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, tell, keep)
+    given = config.scan_camera.late, config.rail.lead, link_of(config)
+    return find_timing(calibration.scan, base_from_flange, sweeps, *given)
+
+
+def look_at_shutter(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    check: Check,
+    keep: Keep,
+) -> CellCalibration:
+    """A new `calibration` with what one sweep to and fro over the fine board tells of the scan camera's shutter.
+
+    Where that tells nothing, for instance because pictures from a moving rail do not show the board, a note says so.
+    Raises `RefusedError` for a rolling shutter: a sweep's rows would lie askew, and nothing else of a job shows it.
+    """
+    pairs = [(config.rail.max_speed, min(EXPOSURES) * config.scan_camera.photo_exposure)]
+    scan = calibration.scan
+    devices.interlocks.work_with(calibration.configuration)
+    try:
+        base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, lambda k, count: check(), keep)
+        shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
+    except RefusedError as unseen:
+        note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
+        return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
+    refuse_rolling(shutter.readout, shutter.sigma)
+    return replace(calibration, scan=replace(scan, shutter=shutter))
+
+
+def _sweeps(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    pairs: Sequence[tuple[float, float]],
+    tell: Callable[[int, int], None],
+    keep: Keep,
+) -> tuple[pin.SE3, list[TimedSweep]]:
+    """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
+
+    `tell` is given each sweep's number and how many there are.
+    """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
     assert calibration.scan.reference is not None
     base_from_board = calibration.scan.reference.base_from_board
     ends = rail_ends(calibration.scan, base_from_board, view, fine, config.rail.travel)
     if not devices.rail.state().homed_here:
-        progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
     mover.to_joints(HOME)
     move_to_view(devices, mover, view, 0)
     base_from_flange = from_ur(devices.arm.state().flange)
-    fast, (short, long) = config.rail.max_speed, (share * config.scan_camera.photo_exposure for share in EXPOSURES)
-    slow = SLOW_SHARE * fast
-    # The clocks are compared before each sweep, and differ by what that leaves open: many short sweeps, not few long.
-    pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
-    pairs.append((fast, short))
     plan = [(speed, exposure, way) for speed, exposure in pairs for way in (1, -1)]
     sweeps = []
     for k, (speed, exposure, way) in enumerate(plan):
-        check()
-        progress(k / len(plan), f"fine board, sweep {k + 1} of {len(plan)}")
+        tell(k, len(plan))
         # Pictures at other places each time: an error of the screw that they share would pass for lateness.
         inner = STAGGER_M * (k * GOLDEN % 1.0)
         between = (ends[0] + inner, ends[1] - STAGGER_M + inner)[::way]
@@ -78,7 +127,7 @@ def collect_timing(
             recoverable=True,
             hint="See what pushed the arm; the sweeps are of no use.",
         )
-    return find_timing(calibration.scan, base_from_flange, sweeps, config.scan_camera.late, config.rail.lead)
+    return base_from_flange, sweeps
 
 
 def _swept(
