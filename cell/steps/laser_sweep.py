@@ -15,7 +15,7 @@ from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
-from cell.steps.board_photo import board_photo
+from cell.steps.board_photo import photographed
 from cell.steps.camera_poses import ScanPlan, photo_pose, scan_plans
 from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
@@ -24,7 +24,7 @@ from cell.steps.step import JobStep
 from cell.steps.stored_sweep import FILE, moved_by, save_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
-from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.steps.workplace import Workplace
 from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame
 from statemachine.policy import Step
@@ -100,10 +100,7 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
 def _require_unmoved(here: Workplace, context: StepContext, fix: BoardFix) -> None:
     """After a fault the arm's base may stand elsewhere: photograph the board again. `RefusedError` if it does."""
     goal = photo_pose(here.job, here.board, fix.base_from_board, here.calibration.target.flange_from_camera)
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    now = board_photo(
-        goal, here.mover, here.photograph, here.job.photo.count, lambda share, text: context.progress(0.0, text)
-    )
+    now = photographed(here, goal, lambda share, text: context.progress(0.0, text))
     if (moved := moved_by(now, fix.base_from_board, fix.covariance)) is not None:
         raise RefusedError(
             f"the board has moved by {moved} since it was photographed, before the fault that ended the sweep. See "
@@ -141,7 +138,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.check,
         context.progress,
     )
-    record = replace(record, pointing=pointing, doubts=doubts)
+    record = replace(record, pointing=pointing, doubts=(*doubts, *here.notes))
     for note in record.notes:
         context.note(text=note)
     return record

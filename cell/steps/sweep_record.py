@@ -15,7 +15,7 @@ from drivers.interfaces import Frame
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
     """What the sweeps brought, in their order; at least one. `pointing` of the laser, where a witness told it; `doubts`
-    for people: what of the calibration did not hold for them."""
+    for people: what of calibration and arm is not as one would have it."""
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
