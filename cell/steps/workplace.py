@@ -80,8 +80,8 @@ class Workplace:
         if self._scatter == 1.0:
             return ()
         return (
-            f"in the calibration the arm's poses scattered {self._scatter:.1f} times as much as arm.repeatability says, "
-            "as uneven gears (joint harmonics), sag or lengths that its controller does not know make them; as much is "
+            f"in the calibration the arm's poses scattered {self._scatter:.1f} times as much as arm.repeatability says "
+            "(uneven gears, that is joint harmonics, or sag, or lengths that its controller does not know); as much is "
             "stated of sweep and place",
         )
 
