@@ -155,6 +155,16 @@ def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:
     assert times_known(placed_pot.calibration.scan, CONFIG) == (None, ())
 
 
+def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord) -> None:
+    made = placed_pot.calibration
+    assert made is not None
+    cell = VirtualCell(CONFIG, 2, "nominal+rolling_shutter")
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
+    with pytest.raises(RefusedError, match=r"rolling shutter: its last row is exposed (9\.9|10\.0|10\.1) ms after"):
+        look_at_shutter(CONFIG, cell.devices, mover, made, lambda: None, lambda what, frame: None)
+
+
 def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord) -> None:
     made = placed_pot.calibration
     assert made is not None
