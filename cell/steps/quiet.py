@@ -63,7 +63,7 @@ def swing_covariance(swung: float, base_from_board: pin.SE3, base_from_vehicle: 
 def words(swung: float, waited: float) -> str:
     """For people, where the job goes on nevertheless."""
     return (
-        f"the vehicle rocks: after {waited:.0f} s of waiting the board still goes to and fro by ±{1e3 * swung:.2f} mm "
-        "between photographs; what that leaves open is in the stated uncertainty. See what shakes it, or lower its "
-        "supports"
+        f"the vehicle rocks, or the board swings: after {waited:.0f} s of waiting it still goes to and fro by "
+        f"±{1e3 * swung:.2f} mm between photographs; what that leaves open is in the stated uncertainty. See what "
+        "shakes it, or lower the vehicle's supports"
     )
