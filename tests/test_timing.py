@@ -16,7 +16,15 @@ from cell.calibration.solve.reference import Reference
 from cell.calibration.solve.results import KEPT, Quality
 from cell.calibration.store import CellCalibration
 from cell.calibration.timing import Shutter, Timing, changed, link_of
-from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_shutter, find_timing, refuse_rolling
+from cell.calibration.timing_fit import (
+    TimedFrame,
+    TimedSweep,
+    find_shutter,
+    find_timing,
+    refuse_late,
+    refuse_rolling,
+    roughly_late,
+)
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.camera import CameraModel
@@ -145,6 +153,18 @@ def test_one_sweep_to_and_fro_tells_a_rolling_shutter() -> None:
     crawling = [replace(one, velocity=1e-2 * one.velocity) for one in sweeps(4, 1e-3)[:2]]
     with pytest.raises(RefusedError, match="known to ±"):
         find_shutter(calibration(), here, crawling, {})
+
+
+@pytest.mark.parametrize("late", [0.0, 1.5e-3, -1e-3, 30e-3])
+def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) -> None:
+    found, sigma = roughly_late(calibration(), pin.SE3.Identity(), sweeps(6, late)[:2])
+    assert sigma < 0.5e-3
+    assert abs(found - late) < 3 * sigma
+    if late > MOST_LATE_S:
+        with pytest.raises(RefusedError, match=r'come (29|30)\.\d+ ms late, .*scan_camera.late = "3[01] ms"'):
+            refuse_late(found, sigma, MOST_LATE_S)
+    else:
+        refuse_late(found, sigma, MOST_LATE_S)
 
 
 def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:

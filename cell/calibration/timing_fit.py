@@ -33,6 +33,8 @@ SURE = 5.0
 LEAST_READOUT_S = 0.5e-3
 BY_EXPOSURE = 0.25
 """Cameras stamp the beginning, the middle or the end of an exposure: 0, 0.5 or 1 of its length later."""
+USUAL_PLAY_M = 30e-6
+"""One standard deviation of the play of a screw that nobody has measured."""
 _TIME_S, _PLACE_M = 0.15e-3, 1e-6
 """About what a sweep's times and its places scatter by: only their ratio counts, what they are shows in the sweeps."""
 _ROUNDS = 3
@@ -49,12 +51,13 @@ class TimedFrame:
 @dataclass(frozen=True, eq=False)
 class TimedSweep:
     """The frames of one sweep over the board at `velocity` m/s, negative backwards, each exposed for `exposure` s; the
-    camera's clock was known to ±`bound` s."""
+    camera's clock was known to ±`bound` s, the times of the rail's readings to ±`rail_bound` s."""
 
     velocity: float
     exposure: float
     bound: float
     frames: Sequence[TimedFrame]
+    rail_bound: float = 0.0
 
 
 def find_shutter(
@@ -73,6 +76,22 @@ def find_shutter(
             Measured("readout of the scan camera, one sigma", 1e3 * sigma, "ms", most=1e3 * WANTED_S),
         )
     return Shutter(readout, sigma, link)
+
+
+def roughly_late(scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep]) -> tuple[float, float]:
+    """How late the stamps come, s, and its deviation, from sweeps at one speed, to and fro.
+
+    One speed does not tell lateness from the play of a screw: what a usual one makes of it is in the deviation.
+    """
+    _require_frames(sweeps)
+    shifts, _, _ = _displacements(scan, base_from_flange, sweeps)
+    velocities = np.array([sweep.velocity for sweep in sweeps for _ in sweep.frames])
+    (_, late), (_, sigma), _ = _least_squares(
+        np.column_stack([np.ones(len(shifts)), velocities]), shifts, np.ones(len(shifts))
+    )
+    by_play = 0.5 * USUAL_PLAY_M / float(np.mean(np.abs(velocities)))
+    by_clocks = np.sqrt(np.mean([sweep.bound**2 + sweep.rail_bound**2 for sweep in sweeps]) / 3.0)
+    return float(late), float(np.sqrt(sigma**2 + by_play**2 + by_clocks**2))
 
 
 def find_timing(
@@ -203,10 +222,16 @@ def _require(made: Timing, by_sigma: float, most_late: float) -> None:
             "calibrate timing` again; until then jobs go on with scan_camera.late",
             Measured("time stamps, one sigma", 1e3 * made.sigma, "ms", most=1e3 * WANTED_S),
         )
-    if abs(made.late) > most_late + 3 * made.sigma:
+    refuse_late(made.late, made.sigma, most_late)
+
+
+def refuse_late(late: float, sigma: float, most_late: float) -> None:
+    """Raise `RefusedError` for stamps that come `late` ± `sigma` s late, which is more than `most_late` s."""
+    if abs(late) > most_late + 3 * sigma:
         raise RefusedError(
-            f"the scan camera's time stamps come {1e3 * made.late:.2f} ms late, scan_camera.late allows "
+            f"the scan camera's time stamps come {1e3 * late:.2f} ms late, scan_camera.late allows "
             f"{1e3 * most_late:g} ms: see the camera's and its driver's settings, or, if that is how this camera is, "
-            f'write scan_camera.late = "{np.ceil(1e3 * abs(made.late)):g} ms" and run `cell calibrate timing` again',
-            Measured("time stamps are late by", 1e3 * made.late, "ms", most=1e3 * most_late),
+            f'write scan_camera.late = "{np.ceil(1e3 * abs(late)):g} ms", calibrate again and run `cell calibrate '
+            "timing`",
+            Measured("time stamps are late by", 1e3 * late, "ms", most=1e3 * most_late),
         )

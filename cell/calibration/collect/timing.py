@@ -11,7 +11,15 @@ import pinocchio as pin
 from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
 from cell.calibration.store import CellCalibration
 from cell.calibration.timing import Timing, link_of
-from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_shutter, find_timing, refuse_rolling
+from cell.calibration.timing_fit import (
+    TimedFrame,
+    TimedSweep,
+    find_shutter,
+    find_timing,
+    refuse_late,
+    refuse_rolling,
+    roughly_late,
+)
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
@@ -72,7 +80,8 @@ def look_at_shutter(
     """A new `calibration` with what one sweep to and fro over the fine board tells of the scan camera's shutter.
 
     Where that tells nothing, for instance because pictures from a moving rail do not show the board, a note says so.
-    Raises `RefusedError` for a rolling shutter: a sweep's rows would lie askew, and nothing else of a job shows it.
+    Raises `RefusedError` for a rolling shutter and for stamps that come later than the configuration allows: a sweep's
+    rows would lie askew, or all of it elsewhere, and nothing of a job shows it.
     """
     pairs = [(config.rail.max_speed, min(EXPOSURES) * config.scan_camera.photo_exposure)]
     scan = calibration.scan
@@ -80,10 +89,12 @@ def look_at_shutter(
     try:
         base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, lambda k, count: check(), keep)
         shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
+        late, sigma = roughly_late(scan, base_from_flange, sweeps)
     except RefusedError as unseen:
         note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
         return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
     refuse_rolling(shutter.readout, shutter.sigma)
+    refuse_late(late, sigma, config.scan_camera.late)
     return replace(calibration, scan=replace(scan, shutter=shutter))
 
 
@@ -164,4 +175,4 @@ def _swept(
             f"no picture of a sweep over the fine board shows it ({refused or 'none came'}); clean it, see that it is "
             "lit, and that scan_camera.photo_exposure is enough for a quarter of it"
         )
-    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made)
+    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made, sweep.time_bound)

@@ -183,6 +183,8 @@ class ScanCalibration:
         again = "jobs go on with scan_camera.late until `cell calibrate timing` has measured it again"
         timing = found("timing", Timing.read, again)
         shutter = found("shutter", Shutter.read, "run `cell calibrate timing`, which looks at it again")
+        alone = "jobs go by the plate on the claw alone until `cell calibrate verify` has seen the laser again"
+        confirmed = found("confirmed", ConfirmedTurn.read, alone)
         return cls(
             _camera(data["camera"]),
             LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
@@ -195,7 +197,7 @@ class ScanCalibration:
             np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
             tuple(data.get("notes", ())),
             Witness.read(data.get("witness")),
-            confirmed=ConfirmedTurn.read(data.get("confirmed")),
+            confirmed=confirmed,
             timing=timing,
             shutter=shutter,
             unread=tuple(unread),
