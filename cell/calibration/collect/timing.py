@@ -32,6 +32,10 @@ SLOW_SHARE = 0.25
 """Of the rail's highest speed: what does not grow with the speed is no lateness."""
 EXPOSURES = 0.25, 0.5
 """Of what photographs of a board at rest are exposed: short, for the board is smeared by what it moves meanwhile."""
+MOST_SMEAR_M = 0.4e-3
+"""What the board may move by during an exposure: less than its dots are apart."""
+ROOM_M = 2e-3
+"""To either side of a sweep and its run-up."""
 FRAMES = 7
 """Of each sweep, about."""
 STAGGER_M = 4e-3
@@ -54,7 +58,8 @@ def collect_timing(
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
     """
-    fast, (short, long) = config.rail.max_speed, (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    short, long = (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    fast = min(config.rail.max_speed, MOST_SMEAR_M / long)
     slow = SLOW_SHARE * fast
     # The clocks are compared before each sweep, and differ by what that leaves open: many short sweeps, not few long.
     pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
@@ -83,7 +88,8 @@ def look_at_shutter(
     Raises `RefusedError` for a rolling shutter and for stamps that come later than the configuration allows: a sweep's
     rows would lie askew, or all of it elsewhere, and nothing of a job shows it.
     """
-    pairs = [(config.rail.max_speed, min(EXPOSURES) * config.scan_camera.photo_exposure)]
+    exposure = min(EXPOSURES) * config.scan_camera.photo_exposure
+    pairs = [(min(config.rail.max_speed, MOST_SMEAR_M / exposure), exposure)]
     scan = calibration.scan
     devices.interlocks.work_with(calibration.configuration)
     try:
@@ -115,7 +121,10 @@ def _sweeps(
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
     assert calibration.scan.reference is not None
     base_from_board = calibration.scan.reference.base_from_board
-    ends = rail_ends(calibration.scan, base_from_board, view, fine, config.rail.travel)
+    # Within the travel the rail has to gain its speed, and to lose it.
+    room = max(speed for speed, _ in pairs) ** 2 / (2 * config.rail.acceleration) + ROOM_M
+    low, high = config.rail.travel
+    ends = rail_ends(calibration.scan, base_from_board, view, fine, (low + room, high - room))
     if not devices.rail.state().homed_here:
         devices.rail.home().wait(60.0)
     mover.to_joints(HOME)
