@@ -26,7 +26,7 @@ from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import rail_ends, verification_views
 from cell.steps.moves import HOME, Mover
 from cell.vision import BoardSpec, find_board, parse_board
-from drivers.errors import DeviceFault, RefusedError
+from drivers.errors import DeviceFault, LimitError, RefusedError
 
 SLOW_SHARE = 0.25
 """Of the rail's highest speed: what does not grow with the speed is no lateness."""
@@ -84,7 +84,8 @@ def look_at_shutter(
 ) -> CellCalibration:
     """A new `calibration` with what one sweep to and fro over the fine board tells of the scan camera's shutter.
 
-    Where that tells nothing, for instance because pictures from a moving rail do not show the board, a note says so.
+    Where that tells nothing, for instance because pictures from a moving rail do not show the board, or the camera is
+    too slow for them, a note says so.
     Raises `RefusedError` for a rolling shutter and for stamps that come later than the configuration allows: a sweep's
     rows would lie askew, or all of it elsewhere, and nothing of a job shows it.
     """
@@ -96,7 +97,7 @@ def look_at_shutter(
         base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, lambda k, count: check(), keep)
         shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
         late, sigma = roughly_late(scan, base_from_flange, sweeps)
-    except RefusedError as unseen:
+    except (RefusedError, LimitError) as unseen:
         note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
         return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
     refuse_rolling(shutter.readout, shutter.sigma)
