@@ -30,6 +30,11 @@ def link_of(config: CellConfig) -> dict[str, str]:
     return made
 
 
+def most_late(config: CellConfig) -> float:
+    """The most, s, that stamps may be late against the rail's readings, as the configuration has it."""
+    return config.scan_camera.late + config.rail.late
+
+
 def changed(was: dict[str, str], now: dict[str, str]) -> str:
     """What is set otherwise, for people; "" where nothing is."""
     names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
@@ -101,9 +106,9 @@ class Timing:
         """Why it does not hold for the cell as it is configured now, for people; "" where it does."""
         if told := changed(self.link, link_of(config)):
             return f"it was measured with other settings ({told})"
-        most = config.scan_camera.late + 3 * self.sigma
-        if abs(self.late) > most:
-            return f"it is {1e3 * self.late:g} ms, scan_camera.late allows {1e3 * config.scan_camera.late:g} ms"
+        most = most_late(config)
+        if abs(self.late) > most + 3 * self.sigma:
+            return f"it is {1e3 * self.late:g} ms, scan_camera.late and rail.late allow {1e3 * most:g} ms"
         return ""
 
     @property

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
 from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing, link_of
+from cell.calibration.timing import Timing, link_of, most_late
 from cell.calibration.timing_fit import (
     TimedFrame,
     TimedSweep,
@@ -70,7 +70,7 @@ def collect_timing(
         progress(k / count, f"fine board, sweep {k + 1} of {count}")
 
     base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, tell, keep)
-    given = config.scan_camera.late, config.rail.lead, link_of(config)
+    given = most_late(config), config.rail.lead, link_of(config)
     return find_timing(calibration.scan, base_from_flange, sweeps, *given)
 
 
@@ -101,7 +101,7 @@ def look_at_shutter(
         note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
         return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
     refuse_rolling(shutter.readout, shutter.sigma)
-    refuse_late(late, sigma, config.scan_camera.late)
+    refuse_late(late, sigma, most_late(config))
     return replace(calibration, scan=replace(scan, shutter=shutter))
 
 
