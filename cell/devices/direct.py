@@ -66,7 +66,9 @@ class VirtualCell(DirectCell):
         return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
-        """Raise `ConfigError` for a fault that only a wire can have."""
+        """Raise `ConfigError` for a fault that only a wire can have, or a vehicle where there is none."""
+        if name.startswith("vehicle.") and not self._config.vehicle.DRIVES:
+            raise ConfigError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
         try:
             faults.require(name)
         except ValueError as error:
