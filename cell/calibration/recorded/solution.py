@@ -39,6 +39,8 @@ from drivers.errors import RefusedError
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
 OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
+LIKELY_LASER = 0.5
+"""Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
 
 
@@ -160,6 +162,20 @@ def solve_frames(
     if result["light_plane"] is None and result["hand_eye"] is None:
         checks += _report_plane(stops, chosen, result)
     apply_checks(checks, result)
+
+
+def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
+    """Where few pictures show a line, and these are of no plane, there may be no laser: that is noted, not refused."""
+    frames = used(frames)
+    why, lit = result["refused"].get("light_plane"), [f for f in frames if f.profile is not None]
+    asked = result["laser"]["asked"] != "auto" or any(f.stripe_from for f in lit)
+    if why is None or asked or "intrinsics" in result["refused"] or len(lit) >= LIKELY_LASER * len(frames):
+        return
+    del result["refused"]["light_plane"]
+    result["notes"].append(
+        f"no light plane: {len(lit)} of {len(frames)} pictures show a line that might be a laser's, and these lines "
+        f"are of no light plane: {why}. Where there was a laser, name its colour with --laser"
+    )
 
 
 def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
