@@ -225,7 +225,7 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
     rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
-    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known)
+    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known, len(chain.stripes))
     apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
     tilt = math.degrees(known.tilt)
     made.append(

@@ -150,7 +150,8 @@ def with_doubt_of_camera(choice: Choice, pictures: Intrinsics) -> tuple[Choice, 
     if other is None or choice.best.camera_free:
         return choice, pictures
     apart = other.adjusted.state.camera.parameters - pictures.camera.parameters
-    if not np.any(np.abs(apart[:4]) > BENT_SIGMAS * np.hypot(pictures.sigma[:4], other.sigma[CAMERA][:4])):
+    # Both follow the same pictures: the larger deviation is what they may differ by.
+    if not np.any(np.abs(apart[:4]) > BENT_SIGMAS * np.maximum(pictures.sigma[:4], other.sigma[CAMERA][:4])):
         return choice, pictures
     covariance = pictures.covariance + 0.25 * np.outer(apart, apart)
     doubted = replace(pictures, covariance=covariance, sigma=np.hypot(pictures.sigma, 0.5 * apart))
