@@ -250,9 +250,10 @@ def angles_about_fixed_z_y_x(folder: Path) -> None:
 
 
 def program_of_the_arm(folder: Path) -> None:
+    turns = [Rotation.from_matrix(p[:3, :3]).as_rotvec() for p in POSES]
     moves = [
-        f"  movel(p[{row(np.r_[p[:3, 3], angles(p, 'rotvec', False)], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)"
-        for p in POSES
+        f"  movel(p[{row(np.r_[p[:3, 3], turn], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)"
+        for p, turn in zip(POSES, turns, strict=True)
     ]
     start = "def photographs():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movej([0.1, -1.5, 1.5, -1.5, -1.5, 0])\n"
     (folder / "photographs.script").write_text(start + "\n".join(moves) + "\nend\n")
