@@ -19,7 +19,7 @@ from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, Vehicle, why_untold
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, SaysHowKnown, Vehicle, why_untold
 
 PINGS = 100
 
@@ -153,7 +153,8 @@ def _vehicle_state(vehicle: Vehicle) -> str:
     # The brake's feedback is not on the bus.
     brake = {None: "brake unknown", True: "braked", False: "brake open"}[state.braked]
     errors = "; ".join(state.trouble) or f"errors {state.error_bits:#06x}"
-    return f"{brake}, {state.battery_volts:.1f} V, {errors}"
+    volts = "" if state.battery_volts is None else f"{state.battery_volts:.1f} V, "
+    return f"{brake}, {volts}{errors}"
 
 
 def _camera_state(camera: Camera) -> str:
@@ -166,7 +167,9 @@ def _camera_state(camera: Camera) -> str:
 
 
 def _laser_state(laser: Laser) -> str:
-    return "ON" if laser.is_on else "off"
+    how = laser.how_known if isinstance(laser, SaysHowKnown) else ""
+    # What nobody can ask, a look that sends nothing cannot know.
+    return f"not known now; {how}" if how else "ON" if laser.is_on else "off"
 
 
 def _claw_state(claw: Claw) -> str:

@@ -95,7 +95,10 @@ class ArmSetup:
 
 @dataclass(frozen=True)
 class RailSetup:
-    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each."""
+    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each.
+
+    `serial` is the number by which the cell knows it; None where it tells its own.
+    """
 
     lead: float
     steps_per_turn: int
@@ -104,13 +107,15 @@ class RailSetup:
     max_speed: float
     acceleration: float
     even: Callable[[Vector, Vector, Vector], EvenMotion]
+    serial: str | None = None
 
 
 @dataclass(frozen=True)
 class VehicleSetup:
     """Limits in m/s and rad/s; `trouble` tells error bits in words, `error` makes a fault of them.
 
-    `error` takes the device's name, its error bits, their words, and whether it was driven lately.
+    `error` takes the device's name, its error bits, their words, and whether it was driven lately. `make` is what it
+    calls itself, `count` the way of a side, m, that its counters count in.
     """
 
     max_speed: float
@@ -118,6 +123,8 @@ class VehicleSetup:
     odometry: Odometry
     trouble: Callable[[int], tuple[str, ...]]
     error: Callable[[str, int, tuple[str, ...], bool], DeviceFault]
+    make: str
+    count: float
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,9 @@ def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
         serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)
-    closed = 1 << drawn.claw_output
-    arm.write_digital_outputs(closed, closed)
+    if drawn.claw_output is not None:
+        closed = 1 << drawn.claw_output
+        arm.write_digital_outputs(closed, closed)
     return arm
 
 
@@ -66,7 +67,10 @@ def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
 
 
 def make_vehicle(scene: Scene) -> VehicleModel:
-    """The vehicle standing at its start; its drift sideways and in yaw follow the odometry's errors."""
+    """The vehicle standing at its start, braked for good where it is a fixed frame.
+
+    Its drift sideways and in yaw follow the odometry's errors.
+    """
     start = scene.world_from_vehicle_start
     yaw = float(np.arctan2(start[1, 0], start[0, 0]))
     params = VehicleParams(
@@ -77,7 +81,10 @@ def make_vehicle(scene: Scene) -> VehicleModel:
         lateral_walk=0.1 * scene.deviations.odometry_scale,
         yaw_walk=0.1 * scene.deviations.odometry_yaw,
     )
-    return VehicleModel(params, stream(scene.seed, "vehicle"))
+    model = VehicleModel(params, stream(scene.seed, "vehicle"))
+    if scene.drawing.cell.fixed:
+        model.set_brake(0.0, True)
+    return model
 
 
 def camera_spec(scene: Scene, camera: str) -> CameraSpec:
