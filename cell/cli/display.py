@@ -109,7 +109,7 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
     console = Console(highlight=False)
     if not rows:
         console.print("no run yet")
-    whats = [" ".join(str(word) for word in (row["kind"], row["job"]) if word) for row in rows]
+    whats = [" ".join(str(word) for word in (row["kind"], row["job"], _simulated(row)) if word) for row in rows]
     wide = max(map(len, whats), default=0)
     for row, what in zip(rows, whats, strict=True):
         begun = str(row["started"] or "")[:16].replace("T", " ")
@@ -121,6 +121,11 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
         console.print(before, end="", markup=False)
         console.print(ended, end="", style=COLOURS.get(str(row["outcome"])), markup=False)
         console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
+
+
+def _simulated(row: Mapping[str, Any]) -> str:
+    which = row.get("simulated")
+    return f"(sim {','.join(which)})" if isinstance(which, list) else "(sim)" if which else ""
 
 
 def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:

@@ -6,7 +6,7 @@ What cannot be simulated as it is described is refused here, before anything is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +52,13 @@ class Described:
         """The job of that file or name. Raises `ConfigError`."""
         return cls(*load_job(job))
 
-    def drawing(self, config: CellConfig) -> Drawing:
+    def drawing(self, config: CellConfig, simulated: Collection[str] = tuple(DEVICES)) -> Drawing:
         """The cell of the configuration with this job's station; the stock cell, to the last bit, where it is that.
 
-        Raises `ConfigError`, with a line for each value, for what nothing simulates.
+        Raises `ConfigError`, with a line for each value, for what nothing simulates; real devices beside the
+        `simulated` ones may be of any make.
         """
-        problems = [*_makes(config), *_boards(config, self.job)]
+        problems = [*_makes(config, simulated), *_boards(config, self.job)]
         if not problems:
             problems = [*_cameras(config, self.job), *_outputs(config), *_table(self.job, self.mesh)]
         if problems:
@@ -70,8 +71,11 @@ class Described:
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:
     arm, rail, laser, claw = config.arm, config.rail, config.laser, config.claw
-    assert isinstance(rail, TmclRailConfig) and isinstance(laser, ArmOutputLaserConfig)
-    assert isinstance(claw, ArmOutputClawConfig)
+    # A real rail, laser or claw of another make is followed: how it is driven does not show.
+    steps = rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
+    stock = STOCK.cell.laser_output, STOCK.cell.claw_output, STOCK.cell.grip_input
+    lit = laser.output if isinstance(laser, ArmOutputLaserConfig) else stock[0]
+    closed, grip = (claw.output, claw.feedback) if isinstance(claw, ArmOutputClawConfig) else stock[1:]
     low, high = rail.travel
     margin = 0.1 * (high - low)
     return drawn.CellDrawing(
@@ -79,15 +83,15 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         payload=arm.payload,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=TURNS_WIDER * config.vehicle.track,
-        rail=drawn.RailDrawing(rail.lead, rail.steps_per_turn, rail.travel, (low + margin, high - margin)),
+        rail=drawn.RailDrawing(rail.lead, steps, rail.travel, (low + margin, high - margin)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,
         tan_theta=laser.tan_theta,
         witness=_witness(config),
-        laser_output=laser.output,
-        claw_output=claw.output,
-        grip_input=claw.feedback,
+        laser_output=lit,
+        claw_output=closed,
+        grip_input=grip,
         fine_board=config.calibration.fine.board,
         base_from_fine_board=_matrix(config.calibration.fine.base_from_board.se3()),
         deck_board=config.calibration.large.board,
@@ -142,8 +146,8 @@ def _matrix(pose: pin.SE3) -> NDArray[np.float64]:
 # --- what nothing simulates ---
 
 
-def _makes(config: CellConfig) -> Iterator[str]:
-    for name in DEVICES:
+def _makes(config: CellConfig, simulated: Collection[str]) -> Iterator[str]:
+    for name in simulated:
         make = config.make(name)
         if make.simulated is None:
             yield (
@@ -207,7 +211,8 @@ def _blur_px(camera: CameraConfig, focus: float, depth: float) -> float:
 
 def _outputs(config: CellConfig) -> Iterator[str]:
     laser, claw = config.laser, config.claw
-    assert isinstance(laser, ArmOutputLaserConfig) and isinstance(claw, ArmOutputClawConfig)
+    if not isinstance(laser, ArmOutputLaserConfig) or not isinstance(claw, ArmOutputClawConfig):
+        return
     if laser.output == claw.output:
         yield f"laser.output and claw.output are both {laser.output}; each has an output of its own"
 

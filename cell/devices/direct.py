@@ -6,7 +6,7 @@ be proven there as well. Everything above the devices' interfaces is the product
 
 from __future__ import annotations
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from cell.device_config import MOST_PAYLOAD, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
@@ -41,6 +41,7 @@ class VirtualCell(DirectCell):
             super().__init__(setup_of(config), seed, level, drawing)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
         self.devices: Devices = behind_gate(

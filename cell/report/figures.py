@@ -29,3 +29,10 @@ def _digits(value: float | None) -> str:
     if value == int(value) and abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def simulated_words(simulated: object) -> str:
+    """What a report says of simulated devices, for people: "" where all are real."""
+    if not simulated:
+        return ""
+    return f"{', '.join(map(str, simulated))} simulated, all else real" if isinstance(simulated, list) else "simulated"

@@ -9,6 +9,9 @@ from typing import Any
 
 from cell.calibration import sessions
 from cell.calibration.store import CellCalibration
+from cell.config import DEVICES
+from cell.devices.mix import beware
+from cell.devices.simulated import is_whole
 from cell.opened import Opened
 from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.ready_job import ReadyJob
@@ -41,6 +44,9 @@ class JobWork:
         def note(text: str) -> None:
             run.tell(Event("note", None, {"text": text}))
 
+        if (simulated := cell.simulated) is not None and not is_whole(simulated):
+            for sentence in beware(simulated.simulated, DEVICES):
+                note(sentence)
         if self.at_start:
             cell.whereabouts.say_at_start()
         calibration = self.stored
