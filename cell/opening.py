@@ -11,8 +11,6 @@ from cell.config import (
     Confirm,
     beside,
     config_to_open,
-    find_config,
-    load_config,
     require_real_addresses,
 )
 from cell.devices.assembly import connect, connected_for
@@ -43,7 +41,7 @@ def open_devices(
     if clock not in ("wall", "virtual"):
         raise ConfigError(f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait')
     given = None if config is None else Path(config)
-    names = simulated_of(sim, load_config(find_config(given, simulated=sim == "all")))
+    names = simulated_of(sim, given)
     whole = set(names) == set(DEVICES)
     if clock == "virtual" and (not whole or speed is not None):
         wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'

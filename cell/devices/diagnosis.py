@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import DEVICES, CellConfig, config_to_open, find_config, load_config, require_real_addresses
+from cell.config import DEVICES, CellConfig, config_to_open, require_real_addresses
 from cell.devices import assembly
 from cell.devices.examination import examine
 from cell.devices.mix import Sim, simulated_of
@@ -75,7 +75,7 @@ def diagnose(
     """
     if unknown := [name for name in only if name not in DEVICES]:
         raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
-    names = simulated_of(sim, load_config(find_config(path, simulated=sim == "all")))
+    names = simulated_of(sim, path)
     whole = set(names) == set(DEVICES)
     _, config = config_to_open(path, simulated=whole)
     if not whole:

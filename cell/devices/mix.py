@@ -7,8 +7,9 @@ nothing follows a simulated device: what it would need of those is refused, not 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
-from cell.config import DEVICES, CellConfig
+from cell.config import DEVICES, CellConfig, find_config, load_config
 from drivers.errors import ConfigError
 
 Sim = str | Sequence[str] | None
@@ -21,17 +22,17 @@ NEEDS = {
 """What has to be real where a camera is real: it carries the camera, lights its picture or finds its station."""
 
 
-def simulated_of(sim: Sim, config: CellConfig) -> tuple[str, ...]:
-    """The names of the devices to simulate, in the cell's order. Raises `ConfigError` for a name that is none."""
+def named(sim: Sim) -> tuple[str, ...] | None:
+    """The devices that `sim` asks to simulate, in the cell's order; None where it leaves that to the configuration.
+
+    Raises `ConfigError` for a name that is none.
+    """
     if sim is None:
-        names: Sequence[str] = config.cell.sim
-    elif isinstance(sim, str):
-        names = [word.strip() for word in sim.split(",") if word.strip()]
-    else:
-        names = sim
-    if list(names) == ["all"]:
+        return None
+    names = [word.strip() for word in sim.split(",") if word.strip()] if isinstance(sim, str) else list(sim)
+    if names == ["all"]:
         return tuple(DEVICES)
-    if list(names) == ["none"]:
+    if names == ["none"]:
         return ()
     if unknown := [name for name in names if name not in DEVICES]:
         raise ConfigError(
@@ -39,6 +40,13 @@ def simulated_of(sim: Sim, config: CellConfig) -> tuple[str, ...]:
             f"{', '.join(DEVICES)}"
         )
     return tuple(name for name in DEVICES if name in names)
+
+
+def simulated_of(sim: Sim, config: Path | None) -> tuple[str, ...]:
+    """As `named`, else what `cell.sim` of this configuration's file names. Raises `ConfigError`."""
+    if (names := named(sim)) is not None:
+        return names
+    return named(load_config(find_config(config)).cell.sim) or ()
 
 
 def require_possible(config: CellConfig, simulated: Collection[str], needed: Collection[str]) -> None:

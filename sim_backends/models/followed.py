@@ -77,23 +77,23 @@ class Track:
         return float(0.5 * (t1 - t0) * bend)
 
     def _around(self, t: float) -> list[tuple[float, Vector]]:
-        """The two readings around `t` and one more on either side, the outermost again where there is none."""
+        """The two readings around `t`, and on either side another one that is half as far away as those are apart:
+        nearer ones would tell of the readings' noise more than of a bend. The outermost again where there is none."""
         with self._lock:
             if not self._rows:
                 raise LookupError("nothing was told of this device yet")
-            found: list[tuple[float, Vector]] = []
+            newer: list[tuple[float, Vector]] = []
             # Readers ask for the latest few milliseconds.
-            for row in reversed(self._rows):
-                found.append(row)
-                if row[0] <= t:
-                    older = len(self._rows) - len(found)
-                    found.append(self._rows[older - 1] if older > 0 else row)
-                    break
-        if found[0][0] <= t:
-            return [found[1], found[0], found[0], found[0]]
-        if found[-1][0] > t:
-            return [found[-1]] * 4
-        return [found[-1], found[-2], found[-3], found[max(0, len(found) - 4)]]
+            rows = reversed(self._rows)
+            before = next(rows)
+            while before[0] > t and (older := next(rows, None)) is not None:
+                newer.append(before)
+                before = older
+            after = newer[-1] if newer and before[0] <= t else before
+            away = 0.5 * (after[0] - before[0])
+            first = next((row for row in rows if row[0] <= before[0] - away), before)
+            last = next((row for row in reversed(newer) if row[0] >= after[0] + away), after)
+        return [first, before, after, last]
 
 
 class FollowedArm(ArmModel):
