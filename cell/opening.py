@@ -47,6 +47,8 @@ def open_devices(
         wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'
         raise ConfigError(f'clock="virtual": {wrong}; leave that out')
     path, loaded = config_to_open(given, simulated=whole, confirm=confirm)
+    # So that whatever keeps the configuration keeps what was simulated.
+    loaded = loaded.model_copy(update={"cell": loaded.cell.model_copy(update={"sim": names})})
     folder = beside(path)
     # The world takes long to load, and real devices have none; over wires it is in another process.
     if clock == "virtual":

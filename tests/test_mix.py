@@ -22,7 +22,7 @@ IMPOSSIBLE = {
     "laser": "scan_camera is real: its pictures show nothing of what laser only simulated would do",
     "rail": "scan_camera is real",
     "target_camera": "scan_camera is real",
-    "vehicle": "scan_camera is real: its pictures show nothing of what vehicle only simulated would do\n  target_camera",
+    "vehicle": "show nothing of what vehicle only simulated would do\n  target_camera is real",
     "arm": "laser is real and hangs on the arm's output, and the arm is simulated",
     "scan_camera,vehicle": "target_camera is real",
     "scan_camera,laser,claw,arm": "target_camera is real",
@@ -67,10 +67,10 @@ def test_a_person_is_told_what_is_simulated_and_what_that_means() -> None:
     assert any("posture is simulated" in text for text in beware((*CAMERAS, "arm"), tuple(DEVICES)))
 
 
-def _written(tmp_path, **cell: str):
-    lines = "".join(f"{key} = {value}\n" for key, value in cell.items())
-    (tmp_path / "cell.toml").write_text(default_toml().replace("[cell]\n", f"[cell]\n{lines}"), encoding="utf-8")
-    return tmp_path / "cell.toml"
+def _written(tmp_path, sim: str = "[]"):
+    path = tmp_path / "cell.toml"
+    path.write_text(default_toml().replace("sim = []", f"sim = {sim}"), encoding="utf-8")
+    return path
 
 
 def test_the_configuration_names_them_and_a_real_device_at_an_example_address_is_refused(tmp_path) -> None:
