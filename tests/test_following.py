@@ -115,6 +115,19 @@ def test_of_a_moment_that_nobody_told_of_there_is_no_picture(pair: tuple[World, 
     assert told.figures()["devices"]["rail"]["readings"] > 50
 
 
+def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World, World, Following]) -> None:
+    """The arm turned by 0.3 rad between two readings that are 0.2 s apart, and stood before and after."""
+    real, _, told = pair
+    t = told._tracks["arm"].until
+    told.tell("vehicle", [[t + at, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0] for at in (0.1, 3.0)])
+    for at, turned in ((0.5, 0.0), (0.7, 0.0), (0.9, 0.3), (1.1, 0.3)):
+        told.tell("arm", [[t + at, *(real.arm.drive.q + turned), 0.0, 0.0]])
+    told.require("target", t + 0.6)
+    told.require("target", t + 1.0)
+    with pytest.raises(NotFollowed, match="where the arm was is not known: two readings of it are 200 ms apart"):
+        told.require("target", t + 0.8)
+
+
 def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(pair: tuple[World, World, Following]) -> None:
     real, follower, told = pair
     t = told._tracks["arm"].until + 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,11 @@ def serial_numbers(devices: Devices) -> dict[str, str]:
         "target_camera": devices.target_camera,
     }
     simulated = () if devices.following is None else devices.following.simulated
-    serials = {name: device.identity().serial for name, device in owners.items()}
+    return marked({name: device.identity().serial for name, device in owners.items()}, simulated)
+
+
+def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
+    """Serial numbers by device name, with those of the `simulated` ones marked as such."""
     return {name: f"simulated-{serial}" if name in simulated else serial for name, serial in serials.items()}
 
 

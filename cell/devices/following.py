@@ -18,16 +18,11 @@ import pinocchio as pin
 from cell.config import CellConfig
 from cell.devices.built_in import OnArm
 from cell.devices.devices import Devices
-from cell.devices.gated import GatedArm
+from cell.devices.feeds import AT_REST_S, PERIOD_S, ArmFeed, Feed, RailFeed, SwitchFeed, VehicleFeed
 from cell.devices.world_link import WorldLink
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmState, Vector
 
-PERIOD_S, AT_REST_S = 0.008, 0.02
-"""Wall seconds between two looks for readings, of what moves and of what stands; the world waits for them with its
-pictures."""
-FINEST_S = 0.0039
-"""Of an arm's states, which come each 2 ms, so many are told while it moves."""
 LATEST_S = 0.25
 """Wall seconds after which, at the 99th percentile, a reading is in the world: pictures wait that long."""
 TRIAL_S = 1.0
@@ -35,8 +30,6 @@ LOOK_S = 0.5
 """Wall seconds between two looks whether the world made all its pictures."""
 MOST_SCATTER = 3.0
 """Times a rail position's stated deviation that the readings of a sweep, which its pictures follow, may scatter."""
-DRIFT = 100e-6
-"""Of a device's clock, until its readings come anew."""
 _KEPT = 30_000
 
 log = logging.getLogger(__name__)
@@ -58,17 +51,17 @@ class Following:
         self._link, self._devices, self._clock = link, devices, devices.clock
         self._closed = threading.Event()
         self._ahead = self._compare_clocks()
-        self._device_ahead: float | None = None
         self._wrenches: deque[tuple[float, Vector]] = deque(maxlen=_KEPT)
         self._felt = threading.Condition()
-        feeds: dict[str, Callable[[WorldLink], None]] = {
-            "arm": self._feed_arm,
-            "rail": self._feed_rail,
-            "vehicle": self._feed_vehicle,
-            "laser": self._feed_laser,
-            "claw": self._feed_claw,
+        feeds: dict[str, Callable[[], Feed]] = {
+            "arm": lambda: self._arm,
+            "rail": lambda: RailFeed(devices),
+            "vehicle": lambda: VehicleFeed(devices),
+            "laser": lambda: SwitchFeed(devices, lambda: devices.laser.is_on),
+            "claw": lambda: SwitchFeed(devices, lambda: devices.claw.holding),
         }
         if "arm" in followed:
+            self._arm = ArmFeed(devices)
             table = devices.arm.link_table()
             rows = (
                 None
@@ -81,7 +74,7 @@ class Following:
             )
             self._link.ask(op="begin", table=rows, outputs=bits)
         self._threads = [
-            threading.Thread(target=self._feed, args=(name, feeds[name]), name=f"following {name}", daemon=True)
+            threading.Thread(target=self._feed, args=(name, feeds[name]()), name=f"following {name}", daemon=True)
             for name in followed
         ]
         self._threads.append(threading.Thread(target=self._say_why_not, name="following pictures", daemon=True))
@@ -115,9 +108,10 @@ class Following:
     def require_paired(self, scatter: float, allowed: float) -> None:
         """The pictures of a sweep were made at the rail's readings, each of which is off by `scatter` m (95 %).
 
-        Raises `DeviceFault` (sim.scattered) when that is more than `allowed`. A simulated rail is exact.
+        Raises `DeviceFault` (sim.scattered) when that is more than `allowed`. Where rail and scan camera are both real,
+        or both simulated, nothing is followed.
         """
-        if "rail" not in self.simulated and scatter > allowed:
+        if "rail" not in self.simulated and "scan_camera" in self.simulated and scatter > allowed:
             raise DeviceFault(
                 "rail",
                 "sim.scattered",
@@ -138,7 +132,7 @@ class Following:
         """The same at each of these states, once it is known; DeviceFault (sim.late) when it does not come."""
         if not states:
             return []
-        times = [self._arm_time(state) for state in states]
+        times = [self._arm.time(state) for state in states]
         with self._felt:
             if not self._felt.wait_for(lambda: self._wrenches and self._wrenches[-1][0] >= times[-1] - 1e-3, 2.0):
                 raise self._late("what the simulated part touches is not told any more")
@@ -186,14 +180,18 @@ class Following:
             hint="End programs that keep this computer busy, then open the cell again.",
         )  # fmt: skip
 
-    def _feed(self, name: str, feed: Callable[[WorldLink], None]) -> None:
+    def _feed(self, name: str, feed: Feed) -> None:
         """Until closed; a device that does not answer for a while leaves a gap, in which there are no pictures."""
-        link = WorldLink(self._link.address)
         said = ""
         try:
-            while not self._closed.is_set():
+            link = WorldLink(self._link.address)
+        except CellError as error:
+            log.warning("%s", error)
+            return
+        try:
+            while not self._closed.wait(0.05):
                 try:
-                    feed(link)
+                    self._tell_all(link, name, feed)
                 except CellError as error:
                     if getattr(error, "code", "") == "sim.lost":
                         log.warning("%s", error)
@@ -201,9 +199,24 @@ class Following:
                     if str(error) != said:
                         log.info("following waits: %s", error)
                     said = str(error)
-                self._closed.wait(0.05)
         finally:
             link.close()
+
+    def _tell_all(self, link: WorldLink, name: str, feed: Feed) -> None:
+        period = AT_REST_S if name == "vehicle" else PERIOD_S
+        with feed.open() as newest:
+            while not self._closed.wait(period):
+                if not (rows := newest()):
+                    continue
+                told = [[row[0] + self._ahead, *row[1:]] for row in rows]
+                wrenches = link.ask(op="tell", device=name, rows=told)["wrenches"]
+                if name == "arm":
+                    with self._felt:
+                        self._wrenches.extend((row[0], np.array(w)) for row, w in zip(rows, wrenches, strict=True))
+                        self._felt.notify_all()
+                if name == "rail" and len(rows) == 1:
+                    # It rests.
+                    self._closed.wait(AT_REST_S - PERIOD_S)
 
     def _say_why_not(self) -> None:
         """A picture that was not made is a frame that does not come: the log says why."""
@@ -216,100 +229,3 @@ class Following:
             if figures["not_made"] > told:
                 log.warning("the simulated world made no picture: %s", figures["why_not"])
             told = figures["not_made"]
-
-    def _tell(self, link: WorldLink, device: str, rows: list[list[float]]) -> list[list[float]]:
-        """Rows begin with host time."""
-        if not rows:
-            return []
-        told = [[row[0] + self._ahead, *row[1:]] for row in rows]
-        wrenches: list[list[float]] = link.ask(op="tell", device=device, rows=told)["wrenches"]
-        return wrenches
-
-    def _arm_time(self, state: ArmState) -> float:
-        """Host time at which a state held: by the arm's own clock, which the way over the wire does not jolt."""
-        if state.device_time <= 0.0:
-            return state.stamp
-        ahead = state.stamp - state.device_time
-        if self._device_ahead is None or abs(ahead - self._device_ahead) > 1.0:
-            self._device_ahead = ahead
-        return state.device_time + self._device_ahead
-
-    def _learn_arm_clock(self, state: ArmState) -> None:
-        """The state that came fastest tells the arm's clock; what its clock drifts meanwhile is allowed for."""
-        if state.device_time > 0.0 and self._device_ahead is not None:
-            self._device_ahead = min(self._device_ahead + DRIFT * PERIOD_S, state.stamp - state.device_time)
-
-    def _feed_arm(self, link: WorldLink) -> None:
-        newest, outputs = -np.inf, -1
-        arm = self._devices.arm
-        # Its own force alone: what the simulated part touches is what comes back from here.
-        with (arm.bare if isinstance(arm, GatedArm) else arm).record() as states:
-            while not self._closed.wait(PERIOD_S):
-                batch = list(states)
-                del states[: len(batch)]
-                rows: list[list[float]] = []
-                for k, state in enumerate(batch):
-                    t = self._arm_time(state)
-                    self._learn_arm_clock(state)
-                    told = k == len(batch) - 1 or (state.moving and t - newest >= FINEST_S)
-                    if not told and state.digital_outputs == outputs:
-                        continue
-                    newest, outputs = t, state.digital_outputs
-                    rows.append(
-                        [t, *(float(q) for q in state.joints), float(state.moving), float(state.digital_outputs)]
-                    )
-                found = self._tell(link, "arm", rows)
-                with self._felt:
-                    self._wrenches.extend((row[0], np.array(wrench)) for row, wrench in zip(rows, found, strict=True))
-                    self._felt.notify_all()
-
-    def _feed_rail(self, link: WorldLink) -> None:
-        """A sweep's readings as they come; at rest, where the last motion has brought it: nothing else moves it.
-
-        It is not asked while it rests, nor while it moves without being recorded: that would take its line's time.
-        """
-        rail = self._devices.rail
-        moved = seen = rail.motion
-        told, position = 0, rail.state().position
-        looked = self._clock.now()
-        while not self._closed.wait(PERIOD_S):
-            before, looked = looked, self._clock.now()
-            motion = rail.motion
-            if motion is not seen:
-                seen, told = motion, 0
-            if motion is not None and (samples := getattr(motion, "samples", None)) is not None:
-                rows = [[float(t), float(at)] for t, at in samples[told:]]
-                self._tell(link, "rail", rows)
-                told += len(rows)
-            if motion is not None and not motion.done:
-                continue
-            if motion is not moved:
-                state = rail.state()
-                if state.moving:
-                    continue
-                moved, position = motion, state.position
-                # It has ended since the last look, with the carriage at rest: whoever waited for it may expose at once.
-                self._tell(link, "rail", [[before, position]])
-            self._tell(link, "rail", [[self._clock.now(), position]])
-            self._closed.wait(AT_REST_S - PERIOD_S)
-
-    def _feed_vehicle(self, link: WorldLink) -> None:
-        newest = -np.inf
-        while not self._closed.wait(AT_REST_S):
-            state = self._devices.vehicle.state()
-            if state.stamp > newest:
-                newest = state.stamp
-                numbers = (state.stamp, state.x, state.y, state.yaw, state.speed, state.yaw_rate, bool(state.braked))
-                self._tell(link, "vehicle", [[float(number) for number in numbers]])
-
-    def _feed_laser(self, link: WorldLink) -> None:
-        laser = self._devices.laser
-        while not self._closed.wait(PERIOD_S):
-            now = self._clock.now()
-            self._tell(link, "laser", [[now, float(laser.is_on)]])
-
-    def _feed_claw(self, link: WorldLink) -> None:
-        claw = self._devices.claw
-        while not self._closed.wait(PERIOD_S):
-            now = self._clock.now()
-            self._tell(link, "claw", [[now, float(claw.holding)]])

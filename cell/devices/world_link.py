@@ -6,6 +6,7 @@ import json
 import socket
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,8 @@ class WorldLink:
                 self._file.flush()
                 answer: dict[str, Any] = json.loads(self._file.readline())
             except (OSError, ValueError) as error:
+                # An answer that comes after all would be taken for the next request's.
+                self.close()
                 raise self._lost(error) from error
         if not answer.get("ok"):
             raise self._lost(answer.get("error"))
@@ -44,7 +47,8 @@ class WorldLink:
 
     def close(self) -> None:
         """End the connection; idempotent."""
-        self._file.close()
+        with suppress(OSError):
+            self._file.close()
         self._socket.close()
 
     def _lost(self, why: object) -> DeviceFault:
