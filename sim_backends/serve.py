@@ -36,8 +36,8 @@ from sim_backends.peers.following import FollowingPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
-from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
+from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.following import FOLLOWED, Following
 from sim_backends.world.hardware import camera_spec
@@ -92,7 +92,7 @@ class ServedCell:
         self.following = Following(world, [name for name in FOLLOWED if name in follow])
         with contextlib.ExitStack() as bound:
             self._arm = None if "arm" in follow else _bound(bound, RtdePeer(world.arm, clock))
-            self._rail = None if "rail" in follow else _bound(bound, TmclPeer(world.rail, clock))
+            self._rail = None if "rail" in follow else _bound(bound, rail_peer(world))
             self._vehicle = None if "vehicle" in follow else _bound(bound, AgilexPeer(world.vehicle, clock))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
@@ -107,6 +107,9 @@ class ServedCell:
                 for name in CAMERAS
             }
             self._gige = frozenset(gige)
+            self._switches, self._switch_endpoints = switch_peers(world)
+            for switch in self._switches:
+                _bound(bound, switch)
             self._told = _bound(bound, FollowingPeer(world, self.following)) if follow else None
             self._truth = _bound(bound, TruthPeer(self.truth, self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
@@ -155,6 +158,7 @@ class ServedCell:
                 }
                 for name, camera in self._cameras.items()
             },
+            **self._switch_endpoints,
             "truth": {"address": self._truth.address},
             **({"following": {"address": self._told.address}} if self._told else {}),
             "seed": scene.seed,
@@ -196,8 +200,8 @@ class ServedCell:
         return picture(self.world, camera, t_mid, exposure)
 
     def _all(self) -> tuple[_Peer, ...]:
-        every = (self._arm, self._rail, self._vehicle, *self._cameras.values(), self._told, self._truth)
-        return tuple(peer for peer in every if peer is not None)
+        devices = (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches)
+        return tuple(peer for peer in (*devices, self._told, self._truth) if peer is not None)
 
 
 def _bound(stack: contextlib.ExitStack, peer: P) -> P:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,14 @@ def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World
     told.require("target", t + 1.0)
     with pytest.raises(NotFollowed, match="where the arm was is not known: two readings of it are 200 ms apart"):
         told.require("target", t + 0.8)
+
+
+def test_how_late_the_readings_came_is_told_as_it_is_documented(pair: tuple[World, World, Following]) -> None:
+    figures = pair[2].figures()
+    told = {f"following.{key}" for key in figures} | {f"following.devices.*.{key}" for key in figures["devices"]["arm"]}
+    text = (Path(__file__).parents[1] / "docs" / "report.md").read_text(encoding="utf-8")
+    assert {key for key in told - {"following.devices"} if f"`{key}" not in text} == set()
+    assert set(figures["devices"]["arm"]["latency_ms"]) == {"p50", "p99", "most"}
 
 
 def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(pair: tuple[World, World, Following]) -> None:

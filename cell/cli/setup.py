@@ -73,6 +73,8 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     if loaded.cell.sim:
         require_possible(loaded, loaded.cell.sim, DEVICES)
     notes = [f"{key} is the example's, where no device is: write your own" for key in example_addresses(loaded)]
+    records = {name: loaded.device(name) for name in DEVICES}
+    notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {
         "ok": True,
         "cell": loaded.cell.name,

@@ -6,23 +6,28 @@ be proven there as well. Everything above the devices' interfaces is the product
 
 from __future__ import annotations
 
+from typing import Any
+
 from cell.config import DEVICES, CellConfig
-from cell.device_config import MOST_PAYLOAD, of_make
+from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.described import Described
 from cell.devices.devices import Devices
+from cell.devices.rail_makes import ModbusRailConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
+from drivers.quantities import UNTOLD
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+from sim_backends.direct.switches import DirectClaw, DirectLaser
 
 
 class VirtualCell(DirectCell):
@@ -43,10 +48,16 @@ class VirtualCell(DirectCell):
             raise ConfigError(str(error)) from error
         self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
-        laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
+        laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         self.devices: Devices = behind_gate(
             config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
         )
+
+    def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
+        """What hangs on the arm is the product's own driver; anything else is a switch of the world."""
+        if self._config.make(name).on_arm:
+            return connect_one(self._config, name, self.clock, arm=self.arm)
+        return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
         """Raise `ConfigError` for a fault that only a wire can have."""
@@ -69,7 +80,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
-    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
+    arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
             ArmLimits(
@@ -84,12 +95,12 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         RailSetup(
             rail.lead,
-            rail.steps_per_turn,
-            rail.microsteps,
+            *_counted(rail),
             rail.travel,
             rail.max_speed,
             rail.acceleration,
             EvenMotion.of,
+            _serial(rail),
         ),
         VehicleSetup(
             vehicle.max_speed,
@@ -100,3 +111,18 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         CameraSetup(ClockMap, Latch),
     )
+
+
+def _counted(rail: RailConfig) -> tuple[int, int]:
+    """Steps of a turn and microsteps of a step that positions are counted in."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn, 1
+    counted = of_make(rail, TmclRailConfig)
+    return counted.steps_per_turn, counted.microsteps
+
+
+def _serial(rail: RailConfig) -> str | None:
+    """What the driver would tell for a drive that does not tell its serial number; None for one that does."""
+    if isinstance(rail, ModbusRailConfig) and rail.registers.serial is None:
+        return rail.serial or UNTOLD
+    return None

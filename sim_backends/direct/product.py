@@ -95,7 +95,10 @@ class ArmSetup:
 
 @dataclass(frozen=True)
 class RailSetup:
-    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each."""
+    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each.
+
+    `serial` is the number by which the cell knows it; None where it tells its own.
+    """
 
     lead: float
     steps_per_turn: int
@@ -104,6 +107,7 @@ class RailSetup:
     max_speed: float
     acceleration: float
     even: Callable[[Vector, Vector, Vector], EvenMotion]
+    serial: str | None = None
 
 
 @dataclass(frozen=True)

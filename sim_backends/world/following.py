@@ -180,11 +180,11 @@ class Following:
     def _take_laser(self, t: float, values: NDArray[np.float64]) -> list[float]:
         # Whoever switched it waited until it was seen: the new state holds since the reading before.
         since = self._tracks["laser"].until
-        self.switch(self._world.scene.drawing.cell.laser_output, bool(values[0]), since if np.isfinite(since) else t)
+        self._world.switch("laser", bool(values[0]), since if np.isfinite(since) else t)
         return []
 
     def _take_claw(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        self.switch(self._world.scene.drawing.cell.claw_output, bool(values[0]), t)
+        self._world.switch("claw", bool(values[0]))
         return []
 
 
