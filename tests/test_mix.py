@@ -8,6 +8,7 @@ from cell import Cell
 from cell.config import DEVICES, default_toml, load_config
 from cell.devices.built_in import AgilexVehicleConfig
 from cell.devices.mix import beware, followed, named, require_possible
+from cell.report.figures import following_words
 from drivers.errors import ConfigError
 
 CONFIG = load_config(None)
@@ -109,3 +110,10 @@ def test_real_devices_of_any_make_can_be_drawn_beside_simulated_ones() -> None:
     with pytest.raises(ConfigError, match="nothing simulates this make"):
         pot.drawing(fixed)
     assert pot.drawing(fixed, ("scan_camera", "laser")).cell.arm == "UR10e"
+
+
+def test_how_late_real_devices_were_followed_is_shown_in_a_line() -> None:
+    late = {"readings": 9, "latency_ms": {"p50": 7.4, "p99": 31.0, "most": 40.0}, "apart_ms": None}
+    told = {"devices": {"arm": late, "rail": {**late, "latency_ms": None}}, "not_made": 1}
+    assert following_words(told) == "arm 7 ms (99 %: 31); 1 picture not made"
+    assert following_words({"missing": "no answer"}) == "not told: no answer"

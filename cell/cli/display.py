@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from cell.cli.end_screen import duration, end_screen
+from cell.config import DEVICES
 from statemachine.runner import Event
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
@@ -125,7 +126,10 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _simulated(row: Mapping[str, Any]) -> str:
     which = row.get("simulated")
-    return f"(sim {','.join(which)})" if isinstance(which, list) else "(sim)" if which else ""
+    if not isinstance(which, list):
+        return "(sim)" if which else ""
+    real = [name for name in DEVICES if name not in which]
+    return f"(sim all but {','.join(real)})" if len(real) < len(which) else f"(sim {','.join(which)})"
 
 
 def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.job import job_path, shipped_jobs
-from cell.report.figures import shown_limit, shown_value, simulated_words
+from cell.report.figures import following_words, shown_limit, shown_value, simulated_words
 from cell.run.reading import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
@@ -26,7 +26,9 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     head = _cut_lines(f"{outcome}  {report.get('reason', '')}", width, REASON_LINES)
     head.append(_cut(_facts(report), width))
     steps = _steps(report)
-    tail = [*_trouble(report, width), *_labelled("report", _shown_path(folder), width)]
+    followed = report.get("following")
+    late = _labelled("followed", following_words(followed), width) if followed else []
+    tail = [*_trouble(report, width), *late, *_labelled("report", _shown_path(folder), width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
     blanks = 2 if report.get("measured") else 1

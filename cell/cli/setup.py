@@ -72,7 +72,8 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         raise
     if loaded.cell.sim:
         require_possible(loaded, loaded.cell.sim, DEVICES)
-    notes = [f"{key} is the example's, where no device is: write your own" for key in example_addresses(loaded)]
+    examples = [key for key in example_addresses(loaded) if key.partition(".")[0] not in loaded.cell.sim]
+    notes = [f"{key} is the example's, where no device is: write your own" for key in examples]
     records = {name: loaded.device(name) for name in DEVICES}
     notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {

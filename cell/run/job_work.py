@@ -13,6 +13,7 @@ from cell.config import DEVICES
 from cell.devices.mix import beware
 from cell.devices.simulated import is_whole
 from cell.opened import Opened
+from cell.report.figures import following_words
 from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.ready_job import ReadyJob
 from cell.run.resumption import UnfinishedRun
@@ -47,6 +48,8 @@ class JobWork:
         if (simulated := cell.simulated) is not None and not is_whole(simulated):
             for sentence in beware(simulated.simulated, DEVICES):
                 note(sentence)
+            if (following := cell.devices.following) is not None:
+                note(f"readings reach the simulated world after: {following_words(following.figures())}")
         if self.at_start:
             cell.whereabouts.say_at_start()
         calibration = self.stored
