@@ -31,13 +31,13 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.following import FollowingPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.truth import TruthPeer
 from sim_backends.peers.wired import rail_peer, switch_peers
+from sim_backends.peers.wired_vehicle import vehicle_peer
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.following import FOLLOWED, Following
 from sim_backends.world.hardware import camera_spec
@@ -93,7 +93,7 @@ class ServedCell:
         with contextlib.ExitStack() as bound:
             self._arm = None if "arm" in follow else _bound(bound, RtdePeer(world.arm, clock))
             self._rail = None if "rail" in follow else _bound(bound, rail_peer(world))
-            self._vehicle = None if "vehicle" in follow else _bound(bound, AgilexPeer(world.vehicle, clock))
+            self._vehicle = None if "vehicle" in follow else _bound(bound, vehicle_peer(world))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
                     bound,
@@ -150,7 +150,7 @@ class ServedCell:
         return {
             **({"arm": {"address": arm.address}} if arm else {}),
             **({"rail": {"url": rail.url}} if rail else {}),
-            **({"vehicle": {"interface": vehicle.interface, "channel": vehicle.channel}} if vehicle else {}),
+            **({"vehicle": vehicle.endpoint} if vehicle else {}),
             **{
                 f"{name}_camera": {
                     "address": camera.address,

@@ -6,7 +6,6 @@ import pytest
 
 from cell import Cell
 from cell.config import DEVICES, default_toml, load_config
-from cell.devices.built_in import AgilexVehicleConfig
 from cell.devices.mix import beware, followed, named, require_possible
 from cell.report.figures import following_words
 from drivers.errors import ConfigError
@@ -103,13 +102,11 @@ def test_an_unknown_device_in_the_configuration_is_refused(tmp_path) -> None:
 def test_real_devices_of_any_make_can_be_drawn_beside_simulated_ones() -> None:
     from cell.devices.described import Described
 
-    vehicle = CONFIG.vehicle
-    assert isinstance(vehicle, AgilexVehicleConfig)
-    fixed = CONFIG.model_copy(update={"vehicle": vehicle.model_copy(update={"driver": "fixed"})})
-    pot = Described.of("pot")
+    camera = CONFIG.target_camera.model_copy(update={"driver": "v4l2"})
+    bought, pot = CONFIG.model_copy(update={"target_camera": camera}), Described.of("pot")
     with pytest.raises(ConfigError, match="nothing simulates this make"):
-        pot.drawing(fixed)
-    assert pot.drawing(fixed, ("scan_camera", "laser")).cell.arm == "UR10e"
+        pot.drawing(bought)
+    assert pot.drawing(bought, ("scan_camera", "laser")).cell.arm == "UR10e"
 
 
 def test_how_late_real_devices_were_followed_is_shown_in_a_line() -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import calibrate, devices, export, run, runs, setup, sim
+from cell.cli import calibrate, devices, export, new_job, run, runs, setup, sim
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
@@ -46,7 +46,15 @@ def _cell(
     console_log(verbose)
 
 
-for register in (run.register, runs.register, export.register, calibrate.register, devices.register, setup.register):
+for register in (
+    run.register,
+    runs.register,
+    export.register,
+    calibrate.register,
+    devices.register,
+    setup.register,
+    new_job.register,
+):
     register(app)
 app.add_typer(sim.app, name="sim")
 

@@ -67,7 +67,10 @@ def make_rail(scene: Scene, made: type[RailModel] = RailModel) -> RailModel:
 
 
 def make_vehicle(scene: Scene, made: type[VehicleModel] = VehicleModel) -> VehicleModel:
-    """The vehicle standing at its start; its drift sideways and in yaw follow the odometry's errors."""
+    """The vehicle standing at its start, braked for good where it is a fixed frame.
+
+    Its drift sideways and in yaw follow the odometry's errors.
+    """
     start = scene.world_from_vehicle_start
     yaw = float(np.arctan2(start[1, 0], start[0, 0]))
     params = VehicleParams(
@@ -78,7 +81,10 @@ def make_vehicle(scene: Scene, made: type[VehicleModel] = VehicleModel) -> Vehic
         lateral_walk=0.1 * scene.deviations.odometry_scale,
         yaw_walk=0.1 * scene.deviations.odometry_yaw,
     )
-    return made(params, stream(scene.seed, "vehicle"))
+    model = made(params, stream(scene.seed, "vehicle"))
+    if scene.drawing.cell.fixed:
+        model.set_brake(0.0, True)
+    return model
 
 
 def camera_spec(scene: Scene, camera: str) -> CameraSpec:
