@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
-from cell.calibration.collect.timing import collect_timing
+from cell.calibration.collect.timing import collect_timing, look_at_shutter
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.finding import find_calibration
 from cell.calibration.store import (
@@ -28,18 +29,29 @@ from cell.motion.arm_models import kinematics_name
 from cell.opened import Opened
 from cell.run.recorded_work import Hands
 from cell.run.run import Run
-from drivers.interfaces import why_untold
+from drivers.interfaces import Device, why_untold
 from statemachine.step import Event
 
 
 def serial_numbers(devices: Devices) -> dict[str, str]:
-    """Of the devices that a calibration belongs to, by name; asked from the devices themselves."""
-    return {
-        "arm": devices.arm.identity().serial,
-        "rail": devices.rail.identity().serial,
-        "scan_camera": devices.scan_camera.identity().serial,
-        "target_camera": devices.target_camera.identity().serial,
+    """Of the devices that a calibration belongs to, by name; asked from the devices themselves.
+
+    One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
+    other way round.
+    """
+    owners: dict[str, Device] = {
+        "arm": devices.arm,
+        "rail": devices.rail,
+        "scan_camera": devices.scan_camera,
+        "target_camera": devices.target_camera,
     }
+    simulated = () if devices.following is None else devices.following.simulated
+    return marked({name: device.identity().serial for name, device in owners.items()}, simulated)
+
+
+def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
+    """Serial numbers by device name, with those of the `simulated` ones marked as such."""
+    return {name: f"simulated-{serial}" if name in simulated else serial for name, serial in serials.items()}
 
 
 def arm_table(config: CellConfig, devices: Devices) -> str:
@@ -80,7 +92,9 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
         tell(0.96, "solving")
         observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
-        return observations, solve_observations(observations).calibration
+        made = solve_observations(observations).calibration
+        tell(0.98, "looking at the scan camera's shutter")
+        return observations, look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
 
     observations, calibration = cell.recorded(run, "calibration", work)
     save_with_observations(calibration, observations, cell.calibrations_folder)

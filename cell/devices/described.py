@@ -6,7 +6,7 @@ What cannot be simulated as it is described is refused here, before anything is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, RailConfig, of_make
-from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, OnArm, TmclRailConfig
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig
+from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
+from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.geometry.poses import from_parts, transform
 from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job, shipped_mesh
@@ -55,12 +56,13 @@ class Described:
         """The job of that file or name. Raises `ConfigError`."""
         return cls(*load_job(job))
 
-    def drawing(self, config: CellConfig) -> Drawing:
+    def drawing(self, config: CellConfig, simulated: Collection[str] = tuple(DEVICES)) -> Drawing:
         """The cell of the configuration with this job's station; the stock cell, to the last bit, where it is that.
 
-        Raises `ConfigError`, with a line for each value, for what nothing simulates.
+        Raises `ConfigError`, with a line for each value, for what nothing simulates; real devices beside the
+        `simulated` ones may be of any make.
         """
-        problems = [*_makes(config), *_boards(config, self.job)]
+        problems = [*_makes(config, simulated), *_boards(config, self.job)]
         if not problems:
             problems = [*_cameras(config, self.job), *_outputs(config), *_table(self.job, self.mesh)]
         if problems:
@@ -68,7 +70,7 @@ class Described:
                 f"this cell cannot be simulated as it is described (job {self.job.job.name}):\n  "
                 + "\n  ".join(problems)
             )
-        return drawn.settled(Drawing(_cell(config), _station(self.job, self.mesh)), STOCK)
+        return drawn.settled(Drawing(_cell(config), _station(self.job, self.mesh, config.vehicle.DRIVES)), STOCK)
 
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:
@@ -79,7 +81,7 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         arm=arm.model,
         payload=arm.payload,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
-        track=TURNS_WIDER * config.vehicle.track,
+        track=_turning_track(config.vehicle),
         rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
@@ -93,7 +95,8 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         base_from_fine_board=_matrix(config.calibration.fine.base_from_board.se3()),
         deck_board=config.calibration.large.board,
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
-        wires={name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
+        wires=_vehicle(config.vehicle)
+        | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
     )
 
 
@@ -101,7 +104,8 @@ def _steps(rail: RailConfig) -> int:
     """Steps of a turn that a drive counts at its coarsest."""
     if isinstance(rail, ModbusRailConfig):
         return rail.counts_per_turn
-    return of_make(rail, TmclRailConfig).steps_per_turn
+    # A real rail of another make is followed: how it is driven does not show.
+    return rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
 
 
 def _wire(record: DeviceConfig) -> dict[str, Any]:
@@ -120,12 +124,38 @@ def _wire(record: DeviceConfig) -> dict[str, Any]:
     return {}
 
 
-def _station(job: Job, mesh: Path) -> drawn.StationDrawing:
+def _turning_track(vehicle: VehicleConfig) -> float:
+    """The track that counts when it turns: two driven wheels slide by far less sideways than four."""
+    return vehicle.track if isinstance(vehicle, CanopenVehicleConfig) else TURNS_WIDER * vehicle.track
+
+
+def _vehicle(record: VehicleConfig) -> dict[str, Any]:
+    """The vehicle's wire, for its peer; none for the stock cell's."""
+    match record:
+        case FixedVehicleConfig():
+            return {"vehicle": {"make": "fixed"}}
+        case CanopenVehicleConfig():
+            keys = {
+                "left_node", "right_node", "wheel_radius", "gear", "counts_per_turn", "velocity_unit", "left_reversed",
+                "right_reversed",
+            }  # fmt: skip
+            lines = {
+                "brake_bit": record.brake_bit if record.brake == "output" else None,
+                "brake_locks": record.brake_locks == "high",
+                "stop_bit": record.stop_input,
+                "stop_active": record.stop_pressed == "high",
+            }
+            return {"vehicle": {"make": "canopen", **record.model_dump(include=keys), **lines}}
+    return {}
+
+
+def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
     approach, there = job.approach, job.surface
     shipped = _closed_form(job, mesh)
     return drawn.StationDrawing(
         height=-float(approach.target.se3().translation[2]),
-        place_from_start=_matrix(approach.start.se3()),
+        # To a fixed frame the station is brought, to where the job has it.
+        place_from_start=_matrix((approach.start if drives else approach.target).se3()),
         board=job.board.spec,
         place_from_board=_matrix(job.place_from_board),
         place_from_surface=_matrix(there.place_from_surface.se3()),
@@ -167,8 +197,8 @@ def _matrix(pose: pin.SE3) -> NDArray[np.float64]:
 # --- what nothing simulates ---
 
 
-def _makes(config: CellConfig) -> Iterator[str]:
-    for name in DEVICES:
+def _makes(config: CellConfig, simulated: Collection[str]) -> Iterator[str]:
+    for name in simulated:
         make = config.make(name)
         if make.simulated is None:
             yield (

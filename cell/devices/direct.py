@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.described import Described
 from cell.devices.devices import Devices
 from cell.devices.rail_makes import ModbusRailConfig
+from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
@@ -28,6 +29,11 @@ from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
+
+AGILEX_COUNT_M = 0.001
+"""In which AgileX v2 tells the way of a side."""
+_VEHICLES = {"agilex": "AgileX v2", "canopen": "CiA 402"}
+"""What the makes call themselves."""
 
 
 class VirtualCell(DirectCell):
@@ -46,10 +52,12 @@ class VirtualCell(DirectCell):
             super().__init__(setup_of(config), seed, level, drawing)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
+        vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
         self.devices: Devices = behind_gate(
-            config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
+            config, self.clock, self.arm, self.rail, vehicle, self.scan_camera, self.target_camera, laser, claw
         )
 
     def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
@@ -59,7 +67,9 @@ class VirtualCell(DirectCell):
         return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
-        """Raise `ConfigError` for a fault that only a wire can have."""
+        """Raise `ConfigError` for a fault that only a wire can have, or a vehicle where there is none."""
+        if name.startswith("vehicle.") and not self._config.vehicle.DRIVES:
+            raise ConfigError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
         try:
             faults.require(name)
         except ValueError as error:
@@ -79,6 +89,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
+    count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
@@ -104,9 +115,11 @@ def setup_of(config: CellConfig) -> Setup:
         VehicleSetup(
             vehicle.max_speed,
             vehicle.max_yaw_rate,
-            PlanarOdometry(vehicle.track),
+            PlanarOdometry(vehicle.track, count),
             lambda bits: system_trouble(bits, commanded=True),
             lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+            _VEHICLES.get(vehicle.driver, vehicle.driver),
+            count,
         ),
         CameraSetup(ClockMap, Latch),
     )
