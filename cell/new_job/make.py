@@ -19,7 +19,7 @@ from cell.devices.described import Described
 from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job, load_job
 from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
-from cell.new_job.knowledge import known, place_from
+from cell.new_job.knowledge import known, place_from, told_by_few
 from cell.new_job.mesh_file import Drawn, read_drawing
 from cell.new_job.picture import draw_proposal
 from cell.new_job.proposal import Proposal, propose
@@ -96,7 +96,15 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in targets[:2]:
             _copied(there / target.name, target).replace(target)
-    return Made(targets[0], targets[1], targets[2], name, proposal.share, found, (*proposal.notes, *notes))
+    return Made(
+        targets[0],
+        targets[1],
+        targets[2],
+        name,
+        proposal.share,
+        found,
+        (*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)),
+    )
 
 
 def _read(text: str) -> Drawn:
