@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
@@ -52,6 +52,7 @@ class VirtualCell(DirectCell):
             super().__init__(setup_of(config), seed, level, drawing)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
@@ -66,7 +67,9 @@ class VirtualCell(DirectCell):
         return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
-        """Raise `ConfigError` for a fault that only a wire can have."""
+        """Raise `ConfigError` for a fault that only a wire can have, or a vehicle where there is none."""
+        if name.startswith("vehicle.") and not self._config.vehicle.DRIVES:
+            raise ConfigError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
         try:
             faults.require(name)
         except ValueError as error:

@@ -168,8 +168,8 @@ def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
     return Check(
         "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
         f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
-        "points are not those of one plane; are there two lines, something else that shines, or a stripe that is of "
-        "another frame?",
+        "points are not those of one plane; are there two lines, something else that shines, a stripe that is of "
+        "another frame, or a laser that came on while the rows of a rolling shutter were exposed?",
     )  # fmt: skip
 
 
