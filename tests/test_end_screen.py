@@ -212,7 +212,7 @@ def test_the_list_tells_when_what_how_and_how_long(
     journal.close()
     assert run_cell(monkeypatch, "runs", "--json") == 0
     rows = json.loads(capsys.readouterr().out)
-    keys = {"run", "outcome", "job", "seed", "level", "reason", "kind", "started", "duration_s"}
+    keys = {"run", "outcome", "job", "simulated", "seed", "level", "reason", "kind", "started", "duration_s"}
     assert all(set(row) == keys for row in rows)
     kinds = {row["kind"]: row for row in rows}
     assert kinds["calibration"]["duration_s"] == 125.0
@@ -223,7 +223,8 @@ def test_the_list_tells_when_what_how_and_how_long(
     text = capsys.readouterr().out
     assert "2026-03-01 10:00" in text
     assert "2 min  stored" in text
-    assert "31 s  translation along the z" in text
+    assert "job pot (sim)" in text
+    assert "31 s  translation" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
