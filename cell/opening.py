@@ -6,7 +6,7 @@ from collections.abc import Collection
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
-from cell.config import Confirm, beside, config_to_open
+from cell.config import Confirm, beside, config_to_open, load_config
 from cell.devices.assembly import connect, connected_for
 from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.opened import Opened
@@ -29,6 +29,7 @@ def open_devices(
     confirm: Confirm | None,
     only: Collection[str],
     clock: str,
+    truth: str | Path | None = None,
 ) -> Opened:
     """Connect as `Cell.open` says, and raise what it says. What is to be undone if the rest fails goes to `undo`."""
     if sim not in (None, "all"):
@@ -38,21 +39,24 @@ def open_devices(
     if clock == "virtual" and (sim is None or speed is not None):
         wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
         raise ConfigError(f'clock="virtual": {wrong}; leave that out')
+    if truth is not None and sim is None:
+        raise ConfigError("truth describes the cell that is simulated; without sim leave it out")
     path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
     folder = beside(path)
+    true = loaded if truth is None else load_config(Path(truth))
     # The world takes long to load, and real devices have none; over wires it is in another process.
     if clock == "virtual":
         from cell.devices.described import Described
         from cell.devices.direct import VirtualCell
 
-        virtual = VirtualCell(loaded, seed, level, Described.of(job))
+        virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
     simulated = None
     if sim == "all":
         from cell.devices.described import Described
 
         simulated = SimulatedCell(
-            loaded, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
+            true, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
         )
         undo.callback(simulated.close)
         loaded = with_endpoints(loaded, simulated.endpoints)

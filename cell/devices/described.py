@@ -77,9 +77,12 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
     return drawn.CellDrawing(
         arm=arm.model,
         payload=arm.payload,
+        payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=TURNS_WIDER * config.vehicle.track,
-        rail=drawn.RailDrawing(rail.lead, rail.steps_per_turn, rail.travel, (low + margin, high - margin)),
+        rail=drawn.RailDrawing(
+            rail.lead, rail.steps_per_turn, rail.travel, (low + margin, high - margin), rail.reversed
+        ),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,

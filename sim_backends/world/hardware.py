@@ -37,6 +37,7 @@ def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
         harmonics=scene.workshop.harmonics,
         compliance=scene.effects.sag,
         carried=drawn.payload,
+        carried_centre=drawn.payload_centre,
         serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)
@@ -61,6 +62,7 @@ def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
         repeatability=scene.deviations.rail_homing,
         start=float(stream(scene.seed, "rail.start").uniform(*drawn.start)),
         serial=int(scene.serial),
+        reversed=drawn.reversed,
     ).around(drawn.travel)
     return RailModel(params, stream(scene.seed, "rail"))
 
