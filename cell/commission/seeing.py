@@ -1,0 +1,176 @@
+"""Bringing a camera over its board on the deck when nobody knows for sure how it is mounted, and seeing it there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.store import nominal_camera
+from cell.commission.check import Result
+from cell.commission.desk import Desk
+from cell.config import CameraConfig
+from cell.device_config import PlateConfig
+from cell.geometry.camera import CameraModel
+from cell.geometry.poses import from_parts, from_ur
+from cell.steps.camera_poses import centre_of
+from cell.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
+from drivers.errors import CellError, DeviceFault, RefusedError
+from drivers.interfaces import Camera, Frame
+
+TILT = math.radians(15.0)
+"""Of the board against the picture: a board that is seen square tells its own tilt badly."""
+RAIL_STEP = 0.015
+"""How far apart the places are, m, at which a rail that is not homed is thought to stand."""
+PHOTO_RATE = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """A camera with the board on the deck that it calibrates by; `depth` (m) is how far off it looks, `step` (m) how
+    far the flange is shifted at first."""
+
+    name: str
+    config: CameraConfig
+    plate: PlateConfig
+    key: str
+    depth: float
+    step: float
+
+    @property
+    def board(self) -> BoardSpec:
+        """The board as its name in the configuration says it is."""
+        return parse_board(self.plate.board)
+
+    @property
+    def model(self) -> CameraModel:
+        """The camera as the configuration draws it."""
+        return nominal_camera(self.config)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A picture of the board: `base_from_flange` as the arm told it, `camera_from_board` with the board as named."""
+
+    base_from_flange: pin.SE3
+    camera_from_board: pin.SE3
+    view: BoardView
+    frame: Frame
+
+
+def eye_of(desk: Desk, name: str) -> Eye:
+    """The eye "scan_camera" or "target_camera" of the cell."""
+    config = desk.config
+    if name == "scan_camera":
+        return Eye(name, config.scan_camera, config.calibration.fine, "calibration.fine", 0.130, 0.005)
+    return Eye(name, config.target_camera, config.calibration.large, "calibration.large", 0.650, 0.030)
+
+
+def camera_of(desk: Desk, eye: Eye) -> Camera:
+    """Its device."""
+    devices = desk.devices
+    return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
+
+
+def take(desk: Desk, eye: Eye) -> Frame:
+    """A photograph at the configured exposure."""
+    camera = camera_of(desk, eye)
+    camera.configure(eye.config.photo_exposure, PHOTO_RATE)
+    return camera.grab()
+
+
+def see(desk: Desk, eye: Eye) -> Seen:
+    """The board from where the arm stands; `RefusedError` when it is not seen."""
+    frame = take(desk, eye)
+    try:
+        view = find_board(frame.image, eye.board)
+        pose = board_pose(view, eye.model)
+    except RefusedError as refused:
+        raise refused.showing(seen={"frame": frame}) from refused
+    return Seen(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
+
+
+def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
+    """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
+
+    Raises `RefusedError` when it is seen from nowhere.
+    """
+    mover = desk.mover()
+    reasons: list[str] = []
+    tried = 0
+    for what, goal in _candidates(desk, eye):
+        desk.look_around()
+        try:
+            mover.to(goal, what)
+        except DeviceFault:
+            raise
+        except CellError as error:
+            reasons.append(str(error))
+            continue
+        tried += 1
+        try:
+            seen = see(desk, eye)
+        except RefusedError as error:
+            reasons.append(str(error))
+            if (frame := error.seen.get("frame")) is not None and tried == 1:
+                desk.keep(result, f"{eye.name}-sees-no-board", frame)  # type: ignore[arg-type]
+            continue
+        if tried > 1:
+            result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
+        desk.last_views[eye.name] = goal
+        return seen
+    raise RefusedError(
+        f"{eye.name} saw the board {eye.plate.board} from none of {tried} places. See that the lens cap is off, the "
+        f"light on, the lens in focus at {1e3 * eye.depth:.0f} mm, that the board on the deck is the one of "
+        f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reasons[-1] if reasons else ''}"
+    )
+
+
+def _candidates(desk: Desk, eye: Eye) -> Iterator[tuple[str, pin.SE3]]:
+    """Places of the flange to try, with words for each."""
+    if eye.name in desk.last_views:
+        yield "where it was seen last", desk.last_views[eye.name]
+    board = eye.board
+    tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
+    centre = eye.plate.base_from_board.se3() * from_parts(centre_of(board))
+    looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
+    drawn = eye.config.flange_from_camera.se3()
+    for quarters in (0, 2, 1, 3):
+        turn = from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters])))
+        for rail in _rail_places(desk, eye):
+            hand = turn * drawn * from_parts((rail, 0.0, 0.0))
+            words = "as drawn" if quarters == 0 else f"bracket turned by {90 * quarters} deg"
+            where = f", rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else ""
+            yield f"{words}{where}", looking * hand.inverse()
+
+
+def _rail_places(desk: Desk, eye: Eye) -> list[float]:
+    """Where the carriage may stand, m, the middle first."""
+    if eye.name != "scan_camera":
+        return [0.0]
+    state = desk.devices.rail.state()
+    if state.homed_here:
+        return [state.position]
+    low, high = desk.config.rail.travel
+    count = max(1, math.ceil((high - low) / RAIL_STEP))
+    places = [low + (k + 0.5) * (high - low) / count for k in range(count)]
+    return sorted(places, key=lambda place: abs(place - 0.5 * (low + high)))
+
+
+def centred_view(desk: Desk, result: Result, eye: Eye) -> Seen:
+    """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
+
+    For a camera whose axes lie as they are drawn.
+    """
+    seen = find_view(desk, result, eye)
+    at = seen.camera_from_board
+    middle = at.rotation @ centre_of(eye.board) + at.translation
+    hand = eye.config.flange_from_camera.se3()
+    shift = from_parts(hand.rotation @ (middle - np.array([0.0, 0.0, eye.depth])))
+    goal = seen.base_from_flange * shift
+    desk.mover().to(goal, f"{eye.name} above the middle of its board")
+    desk.last_views[eye.name] = goal
+    return see(desk, eye)
