@@ -83,7 +83,6 @@ def commission(
         config,
         _person(by_itself, console),
         _Page(console, CHECKS),
-        lambda text: console.print(text, markup=False),
         **options,
     )
     if show:
@@ -106,7 +105,8 @@ def commission(
     else:
         for entry in made.progress.mended:
             console.print(
-                f"found and mended: {entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}",
+                f"found and mended: {entry['name']}: {entry['what']}; configured {entry['told']}, "
+                f"measured {entry['found']}",
                 style="yellow",
                 markup=False,
             )
@@ -162,7 +162,8 @@ def _list(made: Commissioning, checks: list[Check], console: Console, json: bool
 
     config = load_config(made.path)
     rows = [
-        {"name": check.name, "title": check.title, "standing": made.progress.standing(check, config), "moves": check.moves,
+        {"name": check.name, "title": check.title, "standing": made.progress.standing(check, config),
+         "moves": check.moves,
          "far": check.far, "fast": check.fast, "limit": check.limit, "needs": list(check.needs)}
         for check in checks
     ]  # fmt: skip

@@ -103,7 +103,8 @@ def _payload(desk: Desk, result: Result) -> None:
             Finding(
                 "arm.payload", "the arm carries another weight than it was told, by its force sensor at rest",
                 f"{told:g} kg", f"{carried:.2f} kg with its centre at ({shown}) mm",
-                "Weigh tool and part, and write both; with a wrong one the arm stops for no reason, or feels contact late.",
+                "Weigh tool and part, and write both; with a wrong one the arm stops for no reason, or feels contact "
+                "late.",
                 {
                     "arm.payload": f'"{carried:.1f} kg"',
                     "arm.payload_centre": "[" + ", ".join(f'"{round(1e3 * float(v)):d} mm"' for v in centre) + "]",

@@ -25,7 +25,6 @@ def begin(
     config: Path | None,
     person: Person,
     show: Callable[[Check, str, Result | None], None],
-    tell: Callable[[str], None],
     *,
     job: str,
     sim: str | None = None,
@@ -61,5 +60,5 @@ def begin(
         world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
         which |= {"seed": seed, "level": level, "clock": clock, "world": world}
     folder = path.resolve().parent / FOLDER
-    desk = Desk(partial(Cell.open, path, **options), person, folder, job, tell)
-    return Commissioning(desk, Progress(folder, which), path, show)
+    desk = Desk(path, partial(Cell.open, path, **options), person, folder, job)
+    return Commissioning(desk, Progress(folder, which, desk.job), path, show)

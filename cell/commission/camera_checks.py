@@ -106,7 +106,8 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
         focal = eye.config.focal_length * across / along
         result.find(
             Finding(
-                f"{eye.name}.focal_length", "ways along the optical axis are seen longer or shorter than ways across it",
+                f"{eye.name}.focal_length",
+                "ways along the optical axis are seen longer or shorter than ways across it",
                 f"{1e3 * eye.config.focal_length:.2f} mm", f"{1e3 * focal:.2f} mm",
                 "Read the focal length on the lens and the pixel's size in the camera's data sheet.",
                 {f"{eye.name}.focal_length": f'"{1e3 * focal:.1f} mm"'},

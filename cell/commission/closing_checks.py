@@ -82,11 +82,11 @@ CHECKS = [
     Check(
         "job_empty", "First job, empty claw, up to the place pose", "everything: vehicle, arm, rail, laser",
         "the whole job but placing", "as configured", "done",
-        (*ALL, "cell.name"), ("verification",), partial(_job, False), recorded=False,
+        (*ALL, "job"), ("verification",), partial(_job, False), recorded=False,
     ),
     Check(
         "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", "the whole job",
         "as configured", "placed",
-        (*ALL, "cell.name"), ("job_empty",), partial(_job, True), recorded=False,
+        (*ALL, "job"), ("job_empty",), partial(_job, True), recorded=False,
     ),
 ]  # fmt: skip

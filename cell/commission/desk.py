@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from cell.commission.check import Result
 from cell.commission.person import Person
+from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.job import Job, load_job
 from cell.run.recorded_work import Hands
@@ -42,17 +43,18 @@ class Declined(Exception):
 
 @dataclass
 class Desk:
-    """`open_cell` connects the cell as its file now says. `folder` takes pictures. `tell` says what goes on."""
+    """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures."""
 
+    path: Path
     open_cell: Callable[[], Cell]
     person: Person
     folder: Path
     job_file: str
-    tell: Callable[[str], None]
     hands: Hands | None = None
     last_views: dict[str, pin.SE3] = field(default_factory=dict)
     """base_from_flange at which each camera saw its board last."""
     _cell: Cell | None = None
+    _config: CellConfig | None = None
     _confirmed: set[str] = field(default_factory=set)
 
     # --- the cell ---
@@ -66,8 +68,10 @@ class Desk:
 
     @property
     def config(self) -> CellConfig:
-        """Its configuration."""
-        return self.cell.config
+        """Its configuration as the file has it, read anew after `close`."""
+        if self._config is None:
+            self._config = load_config(self.path)
+        return self._config
 
     @property
     def devices(self) -> Devices:
@@ -81,6 +85,7 @@ class Desk:
 
     def close(self) -> None:
         """Let go of the cell; `cell` opens it again."""
+        self._config = None
         if self._cell is not None:
             cell, self._cell = self._cell, None
             cell.close()

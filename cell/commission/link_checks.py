@@ -9,7 +9,7 @@ from cell.devices.diagnosis import STATES, ask
 
 
 def _links(desk: Desk, result: Result) -> None:
-    devices, config = desk.devices, desk.config
+    devices, config = desk.devices, desk.cell.config
     for name in STATES:
         device = getattr(devices, name)
         row = ask(name, config.device(name).place, getattr(device, "bare", device), devices.clock)

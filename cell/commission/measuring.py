@@ -43,8 +43,8 @@ def measure(desk: Desk, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
         hand = found.flange_from_camera
     if len(seen) < 1 + len(shifted) + LEAST_TURNED:
         raise RefusedError(
-            f"only {len(seen) - 1 - len(shifted)} of 12 turned views show the board, at least {LEAST_TURNED} are needed: "
-            "see that light and lens let the camera see it from the side as well"
+            f"only {len(seen) - 1 - len(shifted)} of 12 turned views show the board, at least {LEAST_TURNED} are "
+            "needed: see that light and lens let the camera see it from the side as well"
         )
     desk.last_views[eye.name] = first.base_from_flange
     return axes, found

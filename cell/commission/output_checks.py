@@ -1,4 +1,4 @@
-"""The arm's outputs: which one lights the laser and which one moves the claw, seen by the camera and by the claw's input.
+"""The arm's outputs: which one lights the laser and which one moves the claw, seen by camera and input.
 
 Each output is switched by itself; what the picture and the inputs do then tells what hangs on it.
 """
@@ -84,7 +84,8 @@ def _outputs(desk: Desk, result: Result) -> None:
     elif by_claw.stripe_rows >= enough and by_laser.stripe_rows < enough:
         result.find(
             Finding(
-                "laser.output, claw.output", "the outputs of laser and claw are swapped: the claw's output lights the laser",
+                "laser.output, claw.output",
+                "the outputs of laser and claw are swapped: the claw's output lights the laser",
                 f"laser {laser}, claw {claw}", f"laser {claw}, claw {laser}",
                 "Swap the two numbers, or the two wires.",
                 {"laser.output": str(claw), "claw.output": str(laser)},
@@ -110,8 +111,8 @@ def _no_light(desk: Desk, result: Result, laser: int, claw: int, enough: float) 
         Finding(
             "laser.output", "no stripe comes when the laser's output is switched on",
             str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
-            "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter is "
-            "open, and that calibration.stripe_exposure is long enough.",
+            "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
+            "is open, and that calibration.stripe_exposure is long enough.",
             {"laser.output": str(lit[0])} if lit else {},
         )
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Whoever stands beside the cell: confirms what is about to move, says what sensors cannot see, does what hands must do.
+"""Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand.
 
 At a simulated cell its own person may answer: what one would see there is known, and hands can be had.
 """

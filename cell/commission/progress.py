@@ -14,6 +14,7 @@ from typing import Any
 
 from cell.commission.check import Check, Result, Verdict
 from cell.config import CellConfig
+from cell.job import Job
 from cell.run.folder import write_json
 from drivers.errors import ConfigError
 
@@ -24,10 +25,11 @@ VERSION = 1
 class Progress:
     """The results so far, in `folder`; `cell` says which cell they are of (name, simulated or not, which world)."""
 
-    def __init__(self, folder: Path, cell: dict[str, Any]) -> None:
-        """Read what is there; `ConfigError` when the file is none."""
+    def __init__(self, folder: Path, cell: dict[str, Any], job: Job) -> None:
+        """Read what is there; `ConfigError` when that is none. `job` is the key "job" of checks."""
         self.folder = folder
         self.cell = cell
+        self._job = job.model_dump(mode="json")
         self._file = folder / FILE
         self._data: dict[str, Any] = {"version": VERSION, "results": {}, "mended": []}
         if self._file.exists():
@@ -83,7 +85,7 @@ class Progress:
 
     def _rests_on(self, check: Check, config: CellConfig) -> str:
         """A hash of all that the result of a check rests on."""
-        dumped = config.model_dump(mode="json")
+        dumped = {**config.model_dump(mode="json"), "job": self._job}
         before = {name: (self.result(name) or {}).get("rests_on") for name in check.needs}
         parts = {"cell": self.cell, "keys": {key: _at(dumped, key) for key in check.keys}, "needs": before}
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

@@ -35,7 +35,8 @@ def write_protocol(progress: Progress, checks: Sequence[Check], config: CellConf
         parts += _check(progress, check, progress.standing(check, config))
     parts.append("<p>Date, name, signature: ______________________________________</p>")
     text = (
-        f"<!doctype html><html lang='en'><meta charset='utf-8'><title>Commissioning of {escape(config.cell.name)}</title>"
+        "<!doctype html><html lang='en'><meta charset='utf-8'>"
+        f"<title>Commissioning of {escape(config.cell.name)}</title>"
         f"<style>{_STYLE}</style><body>{''.join(parts)}</body></html>\n"
     )
     path = progress.folder / FILE
@@ -70,7 +71,8 @@ def _mended(mended: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     yield "<h2>Found and mended</h2>"
     rows = [
         f"<tr><td>{escape(entry['name'])}</td><td>{escape(entry['what'])}</td><td>{escape(entry['told'])}</td>"
-        f"<td>{escape(entry['found'])}</td><td>{escape('; '.join(f'{k} = {v}' for k, v in entry['write'].items()))}</td>"
+        f"<td>{escape(entry['found'])}</td>"
+        f"<td>{escape('; '.join(f'{k} = {v}' for k, v in entry['write'].items()))}</td>"
         f"<td>{escape(entry['check'])}, {escape(entry['when'])}; before: {escape(entry['backup'])}</td></tr>"
         for entry in mended
     ]
@@ -93,14 +95,16 @@ def _check(progress: Progress, check: Check, standing: str) -> Iterable[str]:
         yield f"<table><tr>{head}</tr>{''.join(_row(row) for row in result['readings'])}</table>"
     for finding in result["findings"]:
         told = f"configured {finding['told']}, measured {finding['found']}"
-        yield f"<p class='wrong'><b>{escape(finding['name'])}</b>: {escape(finding['what'])}; {escape(told)}. {escape(finding['remedy'])}</p>"
+        said = escape(f"{finding['what']}; {told}. {finding['remedy']}")
+        yield f"<p class='wrong'><b>{escape(finding['name'])}</b>: {said}</p>"
     for note in result["notes"]:
         yield f"<p>{escape(note)}</p>"
     for picture in result["pictures"]:
         path = progress.folder / picture
         if path.is_file():
             data = base64.b64encode(path.read_bytes()).decode()
-            yield f"<figure><img src='data:image/png;base64,{data}' alt=''><figcaption>{escape(path.stem)}</figcaption></figure>"
+            image = f"<img src='data:image/png;base64,{data}' alt=''>"
+            yield f"<figure>{image}<figcaption>{escape(path.stem)}</figcaption></figure>"
     yield "</section>"
 
 

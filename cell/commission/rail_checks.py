@@ -1,4 +1,4 @@
-"""The rail: which way and how far it goes, seen by the camera that it carries; then its zero, its ends and its limits."""
+"""The rail: which way and how far it goes, seen by its camera; then its zero, its ends and its limits."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def _direction(desk: Desk, result: Result) -> None:
 def _judge(desk: Desk, result: Result, told: float, way: float, moved: np.ndarray) -> None:
     if way < 0.05 * abs(told):
         raise RefusedError(
-            f"the rail counted {1e3 * told:.2f} mm and the camera moved {1e3 * way:.2f} mm: see that the motor has current, "
-            "that the coupling holds, and that the camera rides on the carriage"
+            f"the rail counted {1e3 * told:.2f} mm and the camera moved {1e3 * way:.2f} mm: see that the motor has "
+            "current, that the coupling holds, and that the camera rides on the carriage"
         )
     ahead = moved[0] * np.sign(told) > 0.0
     aslant = math.acos(min(1.0, abs(moved[0]) / way))

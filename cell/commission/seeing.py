@@ -138,13 +138,26 @@ def _candidates(desk: Desk, eye: Eye) -> Iterator[tuple[str, pin.SE3]]:
     centre = eye.plate.base_from_board.se3() * from_parts(centre_of(board))
     looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
     drawn = eye.config.flange_from_camera.se3()
-    for quarters in (0, 2, 1, 3):
-        turn = from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters])))
-        for rail in _rail_places(desk, eye):
-            hand = turn * drawn * from_parts((rail, 0.0, 0.0))
-            words = "as drawn" if quarters == 0 else f"bracket turned by {90 * quarters} deg"
-            where = f", rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else ""
-            yield f"{words}{where}", looking * hand.inverse()
+    rails = _rail_places(desk, eye)
+    # A head that is turned in its place is carried another way; a camera without a rail looks the same way for it.
+    for quarters in (0, 2, 1, 3) if eye.name == "scan_camera" else (0,):
+        turn = _about_z(quarters)
+        for rail in rails:
+            hand = drawn * turn * from_parts((rail, 0.0, 0.0))
+            yield _words("head", quarters, eye, rail), looking * turn * hand.inverse()
+    for quarters in (2, 1, 3):
+        for rail in rails:
+            hand = _about_z(quarters) * drawn * from_parts((rail, 0.0, 0.0))
+            yield _words("bracket", quarters, eye, rail), looking * hand.inverse()
+
+
+def _about_z(quarters: int) -> pin.SE3:
+    return from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters])))
+
+
+def _words(what: str, quarters: int, eye: Eye, rail: float) -> str:
+    words = "as drawn" if quarters == 0 else f"{what} turned by {90 * quarters} deg"
+    return f"{words}, rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else words
 
 
 def _rail_places(desk: Desk, eye: Eye) -> list[float]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from cell.commission.check import Check, Result
 from cell.commission.desk import Desk
 from cell.run.recorded_work import Hands
+from cell.steps.approach import Planar, RelativeOdometry, drive_line
 from drivers.errors import Aborted, CellError, InterlockError
 from drivers.interfaces import ArmSafety, Motion
 
@@ -31,14 +33,16 @@ BY = "the commissioning, which had stopped the cell itself"
 def _stops(desk: Desk, result: Result) -> None:
     desk.fold()
     desk.home_rail()
+    stood = RelativeOdometry(desk.devices.vehicle)
     for name, start in (("rail", _rail_moves), ("arm", _arm_moves), ("vehicle", _vehicle_moves)):
         if name == "vehicle" and not desk.config.vehicle.DRIVES:
             continue
-        for cause, stop in (("Cell.stop()", _by_program), ("`cell abort`", _by_request)):
-            _measured(desk, result, name, cause, start, stop)
+        for sign, cause, stop in ((1.0, "Cell.stop()", _by_program), (-1.0, "`cell abort`", _by_request)):
+            _measured(desk, result, name, cause, partial(start, sign), stop)
     _vehicle_unrenewed(desk, result)
     _laser(desk, result)
     _emergency(desk, result)
+    _drive_back(desk, stood)
 
 
 def _measured(
@@ -58,7 +62,7 @@ def _measured(
         start(desk)
         while desk.devices.clock.now() - begun < BEFORE_S:
             if name == "vehicle":
-                desk.devices.vehicle.drive(VEHICLE_SPEED, 0.0)
+                start(desk)
             desk.devices.clock.sleep(0.05)
         marks["at"], marks["from"] = desk.devices.clock.now(), _place(desk, name)
 
@@ -86,7 +90,7 @@ def _prepare(desk: Desk, name: str) -> None:
     if name == "rail":
         low, high = desk.config.rail.travel
         desk.confirm("rail", "the carriage", "a part of its travel", f"{1e3 * RAIL_SPEED:.0f} mm/s")
-        desk.devices.rail.move_to(low + 0.1 * (high - low), min(RAIL_SPEED, desk.config.rail.max_speed)).wait(60.0)
+        desk.devices.rail.move_to(0.5 * (low + high), min(RAIL_SPEED, desk.config.rail.max_speed)).wait(60.0)
     elif name == "arm":
         desk.confirm(
             "joint 1",
@@ -101,22 +105,36 @@ def _prepare(desk: Desk, name: str) -> None:
         desk.devices.vehicle.enable()
 
 
-def _rail_moves(desk: Desk) -> Motion:
+def _rail_moves(sign: float, desk: Desk) -> Motion:
     low, high = desk.config.rail.travel
-    return desk.devices.rail.move_to(high - 0.1 * (high - low), min(RAIL_SPEED, desk.config.rail.max_speed))
+    goal = 0.5 * (low + high) + sign * 0.4 * (high - low)
+    return desk.devices.rail.move_to(goal, min(RAIL_SPEED, desk.config.rail.max_speed))
 
 
-def _arm_moves(desk: Desk) -> Motion:
+def _arm_moves(sign: float, desk: Desk) -> Motion:
     arm = desk.devices.arm
     if not desk.devices.vehicle.state().braked:
         desk.devices.vehicle.recover()
     goal = arm.state().joints.copy()
-    goal[0] += ARM_STEP
+    goal[0] += sign * ARM_STEP
     return arm.move_joints(goal, ARM_SPEED, math.radians(40.0))
 
 
-def _vehicle_moves(desk: Desk) -> None:
-    desk.devices.vehicle.drive(VEHICLE_SPEED, 0.0)
+def _vehicle_moves(sign: float, desk: Desk) -> None:
+    desk.devices.vehicle.drive(sign * VEHICLE_SPEED, 0.0)
+
+
+def _drive_back(desk: Desk, stood: RelativeOdometry) -> None:
+    """The vehicle to where it stood, by its wheels' counters."""
+    if not desk.config.vehicle.DRIVES:
+        return
+    desk.fold()
+    vehicle = desk.devices.vehicle
+    vehicle.enable()
+    try:
+        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, desk.look_around)
+    finally:
+        vehicle.brake()
 
 
 def _place(desk: Desk, name: str) -> float:
@@ -200,7 +218,7 @@ def _emergency(desk: Desk, result: Result) -> None:
     desk.fold()
     if not desk.devices.vehicle.state().braked:
         desk.devices.vehicle.recover()
-    _arm_moves(desk)
+    _arm_moves(1.0, desk)
     clock.sleep(BEFORE_S)
     begun, before = clock.now(), _place(desk, "arm")
     cause = "emergency stop"
@@ -229,7 +247,7 @@ def _emergency(desk: Desk, result: Result) -> None:
         )
     refused = 0.0
     try:
-        _arm_moves(desk).wait(1.0)
+        _arm_moves(1.0, desk).wait(1.0)
     except CellError:
         refused = 1.0
     result.measure("a motion while it is stopped refused", refused, "", least=1.0)

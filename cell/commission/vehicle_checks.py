@@ -1,4 +1,4 @@
-"""The vehicle: which way and how far its wheels take it, by their counters and, where it is seen, by the station's board."""
+"""The vehicle: which way and how far its wheels take it, by their counters and by the station's board."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.store import nominal_camera
+from cell.commission.camera_checks import PITCH_OFF
 from cell.commission.check import Check, Finding, Result
 from cell.commission.desk import Desk
-from cell.geometry.poses import from_ur
+from cell.commission.mounting import axes_from_shifts
+from cell.geometry.poses import from_parts, from_ur
 from cell.steps.approach import Planar, RelativeOdometry, drive_line
 from cell.steps.camera_poses import look_pose
 from cell.vision import board_pose, find_board, parse_board
-from drivers.errors import RefusedError
+from drivers.errors import CellError, DeviceFault, RefusedError
 
 WAY, SPEED = 0.050, 0.050
 MOST_OFF_MM = 5.0
-MOST_OFF_SHARE = 0.3
-"""By how much, relative, what the camera sees may differ from what the wheels count: from metres away it sees little."""
+MOST_OFF_SHARE = 0.4
+"""By how much, relative, what the camera sees may differ from what the wheels count: from afar it sees little."""
+SHIFT = 0.060
+"""By how much, m, the flange is shifted to measure the station's board, each way."""
 LEAST_SEEN = 0.012
 """A way that the camera sees must be this long, m, to say which way it went."""
 PHOTO_RATE = 10.0
@@ -39,6 +43,8 @@ def _wheels(desk: Desk, result: Result) -> None:
     desk.mover().to(look, "the looking pose")
     desk.confirm("vehicle", "its wheels, straight ahead", f"{1e3 * WAY:.0f} mm and back", f"{1e3 * SPEED:.0f} mm/s")
     before = _board_at(desk, result, "vehicle-before")
+    if before is not None:
+        _pitch(desk, result, look)
     devices.vehicle.enable()
     try:
         odometry = RelativeOdometry(devices.vehicle)
@@ -67,8 +73,8 @@ def _wheels(desk: Desk, result: Result) -> None:
     ratio = float(way[0]) / there.x
     if np.linalg.norm(way) < LEAST_SEEN:
         raise RefusedError(
-            f"the wheels counted {1e3 * there.x:.0f} mm, the camera saw the board come {1e3 * way[0]:.0f} mm nearer: see "
-            "that the wheels take the vehicle along, and that it is not jacked up"
+            f"the wheels counted {1e3 * there.x:.0f} mm, the camera saw the board {1e3 * way[0]:.0f} mm nearer; "
+            "see that the wheels take the vehicle along, and that it is not jacked up"
         )
     if way[0] < 0.0:
         result.find(
@@ -78,13 +84,44 @@ def _wheels(desk: Desk, result: Result) -> None:
                 "Turn arm.vehicle_from_base by 180 deg about z, or have the vehicle's maker reverse its drives.",
             )
         )  # fmt: skip
-    elif abs(ratio - 1.0) > MOST_OFF_SHARE:
+    else:
+        result.measure(
+            "that over the wheels' way", ratio, "", least=1.0 - MOST_OFF_SHARE, most=1.0 + MOST_OFF_SHARE,
+            remedy="See the wheels' diameter, whether they slip, and the station's board.",
+        )  # fmt: skip
+
+
+def _pitch(desk: Desk, result: Result, look: pin.SE3) -> None:
+    """How large the station's board is, by the ways of the arm before it; the arm is back at `look` afterwards."""
+    board, mover = parse_board(desk.job.board.spec), desk.mover()
+    flanges, boards = [], []
+    for shift in (np.zeros(3), *(sign * SHIFT * axis for axis in np.eye(3) for sign in (1.0, -1.0))):
+        desk.look_around()
+        try:
+            mover.to(look * from_parts(shift), "before the station's board")
+            frame = desk.devices.target_camera.grab()
+            seen = board_pose(find_board(frame.image, board), nominal_camera(desk.config.target_camera))
+        except DeviceFault:
+            raise
+        except CellError:
+            continue
+        flanges.append(from_ur(desk.devices.arm.state().flange))
+        boards.append(seen.camera_from_board)
+    mover.to(look, "the looking pose")
+    try:
+        across = axes_from_shifts(flanges, boards).across
+    except RefusedError as refused:
+        result.notes.append(f"the station's board could not be measured from here: {refused}")
+        return
+    result.measure("station's board by the arm's measure over its name", across, "")
+    if abs(across - 1.0) > PITCH_OFF:
         result.find(
             Finding(
-                "board.spec of the job", "the station's board comes nearer by another way than the wheels count",
-                f"{1e3 * there.x:.0f} mm by the wheels", f"{1e3 * way[0]:.0f} mm by the board",
-                f"Measure the station's board: its pitch would be {1e3 * parse_board(job.board.spec).pitch / ratio:.1f} mm; "
-                "if it is right, see the wheels' diameter and whether they slip.",
+                "board.spec of the job",
+                "the station's board has another pitch than its name says, by the ways of the arm",
+                f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm",
+                "Measure from the first to the last point with a ruler, and name the board so in the job's file: the "
+                "vehicle drives by it.",
             )
         )  # fmt: skip
 
@@ -119,8 +156,9 @@ def _board_at(desk: Desk, result: Result, name: str) -> np.ndarray | None:
 CHECKS = [
     Check(
         "vehicle", "Vehicle: its wheels, direction and unit",
-        "the arm to the job's looking pose, then the wheels", f"{1e3 * WAY:.0f} mm ahead and back", f"{1e3 * SPEED:.0f} mm/s",
+        "the arm to the job's looking pose, then the wheels", f"{1e3 * WAY:.0f} mm ahead and back",
+        f"{1e3 * SPEED:.0f} mm/s",
         f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight; the station's board comes nearer",
-        ("vehicle", "target_camera", "arm"), ("target_mounting", "outputs"), _wheels,
+        ("vehicle", "target_camera", "arm", "job"), ("target_mounting", "outputs"), _wheels,
     ),
 ]  # fmt: skip

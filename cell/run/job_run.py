@@ -150,6 +150,7 @@ class JobRun:
                 folder,
                 whereabouts,
                 self.earlier,
+                needs_part=self.kind.places,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),
