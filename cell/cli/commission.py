@@ -61,7 +61,7 @@ def commission(
     """
     from rich.console import Console
 
-    from cell.commission.begin import begin
+    from cell.commission.begin import begin, confirms_itself
     from cell.commission.protocol import write_protocol
     from cell.commission.sequence import CHECKS, chosen
     from drivers.errors import ConfigError
@@ -78,7 +78,7 @@ def commission(
         "clock": clock.value,
         "truth": truth,
     }
-    by_itself = sim is not None and confirm is not Confirm.person
+    by_itself = confirm is not Confirm.person and (sim is not None or confirms_itself(config))
     made = begin(
         config,
         _person(by_itself, console),

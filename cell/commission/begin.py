@@ -62,3 +62,9 @@ def begin(
     folder = path.resolve().parent / FOLDER
     desk = Desk(path, partial(Cell.open, path, **options), person, folder, job)
     return Commissioning(desk, Progress(folder, which, desk.job), path, show)
+
+
+def confirms_itself(config: Path | None) -> bool:
+    """Whether the configuration names a simulated cell that confirms by itself what a person has to."""
+    path = Path(CONFIGURATION) if config is None else config
+    return path.is_file() and load_config(path).cell.confirm == "simulated"

@@ -72,7 +72,7 @@ CHECKS = [
     Check(
         "calibration", "Calibration", "arm, rail and laser, over the two boards on the deck", "their whole reach there",
         "as configured", "solved, and its own checks good",
-        ALL, ("stops",), _calibrate, recorded=False,
+        ALL, ("station",), _calibrate, recorded=False,
     ),
     Check(
         "verification", "Verification of the calibration", "arm, rail and laser, one view of each board",

@@ -20,6 +20,7 @@ from cell.commission.check import Result
 from cell.commission.person import Person
 from cell.config import load_config
 from cell.devices.devices import Devices
+from cell.devices.truth_link import cause_fault, make_ready
 from cell.job import Job, load_job
 from cell.run.recorded_work import Hands
 from cell.steps.moves import HOME, Mover
@@ -90,13 +91,27 @@ class Desk:
             cell, self._cell = self._cell, None
             cell.close()
 
+    @property
+    def simulated(self) -> bool:
+        """Whether this cell has a world that can be told what to do: its own, or one that is served."""
+        return self.cell.simulated is not None or bool(self.cell.config.cell.truth)
+
     def fill_claw(self) -> None:
         """At a simulated cell: what a person's hands do, who puts the job's part into the claw."""
-        simulated = self.cell.simulated
-        if simulated is not None:
-            from cell.devices.described import Described
+        from cell.devices.described import Described
 
-            simulated.make_ready(Described.of(self.job_file))
+        described = Described.of(self.job_file)
+        if self.cell.simulated is not None:
+            self.cell.simulated.make_ready(described)
+        elif self.cell.config.cell.truth:
+            make_ready(self.cell.config.cell.truth, described.drawing(self.config).as_json())
+
+    def cause(self, fault: str) -> None:
+        """At a simulated cell: cause a fault by its name."""
+        if self.cell.simulated is not None:
+            self.cell.simulated.fault(fault)
+        else:
+            cause_fault(self.cell.config.cell.truth, fault)
 
     # --- the person ---
 

@@ -35,6 +35,7 @@ CHECKS: tuple[Check, ...] = (
     *output_checks.CHECKS,
     *vehicle_checks.CHECKS,
     *stop_checks.CHECKS,
+    *vehicle_checks.STATION_CHECKS,
     *closing_checks.CHECKS,
 )
 ROUNDS = 4

@@ -214,7 +214,7 @@ def _laser(desk: Desk, result: Result) -> None:
 def _emergency(desk: Desk, result: Result) -> None:
     """A person stops the arm with the button while it turns; afterwards nothing goes on by itself."""
     arm, clock = desk.devices.arm, desk.devices.clock
-    simulated = desk.cell.simulated
+    simulated = desk.simulated
     desk.fold()
     if not desk.devices.vehicle.state().braked:
         desk.devices.vehicle.recover()
@@ -222,9 +222,9 @@ def _emergency(desk: Desk, result: Result) -> None:
     clock.sleep(BEFORE_S)
     begun, before = clock.now(), _place(desk, "arm")
     cause = "emergency stop"
-    if simulated is not None:
+    if simulated:
         cause = "protective stop (simulated)"
-        simulated.fault("arm.protective_stop")
+        desk.cause("arm.protective_stop")
     elif not desk.person.does("Press the emergency stop now, while joint 1 turns."):
         desk.cell.stop()
         desk.cell.clear_stop(BY)
@@ -238,7 +238,7 @@ def _emergency(desk: Desk, result: Result) -> None:
         clock.sleep(PERIOD_S)
     result.notes.append(f"after the {cause} the arm told: {stopped.value}")
     result.measure(f"arm, {cause}: it told so", float(stopped is not ArmSafety.NORMAL), "", least=1.0)
-    if simulated is not None:
+    if simulated:
         result.measure(
             f"arm, {cause}: time to rest, at most", clock.now() - begun, "s", most=MOST_S * max(1.0, clock.rate)
         )
