@@ -146,12 +146,12 @@ CHECKS = [
         "arm_axes", "Arm: each joint alone, direction and unit",
         "one joint after the other", "2 deg and back", f"{math.degrees(SPEED):.0f} deg/s",
         f"2 deg within {MOST_OFF_DEG} deg, no other joint, flange as the model has it; beyond a limit refused",
-        ("arm", "vehicle"), ("links",), _axes,
+        ("arm.model", "arm.address"), ("links",), _axes,
     ),
     Check(
         "payload", "Arm: what it carries, by the force that it feels at rest",
         "the arm to its folded posture, then two wrist joints", "up to 35 deg", "15 deg/s, 150 mm/s",
         f"within {MASS_OFF} kg and {1e3 * CENTRE_OFF:.0f} mm of arm.payload and arm.payload_centre",
-        ("arm",), ("arm_axes",), _payload,
+        ("arm.payload", "arm.payload_centre"), ("arm_axes",), _payload,
     ),
 ]  # fmt: skip

@@ -170,7 +170,7 @@ def _camera_check(name: str, other: tuple[str, ...]) -> list[Check]:
     kind = name.removesuffix("_camera")
     plate = "calibration.fine" if kind == "scan" else "calibration.large"
     depth = "130" if kind == "scan" else "650"
-    keys = (name, plate, "arm.model", "arm.vehicle_from_base", "rail")[: 5 if kind == "scan" else 4]
+    keys = (name, plate, "arm.model", "arm.vehicle_from_base", "rail.travel")[: 5 if kind == "scan" else 4]
     return [
         Check(
             f"{kind}_picture", f"{name}: light, focus and board in the picture",

@@ -7,6 +7,11 @@ from cell.commission.desk import Desk
 from cell.config import DEVICES
 from cell.devices.diagnosis import STATES, ask
 
+WHERE = tuple(
+    f"{name}.{key}" for name in DEVICES for key in ("driver", "address", "url", "channel", "interface", "model", "baud")
+)
+"""What tells who is connected, and where, whatever the make."""
+
 
 def _links(desk: Desk, result: Result) -> None:
     devices, config = desk.devices, desk.cell.config
@@ -34,6 +39,6 @@ CHECKS = [
     Check(
         "links", "Links and identities: every device answers and is well",
         "nothing", "", "", "identity, round trips and figures as in `cell diag`",
-        ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw"), (), _links,
+        WHERE, (), _links,
     ),
 ]  # fmt: skip

@@ -262,6 +262,6 @@ CHECKS = [
         "rail, joint 1 and wheels, one after the other, each stopped on its way; the laser",
         "rail 20 mm, joint 1 6 deg, wheels 100 mm at most", "20 mm/s, 5 deg/s, 100 mm/s",
         f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, {MOST_WAY['vehicle']:g} mm",
-        ("rail", "arm", "vehicle", "laser"), ("rail_limits", "vehicle", "outputs"), _stops, recorded=False,
+        ("rail", "arm.model", "vehicle", "laser"), ("rail_limits", "vehicle", "outputs"), _stops, recorded=False,
     ),
 ]  # fmt: skip

@@ -211,7 +211,7 @@ CHECKS = [
         "vehicle", "Vehicle: its wheels, direction and unit",
         "the wheels, with the arm folded", f"{1e3 * WAY:.0f} mm ahead and back", f"{1e3 * SPEED:.0f} mm/s",
         f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
-        ("vehicle", "arm"), ("target_mounting", "outputs"), _wheels,
+        ("vehicle",), ("target_mounting", "outputs"), _wheels,
     ),
 ]  # fmt: skip
 STATION_CHECKS = [
@@ -220,6 +220,6 @@ STATION_CHECKS = [
         "the arm to the job's looking pose; the wheels, until the board is seen, and back",
         f"up to {LEAST_LEFT:g} m before the job's target", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
         f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
-        ("vehicle", "target_camera", "arm", "job"), ("stops",), _station,
+        ("vehicle", "target_camera", "arm.vehicle_from_base", "job"), ("stops",), _station,
     ),
 ]  # fmt: skip
