@@ -168,7 +168,8 @@ def _interpolate(
         if not _solve(normal, right) or not right[0, 0] > 0.0:
             continue
         chi2, total = 0.0, 0.0
-        made[n] = origin
+        for k in range(3):
+            made[n, k] = origin[k]
         for i in range(first, last):
             for j in range(left, end, stride):
                 if measured[i, j]:
@@ -187,7 +188,8 @@ def _interpolate(
         # What the surface has beyond a quadratic shows in the residuals, and does not average out in the hole.
         excess = max(0.0, chi2 - 1.0 - 2.0 * np.sqrt(2.0 / (count - 6)))
         variances[n] = right[0, 0] * max(1.0, chi2) + MISFIT * excess * count / total
-        ways[n] = way
+        for k in range(3):
+            ways[n, k] = way[k]
     return made, variances, ways
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -61,10 +62,21 @@ class Upright:
         corners = np.array([[x + dx, y + dy], [x - dx, y + dy], [x - dx, y - dy], [x + dx, y - dy]])
         return cls(body.name, corners, float(z - dz), float(z + dz))
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """The farthest corner from the origin, m."""
         return float(np.linalg.norm(self.corners, axis=1).max())
+
+    @cached_property
+    def middle(self) -> Vector:
+        """(2,), m."""
+        middle: Vector = self.corners.mean(axis=0)
+        return middle
+
+    @cached_property
+    def radius(self) -> float:
+        """Of the circle about the middle through the corners, m."""
+        return math.dist(self.middle, self.corners[0])
 
     def beside(self, other: Upright) -> bool:
         """Whether the two could meet if one were moved over the floor."""
@@ -125,6 +137,8 @@ class Way:
         # A wrong heading swings the corners, and leads aside on the way after it.
         for ours, theirs in self._pairs:
             needed = MARGIN + DRIFT * length + TURN_DRIFT * turned * (ours.reach + length)
+            if math.dist(ours.middle @ turn + shift, theirs.middle) > ours.radius + theirs.radius + needed:
+                continue  # Their circles are that far apart.
             room = distance(ours.corners @ turn + shift, theirs.corners)
             if room < needed:
                 what = "" if ours is self._vehicle[0] else f"with the arm's {ours.name} "
