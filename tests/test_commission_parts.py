@@ -17,7 +17,7 @@ from cell.commission.check import Check, Result
 from cell.commission.mounting import against_drawing, axes_from_shifts, solve_mounting
 from cell.commission.output_checks import bright_rows
 from cell.commission.progress import Progress
-from cell.commission.sequence import CHECKS
+from cell.commission.sequence import CHECKS, table
 from cell.commission.toml_edit import edited, write_changes
 from cell.config import default_toml, load_config
 from cell.device_config import CameraConfig
@@ -231,3 +231,8 @@ def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
         assert check.moves == "nothing" or (check.far and check.fast)
         assert set(check.needs) <= before, check.name
         before.add(check.name)
+
+
+def test_the_documents_table_is_current() -> None:
+    text = (Path(__file__).parent.parent / "docs" / "commission.md").read_text(encoding="utf-8")
+    assert table() in text

@@ -172,3 +172,14 @@ def chosen(only: Sequence[str], until: str | None) -> list[Check]:
         last = CHECKS.index(by_name(until))
         picked = [check for check in picked if CHECKS.index(check) <= last]
     return picked
+
+
+def table() -> str:
+    """The checks as the table of docs/commission.md."""
+    rows = ["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|"]
+    rows += [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())
