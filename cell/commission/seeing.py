@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pinocchio as pin
 
@@ -14,18 +15,22 @@ from cell.commission.check import Result
 from cell.commission.desk import Desk
 from cell.config import CameraConfig
 from cell.device_config import PlateConfig
-from cell.geometry.camera import CameraModel
+from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts, from_ur
 from cell.steps.camera_poses import centre_of
 from cell.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
 from drivers.errors import CellError, DeviceFault, RefusedError
-from drivers.interfaces import Camera, Frame
+from drivers.interfaces import Camera, Frame, Image
 
 TILT = math.radians(15.0)
 """Of the board against the picture: a board that is seen square tells its own tilt badly."""
 RAIL_STEP = 0.015
 """How far apart the places are, m, at which a rail that is not homed is thought to stand."""
 PHOTO_RATE = 10.0
+CENTRINGS = 3
+"""How often the camera goes on towards what is bright in its picture."""
+LEAST_CONTRAST, LEAST_WAY_SHARE = 25.0, 0.03
+"""By how many DN something has to stand out, and by which share of the picture's width off its middle, to go there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,59 +101,82 @@ def see(desk: Desk, eye: Eye) -> Seen:
 def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
     """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
 
-    Raises `RefusedError` when it is seen from nowhere.
+    Where a part of something bright is in the picture, the camera goes on towards it. Raises `RefusedError` when the
+    board is seen from nowhere.
     """
     mover = desk.mover()
-    reasons: list[str] = []
-    tried = 0
-    for what, goal in _candidates(desk, eye):
-        desk.look_around()
-        try:
-            mover.to(goal, what)
-        except DeviceFault:
-            raise
-        except CellError as error:
-            reasons.append(str(error))
-            continue
-        tried += 1
-        try:
-            seen = see(desk, eye)
-        except RefusedError as error:
-            reasons.append(str(error))
-            if (frame := error.seen.get("frame")) is not None and tried == 1:
-                desk.keep(result, f"{eye.name}-sees-no-board", frame)  # type: ignore[arg-type]
-            continue
-        if tried > 1:
-            result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
-        desk.last_views[eye.name] = goal
-        return seen
+    reason, tried = "", 0
+    for what, goal, hand in _candidates(desk, eye):
+        for _ in range(1 + CENTRINGS):
+            desk.look_around()
+            try:
+                mover.to(goal, what)
+            except DeviceFault:
+                raise
+            except CellError as error:
+                reason = str(error)
+                break
+            tried += 1
+            try:
+                seen = see(desk, eye)
+            except RefusedError as error:
+                reason = str(error)
+                frame = error.seen["frame"]
+                assert isinstance(frame, Frame)
+                if tried == 1:
+                    desk.keep(result, f"{eye.name}-sees-no-board", frame)
+                way = towards_bright(frame.image)
+                if way is None:
+                    break
+                metres = np.array([*way, 0.0]) * eye.depth / eye.model.fx
+                goal = goal * from_parts(hand.rotation @ metres)
+                continue
+            if tried > 1:
+                result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
+            desk.last_views[eye.name] = goal
+            return seen
     raise RefusedError(
         f"{eye.name} saw the board {eye.plate.board} from none of {tried} places. See that the lens cap is off, the "
         f"light on, the lens in focus at {1e3 * eye.depth:.0f} mm, that the board on the deck is the one of "
-        f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reasons[-1] if reasons else ''}"
+        f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reason}"
     )
 
 
-def _candidates(desk: Desk, eye: Eye) -> Iterator[tuple[str, pin.SE3]]:
-    """Places of the flange to try, with words for each."""
-    if eye.name in desk.last_views:
-        yield "where it was seen last", desk.last_views[eye.name]
-    board = eye.board
-    tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
-    centre = eye.plate.base_from_board.se3() * from_parts(centre_of(board))
-    looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
+def towards_bright(image: Image) -> Array | None:
+    """From the picture's middle to that of what is bright in it, (2,) px; None when nothing stands out, or all does."""
+    level, _ = cv2.threshold(cv2.GaussianBlur(image, (9, 9), 0), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    bright = image > level
+    share = float(bright.mean())
+    if not 0.02 < share < 0.95 or float(image[bright].mean() - image[~bright].mean()) < LEAST_CONTRAST:
+        return None
+    # Dark dots belong to their bright board: the middle of its outline, not of its pixels.
+    rows, columns = np.flatnonzero(bright.mean(axis=1) > 0.05), np.flatnonzero(bright.mean(axis=0) > 0.05)
+    if not len(rows) or not len(columns):
+        return None
+    middle = 0.5 * np.array([columns[0] + columns[-1], rows[0] + rows[-1]])
+    way = middle - 0.5 * np.array([image.shape[1] - 1, image.shape[0] - 1])
+    return way if np.linalg.norm(way) > LEAST_WAY_SHARE * image.shape[1] else None
+
+
+def _candidates(desk: Desk, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
+    """Places of the flange to try, with words for each, and flange_from_camera as it would be then."""
     drawn = eye.config.flange_from_camera.se3()
+    if eye.name in desk.last_views:
+        yield "where it was seen last", desk.last_views[eye.name], drawn
+    tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
+    centre = eye.plate.base_from_board.se3() * from_parts(centre_of(eye.board))
+    looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
     rails = _rail_places(desk, eye)
     # A head that is turned in its place is carried another way; a camera without a rail looks the same way for it.
     for quarters in (0, 2, 1, 3) if eye.name == "scan_camera" else (0,):
         turn = _about_z(quarters)
         for rail in rails:
             hand = drawn * turn * from_parts((rail, 0.0, 0.0))
-            yield _words("head", quarters, eye, rail), looking * turn * hand.inverse()
+            yield _words("head", quarters, eye, rail), looking * turn * hand.inverse(), hand
     for quarters in (2, 1, 3):
         for rail in rails:
             hand = _about_z(quarters) * drawn * from_parts((rail, 0.0, 0.0))
-            yield _words("bracket", quarters, eye, rail), looking * hand.inverse()
+            yield _words("bracket", quarters, eye, rail), looking * hand.inverse(), hand
 
 
 def _about_z(quarters: int) -> pin.SE3:
