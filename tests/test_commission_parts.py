@@ -17,6 +17,7 @@ from cell.commission.check import Check, Result
 from cell.commission.mounting import against_drawing, axes_from_shifts, solve_mounting
 from cell.commission.output_checks import bright_rows
 from cell.commission.progress import Progress
+from cell.commission.rail_checks import judge
 from cell.commission.sequence import CHECKS, table
 from cell.commission.toml_edit import edited, write_changes
 from cell.config import default_toml, load_config
@@ -110,6 +111,26 @@ def test_where_a_rail_that_is_not_homed_carries_the_camera_is_no_fault_of_its_mo
     assert "50 mm" in against_drawing(DRAWN * from_parts((0.07, 0.05, 0.0)), DRAWN, (0.0, 0.1)).words
     head = DRAWN * from_parts(np.zeros(3), turned((0.0, 0.0, 1.0), 90.0)) * from_parts((0.07, 0.0, 0.0))
     assert "90 deg about the optical" in against_drawing(head, DRAWN, (0.0, 0.1)).words
+
+
+def judged(told: float, moved: tuple[float, float, float]) -> list[str]:
+    result = Result()
+    judge(load_config(None).rail, result, told, 1e-3 * np.array(moved))
+    return [f"{finding.name} {finding.write}" for finding in result.findings]
+
+
+def test_a_rail_is_judged_by_the_way_that_its_camera_went() -> None:
+    assert judged(0.005, (4.97, 0.05, -0.1)) == []
+    assert judged(-0.005, (-4.97, 0.05, -0.1)) == []
+    assert judged(0.005, (-5.02, 0.1, 0.0)) == ["rail.reversed {'rail.reversed': 'true'}"]
+    assert judged(0.005, (9.95, 0.1, 0.0)) == ["rail.lead {'rail.lead': '\"4 mm\"'}"]
+    assert judged(-0.005, (1.26, 0.0, 0.0)) == [
+        "rail.reversed {'rail.reversed': 'true'}", "rail.lead {'rail.lead': '\"0.5 mm\"'}",
+    ]  # fmt: skip
+    # Across its x axis it is no reversed rail, but a camera that is turned on the carriage.
+    assert judged(0.005, (0.1, 5.0, 0.0)) == []
+    with pytest.raises(RefusedError, match="coupling"):
+        judged(0.005, (0.02, 0.01, 0.0))
 
 
 # --- weight and light ---

@@ -66,8 +66,8 @@ def commission(
     from cell.commission.sequence import CHECKS, chosen
     from drivers.errors import ConfigError
 
-    if sim is None and (truth is not None or confirm is Confirm.simulated):
-        raise ConfigError("--truth and --confirm simulated are for a simulated cell; give --sim all, or leave them out")
+    if sim != "all" and (truth is not None or confirm is Confirm.simulated):
+        raise ConfigError("--truth and --confirm simulated are for a cell that is all simulated; give --sim all")
     checks = chosen(only or (), until)
     console = Console(stderr=json, highlight=False)
     options: dict[str, Any] = {
@@ -78,7 +78,7 @@ def commission(
         "clock": clock.value,
         "truth": truth,
     }
-    by_itself = confirm is not Confirm.person and (sim is not None or confirms_itself(config))
+    by_itself = confirm is not Confirm.person and (sim == "all" or (sim is None and confirms_itself(config)))
     made = begin(
         config,
         _person(by_itself, console),

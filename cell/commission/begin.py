@@ -50,17 +50,14 @@ def begin(
         load_config(truth)
     job_path(job)
     options: dict[str, Any] = {"sim": sim, "job": job}
-    which: dict[str, Any] = {
-        "name": loaded.cell.name,
-        "simulated": sim is not None or bool(loaded.cell.truth),
-        "job": job,
-    }
+    simulated = sim == "all" or (sim is None and bool(loaded.cell.truth))
+    which: dict[str, Any] = {"name": loaded.cell.name, "simulated": simulated, "sim": sim, "job": job}
     if sim is not None:
         options |= {"seed": seed, "level": level, "clock": clock, "truth": truth}
         world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
         which |= {"seed": seed, "level": level, "clock": clock, "world": world}
     folder = path.resolve().parent / FOLDER
-    desk = Desk(path, partial(Cell.open, path, **options), person, folder, job)
+    desk = Desk(path, partial(Cell.open, path, **options), person, folder, job, simulated)
     return Commissioning(desk, Progress(folder, which, desk.job), path, show)
 
 

@@ -44,13 +44,17 @@ class Declined(Exception):
 
 @dataclass
 class Desk:
-    """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures."""
+    """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures.
+
+    `simulated`: all of its devices are, and their world can be told what to do.
+    """
 
     path: Path
     open_cell: Callable[[], Cell]
     person: Person
     folder: Path
     job_file: str
+    simulated: bool
     hands: Hands | None = None
     last_views: dict[str, pin.SE3] = field(default_factory=dict)
     """base_from_flange at which each camera saw its board last."""
@@ -90,11 +94,6 @@ class Desk:
         if self._cell is not None:
             cell, self._cell = self._cell, None
             cell.close()
-
-    @property
-    def simulated(self) -> bool:
-        """Whether this cell has a world that can be told what to do: its own, or one that is served."""
-        return self.cell.simulated is not None or bool(self.cell.config.cell.truth)
 
     def fill_claw(self) -> None:
         """At a simulated cell: what a person's hands do, who puts the job's part into the claw."""

@@ -9,8 +9,9 @@ import numpy as np
 from cell.commission.check import Check, Finding, Result
 from cell.commission.desk import Desk
 from cell.commission.seeing import centred_view, eye_of, see
-from drivers.errors import InterlockError, LimitError, RefusedError
-from drivers.interfaces import Nudged
+from cell.device_config import RailConfig
+from drivers.errors import DeviceFault, InterlockError, LimitError, RefusedError
+from drivers.interfaces import Nudged, Vector
 
 STEP, FIRST_STEP = 0.005, 0.001
 SPEED = 0.005
@@ -20,6 +21,8 @@ LEAD_OFF = 0.05
 SCREWS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 40.0, 50.0)
 """Leads that are sold, mm."""
 SLOW = 0.020
+BEYOND = 0.006
+"""How far beyond an end of the travel its limit switch is looked for, m."""
 
 
 def _direction(desk: Desk, result: Result) -> None:
@@ -52,10 +55,15 @@ def _direction(desk: Desk, result: Result) -> None:
     result.measure("commanded", 1e3 * reached, "mm")
     result.measure("the camera went, along its x axis", 1e3 * along, "mm")
     result.measure("the camera went, in all", 1e3 * way, "mm")
-    _judge(desk, result, reached, way, moved)
+    judge(desk.config.rail, result, reached, moved)
 
 
-def _judge(desk: Desk, result: Result, told: float, way: float, moved: np.ndarray) -> None:
+def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
+    """What the camera's way (3,) in its own axes says of a rail that was told to go `told`, both in m.
+
+    Raises `RefusedError` when it did not move.
+    """
+    way = float(np.linalg.norm(moved))
     if way < 0.05 * abs(told):
         raise RefusedError(
             f"the rail counted {1e3 * told:.2f} mm and the camera moved {1e3 * way:.2f} mm: see that the motor has "
@@ -68,25 +76,25 @@ def _judge(desk: Desk, result: Result, told: float, way: float, moved: np.ndarra
         remedy="The camera is turned on the carriage: turn it so that its rows lie along the rail.",
     )  # fmt: skip
     if not ahead and aslant < MOST_SIDEWAYS:
-        now = bool(getattr(desk.config.rail, "reversed", False))
+        now = bool(getattr(rail, "reversed", False))
         result.find(
             Finding(
                 "rail.reversed", "the carriage goes the other way than it is told: the rail's direction is reversed",
                 f"+{1e3 * abs(told):.1f} mm", f"{1e3 * moved[0] * np.sign(told):+.1f} mm along the camera's x axis",
                 "Have the module turn the motor the other way, or swap the two wires of one of its coils. If it was "
                 "seen by eye to go away from its home switch, the camera sits upside down on the carriage instead.",
-                {"rail.reversed": str(not now).lower()} if hasattr(desk.config.rail, "reversed") else {},
+                {"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
             )
         )  # fmt: skip
     ratio = way / abs(told)
     if abs(ratio - 1.0) > LEAD_OFF:
-        lead = desk.config.rail.lead * ratio
+        lead = rail.lead * ratio
         sold = min(SCREWS, key=lambda mm: abs(math.log(1e-3 * mm / lead)))
         value = 1e-3 * sold if abs(1e-3 * sold / lead - 1.0) < 0.04 else lead
         result.find(
             Finding(
                 "rail.lead", f"the carriage goes {ratio:.2f} times as far as it is told",
-                f"{1e3 * desk.config.rail.lead:g} mm a turn", f"{1e3 * lead:.2f} mm a turn",
+                f"{1e3 * rail.lead:g} mm a turn", f"{1e3 * lead:.2f} mm a turn",
                 "Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
                 {"rail.lead": f'"{1e3 * value:.4g} mm"'},
             )
@@ -135,7 +143,37 @@ def _limits(desk: Desk, result: Result) -> None:
         except LimitError:
             refused += 1
     result.measure("commands 1 mm beyond an end refused", float(refused), "of 2", least=2.0)
+    _switches(desk, result, speed)
     rail.move_to(0.5 * (low + high), speed).wait(60.0)
+
+
+def _switches(desk: Desk, result: Result, speed: float) -> None:
+    """Slowly beyond each end of the travel, until its limit switch stops the carriage; then the zero is found anew."""
+    rail, (low, high) = desk.devices.rail, desk.config.rail.travel
+    if not isinstance(rail, Nudged):
+        result.notes.append("this rail moves only within its travel: press its limit switches by hand")
+        return
+    desk.confirm(
+        "rail, beyond its travel", "the carriage, until a limit switch stops it", f"at most {1e3 * BEYOND:.0f} mm",
+        f"{1e3 * SPEED:.0f} mm/s",
+    )  # fmt: skip
+    for name, end, way in (("left", low, -BEYOND), ("right", high, BEYOND)):
+        if not rail.state().homed_here:
+            rail.home().wait(120.0)
+        rail.move_to(end, speed).wait(3.0 * (high - low) / speed + 20.0)
+        code = ""
+        try:
+            _nudge(desk, way)
+        except DeviceFault as fault:
+            code = fault.code
+        state = rail.state()
+        hit = state.left_switch if name == "left" else state.right_switch
+        result.measure(
+            f"{name} limit switch stops the carriage", float(hit and code == "rail.limit_switch"), "", least=1.0,
+            remedy=f"No switch stopped it within {1e3 * BEYOND:.0f} mm: see the switch, its wire, and that it is on.",
+        )  # fmt: skip
+        _nudge(desk, -way)
+    rail.home().wait(120.0)
 
 
 CHECKS = [
@@ -147,8 +185,9 @@ CHECKS = [
     ),
     Check(
         "rail_limits", "Rail: home switch, ends of the travel, limits",
-        "the carriage", "its whole travel, once to and fro", "half of rail.max_speed to its switch, then 20 mm/s",
-        "home found; both ends reached without a switch; beyond them refused",
+        "the carriage", "its whole travel, and 6 mm beyond each end",
+        "half of rail.max_speed to its switch, then 20 and 5 mm/s",
+        "home found; both ends reached without a switch; commands beyond refused; limit switches stop it",
         ("rail",), ("rail_direction",), _limits,
     ),
 ]  # fmt: skip

@@ -38,8 +38,8 @@ CHECKS: tuple[Check, ...] = (
     *vehicle_checks.STATION_CHECKS,
     *closing_checks.CHECKS,
 )
-ROUNDS = 4
-"""How often a check is done again at most because something that it found was mended."""
+MENDS = 3
+"""How often at most what a check found is written, and the check done again."""
 
 
 @dataclass
@@ -71,14 +71,16 @@ class Commissioning:
 
     def _until_good(self, check: Check) -> bool:
         """Do a check, mend what it found, and do it again, as often as that helps."""
-        for _ in range(ROUNDS):
+        mended = 0
+        while True:
             result = self._once(check)
             self.show(check, result.verdict.value, result)
             if result.verdict is Verdict.GOOD:
                 return True
-            if not self._mend(check, result) and not self._again(check, result):
+            if mended < MENDS and self._mend(check, result):
+                mended += 1
+            elif not self._again(check, result):
                 return False
-        return False
 
     def _once(self, check: Check) -> Result:
         result, begun = Result(), time.monotonic()
