@@ -30,6 +30,7 @@ from cell.device_config import (
 from cell.devices.built_in import BUILT_IN
 from cell.devices.make import AnyMake
 from cell.devices.makes import make_of, record_of
+from cell.devices.switch_makes import line_problems
 from cell.obstacles import VehicleObstacle, once_each
 from cell.toml_file import Table, read_toml, validate
 from cell.units import number, shown
@@ -115,6 +116,8 @@ class CellConfig(Table):
             other = found.setdefault(place.lower(), key)
             if place and other != key:
                 raise ValueError(f"{other} and {key} are both {shown(place)}; each device has an address of its own")
+        if problem := next(line_problems({name: self.device(name) for name in DEVICES}), None):
+            raise ValueError(problem)
         return self
 
     def device(self, name: str) -> DeviceConfig:

@@ -53,9 +53,13 @@ def real_path(address: str) -> str:
 
 
 class DeviceConfig(Table):
-    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is."""
+    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is.
+
+    `CAUTION` is what a person has to know of devices of this make before relying on them; `cell check` says it.
+    """
 
     ADDRESS: ClassVar[str] = "address"
+    CAUTION: ClassVar[str] = ""
 
     driver: str
 
@@ -83,13 +87,21 @@ def of_make(record: DeviceConfig, kind: type[OfMake]) -> OfMake:
 Travel = Annotated[float, quantity("mm", -100, 2_000)]
 
 
+Late = Annotated[float, quantity("ms", 0, 100)]
+
+
 class RailConfig(DeviceConfig):
-    """A rail; `lead` is the travel per turn of its motor."""
+    """A rail; `lead` is the travel per turn of its motor.
+
+    `late`: by how much older a position may be than the moment at which it was asked for; nobody can see that from
+    outside.
+    """
 
     lead: Annotated[float, quantity("mm", 0.1, 50)]
     travel: tuple[Travel, Travel]
     max_speed: Annotated[float, quantity("mm/s", 0.1, 500)]
     acceleration: Annotated[float, quantity("mm/s^2", 1, 10_000)]
+    late: Late = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -172,7 +184,7 @@ class CameraConfig(DeviceConfig):
     focal_length: Annotated[float, quantity("mm", 1, 200)]
     flange_from_camera: Mounting
     photo_exposure: PhotoExposure
-    late: Annotated[float, quantity("ms", 0, 100)] = 0.002
+    late: Late = 0.002
 
     @model_validator(mode="after")
     def _sees(self) -> Self:

@@ -9,6 +9,8 @@ import math
 
 from drivers.errors import LimitError
 
+UNTOLD = "not told"
+"""In place of a model, serial number or version that a device does not tell."""
 _SHOWN = {
     "m": ("mm", 1e3),
     "m/s": ("mm/s", 1e3),

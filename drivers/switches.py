@@ -7,6 +7,7 @@ its context is left for whatever reason, and off again on `stop()` and `close()`
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -84,37 +85,63 @@ class ArmSwitchedLaser(_Switch):
         self.stop()
 
 
-class ArmSwitchedClaw(_Switch):
-    """A gripper on the digital output `output` of `arm` (on = closed), confirmed by the digital input `feedback`."""
+class ConfirmedClaw(ABC):
+    """What claws share that one switch closes and another one confirms; `_shown_by` names the one that confirms."""
 
-    def __init__(self, name: str, arm: Arm, output: int, feedback: int, *, clock: Clock | None = None) -> None:
-        super().__init__(name, arm, output)
-        self._feedback = feedback
-        self._clock = clock or Clock()
+    name: str
+    _clock: Clock
+    _shown_by: str
+
+    @abstractmethod
+    def _close(self, closed: bool) -> None:
+        """Set the switch."""
+
+    @property
+    @abstractmethod
+    def holding(self) -> bool:
+        """What the feedback input shows."""
 
     def grip(self, timeout: float = 2.0) -> None:
         """Close and wait for the feedback; `DeviceFault` (claw.no_part) when no part is held after `timeout` s."""
-        self._arm.set_digital_output(self._output, True)
+        self._close(True)
         if not self._feedback_becomes(True, timeout):
             raise DeviceFault(
                 self.name,
                 "claw.no_part",
-                f"closed, but after {timeout:.3g} s input {self._feedback} does not show a held part",
+                f"closed, but after {timeout:.3g} s {self._shown_by} does not show a held part",
                 recoverable=True,
                 hint="See that the part lies between the fingers and that the feedback is wired, then grip again.",
             )
 
     def release(self, timeout: float = 2.0) -> None:
         """Open and wait for the feedback; `DeviceFault` (claw.stuck) when a part is still held after `timeout` s."""
-        self._arm.set_digital_output(self._output, False)
+        self._close(False)
         if not self._feedback_becomes(False, timeout):
             raise DeviceFault(
                 self.name,
                 "claw.stuck",
-                f"opened, but after {timeout:.3g} s input {self._feedback} still shows a held part",
+                f"opened, but after {timeout:.3g} s {self._shown_by} still shows a held part",
                 recoverable=True,
                 hint="See whether the part sticks to the fingers; the arm must not retreat before it is free.",
             )
+
+    def _feedback_becomes(self, value: bool, timeout: float) -> bool:
+        deadline = self._clock.now() + max(timeout, _WALL_FLOOR_S * self._clock.rate)
+        while self.holding != value:
+            if self._clock.now() >= deadline:
+                return False
+            self._clock.sleep(_POLL_S)
+        return True
+
+
+class ArmSwitchedClaw(_Switch, ConfirmedClaw):
+    """A gripper on the digital output `output` of `arm` (on = closed), confirmed by the digital input `feedback`."""
+
+    def __init__(self, name: str, arm: Arm, output: int, feedback: int, *, clock: Clock | None = None) -> None:
+        super().__init__(name, arm, output)
+        self._feedback = feedback
+        self._shown_by = f"input {feedback}"
+        self._clock = clock or Clock()
 
     @property
     def holding(self) -> bool:
@@ -127,10 +154,5 @@ class ArmSwitchedClaw(_Switch):
     def close(self) -> None:
         """Leave the claw as it is; the arm stays connected."""
 
-    def _feedback_becomes(self, value: bool, timeout: float) -> bool:
-        deadline = self._clock.now() + max(timeout, _WALL_FLOOR_S * self._clock.rate)
-        while self.holding != value:
-            if self._clock.now() >= deadline:
-                return False
-            self._clock.sleep(_POLL_S)
-        return True
+    def _close(self, closed: bool) -> None:
+        self._arm.set_digital_output(self._output, closed)

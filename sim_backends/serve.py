@@ -35,8 +35,8 @@ from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
-from sim_backends.peers.tmcl import TmclPeer
 from sim_backends.peers.truth import TruthPeer
+from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
@@ -88,7 +88,7 @@ class ServedCell:
         clock = world.clock
         with contextlib.ExitStack() as bound:
             self._arm = _bound(bound, RtdePeer(world.arm, clock))
-            self._rail = _bound(bound, TmclPeer(world.rail, clock))
+            self._rail = _bound(bound, rail_peer(world))
             self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
@@ -100,6 +100,9 @@ class ServedCell:
                 for name in CAMERAS
             }
             self._gige = frozenset(gige)
+            self._switches, self._switch_endpoints = switch_peers(world)
+            for switch in self._switches:
+                _bound(bound, switch)
             self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
         self._faults: dict[str, Callable[[], None]] = {
@@ -145,6 +148,7 @@ class ServedCell:
                 }
                 for name, camera in self._cameras.items()
             },
+            **self._switch_endpoints,
             "truth": {"address": self._truth.address},
             "seed": scene.seed,
             "level": scene.level,
@@ -176,7 +180,7 @@ class ServedCell:
             camera.clear()
 
     def _all(self) -> tuple[_Peer, ...]:
-        return (self._arm, self._rail, self._vehicle, *self._cameras.values(), self._truth)
+        return (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches, self._truth)
 
 
 def _bound(stack: contextlib.ExitStack, peer: P) -> P:

@@ -184,7 +184,7 @@ def test_of_two_packages_with_one_name_neither_is_taken(site: Path, tmp_path: Pa
 def test_an_unknown_driver_is_refused_with_what_is_installed(site: Path, tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(default_toml().replace('driver = "tmcl"', 'driver = "plc"'))
-    with pytest.raises(ConfigError, match=r'rail\.driver: "plc" is not one of "tmcl" or "acme"'):
+    with pytest.raises(ConfigError, match=r'rail\.driver: "plc" is not one of "tmcl" or "modbus" or "acme"'):
         load_config(path)
 
 

@@ -112,7 +112,7 @@ def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
 def flat(value: object) -> np.ndarray:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return np.concatenate([flat(getattr(value, f.name)) for f in dataclasses.fields(value)])
-    if isinstance(value, str):
+    if isinstance(value, str | dict):
         return np.zeros(0)
     return np.asarray(value, dtype=float).ravel()
 

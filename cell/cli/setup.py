@@ -51,7 +51,7 @@ def init(
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
     from cell.check.fit import require_fit
-    from cell.config import example_addresses, find_config, load_config, require_confirm
+    from cell.config import DEVICES, example_addresses, find_config, load_config, require_confirm
     from cell.job import job_path, load_job
     from drivers.errors import ConfigError
 
@@ -69,6 +69,8 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
             raise typer.Exit(EXIT_USAGE) from error
         raise
     notes = [f"{key} is the example's, where no device is: write your own" for key in example_addresses(loaded)]
+    records = {name: loaded.device(name) for name in DEVICES}
+    notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {
         "ok": True,
         "cell": loaded.cell.name,

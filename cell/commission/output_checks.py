@@ -51,8 +51,10 @@ def bright_rows(off: Image, on: Image) -> int:
 def _outputs(desk: Desk, result: Result) -> None:
     config = desk.config
     if not isinstance(config.laser, OnArm) or not isinstance(config.claw, OnArm):
-        result.notes.append("laser or claw does not hang on the arm's outputs: only the laser's light is looked for")
+        result.notes.append("laser or claw does not hang on the arm's outputs: each is tried as it is configured")
         _laser_alone(desk, result)
+        desk.confirm("claw", "the claw opens and closes, hands out of it", "its whole stroke", "its own")
+        _claw(desk, result)
         return
     laser, claw = config.laser.output, config.claw.output
     centred_view(desk, result, eye_of(desk, "scan_camera"))

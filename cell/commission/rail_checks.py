@@ -10,7 +10,7 @@ from cell.commission.check import Check, Finding, Result
 from cell.commission.desk import Desk
 from cell.commission.seeing import centred_view, eye_of, see
 from cell.device_config import RailConfig
-from drivers.errors import DeviceFault, InterlockError, LimitError, RefusedError
+from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
 
 STEP, FIRST_STEP = 0.005, 0.001
@@ -28,6 +28,9 @@ BEYOND = 0.006
 def _direction(desk: Desk, result: Result) -> None:
     rail = desk.devices.rail
     eye = eye_of(desk, "scan_camera")
+    if not _nudged(desk) and not rail.state().homed_here:
+        desk.fold()
+        _watched_homing(desk)
     first = centred_view(desk, result, eye)
     desk.keep(result, "rail-before", first.frame, first.view.pixels)
     state = rail.state()
@@ -101,13 +104,33 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
         )  # fmt: skip
 
 
-def _nudge(desk: Desk, way: float) -> None:
+def _watched_homing(desk: Desk) -> None:
+    """The zero of a rail whose direction nobody has seen: a person watches it. Raises `RefusedError`."""
+    desk.confirm(
+        "rail", "it searches its home switch; watch whether it goes towards that, and stop it if not",
+        "its whole travel at most", "half its configured speed",
+    )  # fmt: skip
+    desk.devices.rail.home().wait(120.0)
+    if not desk.person.sees("Did the carriage go to its home switch and stop there?"):
+        raise RefusedError("the rail did not go to its home switch: have its drive turn the motor the other way")
+
+
+def _nudged(desk: Desk) -> bool:
+    """Whether this make of rail moves by a little before it is homed."""
     rail = desk.devices.rail
+    return isinstance(getattr(rail, "bare", rail), Nudged)
+
+
+def _nudge(desk: Desk, way: float) -> None:
+    """By a little; a make that moves only when it is homed has been homed."""
+    rail, speed = desk.devices.rail, min(SPEED, desk.config.rail.max_speed)
     if abs(way) < 1e-6:
         return
-    if not isinstance(rail, Nudged):
-        raise InterlockError("rail", "moves only when it is homed")
-    rail.nudge(way, min(SPEED, desk.config.rail.max_speed)).wait(30.0)
+    if _nudged(desk):
+        assert isinstance(rail, Nudged)
+        rail.nudge(way, speed).wait(30.0)
+    else:
+        rail.move_to(rail.state().position + way, speed).wait(30.0)
 
 
 def _limits(desk: Desk, result: Result) -> None:
@@ -150,7 +173,7 @@ def _limits(desk: Desk, result: Result) -> None:
 def _switches(desk: Desk, result: Result, speed: float) -> None:
     """Slowly beyond each end of the travel, until its limit switch stops the carriage; then the zero is found anew."""
     rail, (low, high) = desk.devices.rail, desk.config.rail.travel
-    if not isinstance(rail, Nudged):
+    if not _nudged(desk):
         result.notes.append("this rail moves only within its travel: press its limit switches by hand")
         return
     desk.confirm(

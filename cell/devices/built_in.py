@@ -24,6 +24,8 @@ from cell.device_config import (
 )
 from cell.devices.camera_makes import FOLDER, GIGE, OPTICS, USB3, V4L2
 from cell.devices.make import AnyMake, Make, Surroundings
+from cell.devices.rail_makes import MODBUS
+from cell.devices.switch_makes import SWITCH_MAKES
 from cell.units import quantity, whole
 
 if TYPE_CHECKING:
@@ -272,4 +274,5 @@ BUILT_IN: tuple[AnyMake, ...] = (
     ),
     Make("claw", "arm_output", ArmOutputClawConfig, _claw, simulated=_with(), on_arm=True),
     GIGE, USB3, V4L2, FOLDER,
+    MODBUS, *SWITCH_MAKES,
 )  # fmt: skip

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig
-from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, TmclRailConfig
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig, of_make
+from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, OnArm, TmclRailConfig
+from cell.devices.rail_makes import ModbusRailConfig
+from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
 from cell.geometry.poses import from_parts, transform
 from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job, shipped_mesh
@@ -70,8 +73,6 @@ class Described:
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:
     arm, rail, laser, claw = config.arm, config.rail, config.laser, config.claw
-    assert isinstance(rail, TmclRailConfig) and isinstance(laser, ArmOutputLaserConfig)
-    assert isinstance(claw, ArmOutputClawConfig)
     low, high = rail.travel
     margin = 0.1 * (high - low)
     return drawn.CellDrawing(
@@ -80,22 +81,49 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=TURNS_WIDER * config.vehicle.track,
-        rail=drawn.RailDrawing(
-            rail.lead, rail.steps_per_turn, rail.travel, (low + margin, high - margin), rail.reversed
-        ),
+        rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin), reverses(rail)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,
         tan_theta=laser.tan_theta,
         witness=_witness(config),
-        laser_output=laser.output,
-        claw_output=claw.output,
-        grip_input=claw.feedback,
+        laser_output=laser.output if isinstance(laser, ArmOutputLaserConfig) else None,
+        claw_output=claw.output if isinstance(claw, ArmOutputClawConfig) else None,
+        grip_input=claw.feedback if isinstance(claw, ArmOutputClawConfig) else None,
         fine_board=config.calibration.fine.board,
         base_from_fine_board=_matrix(config.calibration.fine.base_from_board.se3()),
         deck_board=config.calibration.large.board,
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
+        wires={name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
     )
+
+
+def reverses(rail: RailConfig) -> bool:
+    """Whether the configuration has the drive turn its motor the other way round."""
+    return isinstance(rail, TmclRailConfig) and rail.reversed
+
+
+def _steps(rail: RailConfig) -> int:
+    """Steps of a turn that a drive counts at its coarsest."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn
+    return of_make(rail, TmclRailConfig).steps_per_turn
+
+
+def _wire(record: DeviceConfig) -> dict[str, Any]:
+    """How a device is wired that does not hang on the arm, as its peer takes it."""
+    wire: dict[str, Any] = {"make": record.driver}
+    match record:
+        case ModbusRailConfig():
+            return wire | record.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
+        case RobotiqClawConfig():
+            return wire | {"place": record.address}
+        case NumatoClawConfig():
+            lines = {"feedback": record.feedback, "active_high": record.held_is == "high"}
+            return wire | {"place": record.held, "relay": record.relay, **lines}
+        case OnBoard():
+            return wire | {"place": record.held, "relay": record.relay}
+    return {}
 
 
 def _station(job: Job, mesh: Path) -> drawn.StationDrawing:
@@ -153,6 +181,8 @@ def _makes(config: CellConfig) -> Iterator[str]:
                 f'{name}.driver = "{make.name}": nothing simulates this make; for a simulated cell name one that is '
                 "simulated (the built-in ones are)"
             )
+        elif name in ("laser", "claw") and not make.on_arm and not _wire(config.device(name)):
+            yield f'{name}.driver = "{make.name}": nothing simulates what this make hangs on; name a built-in one'
 
 
 def _boards(config: CellConfig, job: Job) -> Iterator[str]:
@@ -210,8 +240,7 @@ def _blur_px(camera: CameraConfig, focus: float, depth: float) -> float:
 
 def _outputs(config: CellConfig) -> Iterator[str]:
     laser, claw = config.laser, config.claw
-    assert isinstance(laser, ArmOutputLaserConfig) and isinstance(claw, ArmOutputClawConfig)
-    if laser.output == claw.output:
+    if isinstance(laser, OnArm) and isinstance(claw, OnArm) and laser.output == claw.output:
         yield f"laser.output and claw.output are both {laser.output}; each has an output of its own"
 
 

@@ -19,7 +19,7 @@ from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, Vehicle, why_untold
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, SaysHowKnown, Vehicle, why_untold
 
 PINGS = 100
 
@@ -167,7 +167,9 @@ def _camera_state(camera: Camera) -> str:
 
 
 def _laser_state(laser: Laser) -> str:
-    return "ON" if laser.is_on else "off"
+    how = laser.how_known if isinstance(laser, SaysHowKnown) else ""
+    # What nobody can ask, a look that sends nothing cannot know.
+    return f"not known now; {how}" if how else "ON" if laser.is_on else "off"
 
 
 def _claw_state(claw: Claw) -> str:

@@ -6,25 +6,30 @@ be proven there as well. Everything above the devices' interfaces is the product
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from cell.config import CellConfig
-from cell.device_config import MOST_PAYLOAD, of_make
+from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
-from cell.devices.described import Described
+from cell.devices.described import Described, reverses
 from cell.devices.devices import Devices
+from cell.devices.rail_makes import ModbusRailConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
+from drivers.quantities import UNTOLD
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+from sim_backends.direct.switches import DirectClaw, DirectLaser
 
 
 class VirtualCell(DirectCell):
@@ -44,6 +49,7 @@ class VirtualCell(DirectCell):
 
         Raises `ConfigError` for an unknown level, and for what cannot be simulated as it is described.
         """
+        self._config = config
         self._truth = truth or config
         drawing = (described or Described.of("pot")).drawing(self._truth)
         try:
@@ -53,10 +59,16 @@ class VirtualCell(DirectCell):
         # The arm's installation is right; a configuration may tell it otherwise.
         self.arm.set_payload(config.arm.payload, np.array(config.arm.payload_centre))
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
-        laser, claw = (connect_one(config, name, self.clock, arm=self.arm) for name in ("laser", "claw"))
+        laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         self.devices: Devices = behind_gate(
             config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
         )
+
+    def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
+        """What hangs on the arm is the product's own driver; anything else is a switch of the world."""
+        if self._config.make(name).on_arm:
+            return connect_one(self._config, name, self.clock, arm=self.arm)
+        return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
         """Raise `ConfigError` for a fault that only a wire can have."""
@@ -79,7 +91,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
-    arm, rail, vehicle = config.arm, of_make(config.rail, TmclRailConfig), config.vehicle
+    arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
             ArmLimits(
@@ -94,13 +106,13 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         RailSetup(
             rail.lead,
-            rail.steps_per_turn,
-            rail.microsteps,
+            *_counted(rail),
             rail.travel,
             rail.max_speed,
             rail.acceleration,
-            rail.reversed,
+            reverses(rail),
             EvenMotion.of,
+            _serial(rail),
         ),
         VehicleSetup(
             vehicle.max_speed,
@@ -111,3 +123,18 @@ def setup_of(config: CellConfig) -> Setup:
         ),
         CameraSetup(ClockMap, Latch),
     )
+
+
+def _counted(rail: RailConfig) -> tuple[int, int]:
+    """Steps of a turn and microsteps of a step that positions are counted in."""
+    if isinstance(rail, ModbusRailConfig):
+        return rail.counts_per_turn, 1
+    counted = of_make(rail, TmclRailConfig)
+    return counted.steps_per_turn, counted.microsteps
+
+
+def _serial(rail: RailConfig) -> str | None:
+    """What the driver would tell for a drive that does not tell its serial number; None for one that does."""
+    if isinstance(rail, ModbusRailConfig) and rail.registers.serial is None:
+        return rail.serial or UNTOLD
+    return None

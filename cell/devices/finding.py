@@ -19,6 +19,10 @@ from cell.config import DEVICES, CellConfig, find_config, load_config
 from cell.device_config import DeviceConfig
 from cell.devices.built_in import TmclRailConfig
 from cell.devices.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
+from cell.devices.make import Surroundings
+from cell.devices.makes import make_of
+from cell.devices.rail_makes import ModbusRailConfig
+from cell.devices.switch_makes import OnBoard
 from cell.run.lock import who_holds
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
@@ -62,10 +66,15 @@ def find(path: Path | None, ports: Collection[str] = (), *, ask: bool = False, r
 
 
 def ask_module(port: str, config: CellConfig | None) -> Found:
-    """Ask a serial port for a TMCL module's version, with the rail's configured speed and address, else the usual."""
+    """Ask a serial port for a TMCL module's version, with the rail's configured speed and address, else the usual.
+
+    Where the configured rail is a drive on Modbus, it is that drive that is asked for.
+    """
     from drivers.rail.tmcl_link import TmclLink
 
     busy = _held(port) or ("" if "://" in port else barred(port) or opened_by(port))
+    if config is not None and isinstance(config.rail, ModbusRailConfig):
+        return Found("Modbus drive", port, busy, False) if busy else _ask_drive(port, config.rail)
     if busy:
         return Found("TMCL module", port, busy, False)
     rail = config.rail if config is not None and isinstance(config.rail, TmclRailConfig) else None
@@ -85,6 +94,21 @@ def ask_module(port: str, config: CellConfig | None) -> Found:
     )
 
 
+def _ask_drive(port: str, record: ModbusRailConfig) -> Found:
+    """Ask a serial port for the configured drive: only reading, by the addresses of its map."""
+    make = make_of("rail", record.driver)
+    try:
+        rail = make.connect("rail", record.model_copy(update={"url": port}), Surroundings(Clock(), look=True))
+        try:
+            state = rail.state()
+        finally:
+            rail.close()
+    except CellError as error:
+        return Found("Modbus drive", port, str(error), False)
+    told = f"number {record.unit} answers: at {1e3 * state.position:.2f} mm, {'homed' if state.homed else 'not homed'}"
+    return Found("Modbus drive", port, told, True, f'[rail] url = "{port}"')
+
+
 def configured(config: CellConfig, root: Path = ROOT) -> list[Found]:
     """Whether something answers where the configuration says that the devices are; all are tried at once."""
     names = [name for name in DEVICES if not config.make(name).on_arm]
@@ -99,7 +123,7 @@ def configured(config: CellConfig, root: Path = ROOT) -> list[Found]:
 
 
 def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
-    place = record.place
+    place = record.url if isinstance(record, OnBoard) else record.place
     if record.driver == "fixed":
         return "nothing to connect", True
     if held := who_holds(name, record.held):

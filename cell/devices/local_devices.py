@@ -64,6 +64,8 @@ def serial_ports(root: Path = ROOT, listed: Iterable[Any] | None = None) -> list
 def _serial_use(place: str, told: list[str]) -> str:
     rail, vehicle = f'[rail] url = "{place}"', f'[vehicle] interface = "slcan", channel = "{place}"'
     words = " ".join(told).lower()
+    if "numato" in words:
+        return f'[laser] driver = "numato", url = "{place}"'
     if re.search(r"trinamic|tmcm", words):
         return rail
     return vehicle if re.search(r"\bcan|slcan", words) else f"{rail}\nor {vehicle}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -128,7 +129,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             here.config.calibration.rail_sigma,
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
-            here.config.scan_camera.late,
+            math.hypot(here.config.scan_camera.late, here.config.rail.late),
             head.timing,
         ),
         here.mover,

@@ -14,7 +14,7 @@ from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyU
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
 from drivers.interfaces.device import Device, Examined, Identity, LinkStatistics, Motion, Reading, Vector
 from drivers.interfaces.rail import LONGEST_NUDGE_M, Nudged, Rail, RailState, Sweep
-from drivers.interfaces.switches import Claw, Laser
+from drivers.interfaces.switches import Claw, Laser, SaysHowKnown
 from drivers.interfaces.vehicle import Vehicle, VehicleState
 from drivers.link_table import LinkTable
 
@@ -41,6 +41,7 @@ __all__ = [
     "Rail",
     "RailState",
     "Reading",
+    "SaysHowKnown",
     "SaysWhyUntold",
     "Sweep",
     "Vector",

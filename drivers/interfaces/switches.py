@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from drivers.interfaces.device import Device
 
@@ -17,6 +17,15 @@ class Laser(Device, Protocol):
     @property
     def is_on(self) -> bool:
         """What the output shows, not what was commanded."""
+
+
+@runtime_checkable
+class SaysHowKnown(Protocol):
+    """What a laser may offer besides `Laser` when nobody can ask its switch."""
+
+    @property
+    def how_known(self) -> str:
+        """Why `is_on` is not what the output shows, in words for people; "" where it is."""
 
 
 class Claw(Device, Protocol):

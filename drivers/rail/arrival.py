@@ -5,6 +5,7 @@ from __future__ import annotations
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeviceFault
 from drivers.quantities import shown
+from drivers.rail.axis import Samples
 from drivers.rail.motion import patience
 from drivers.rail.tmcl_codec import Axis
 from drivers.rail.tmcl_link import TmclLink
@@ -14,9 +15,6 @@ STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""
 _STALL_FLAG = 1
 _DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
-
-Samples = list[tuple[float, float, float]]
-"""Host time in s, position in m, round trip in s of each reading."""
 
 
 class Arrival:

@@ -54,9 +54,12 @@ def require_supported(name: str, firmware: str) -> None:
     )
 
 
-def set_checked(link: TmclLink, axis: Axis, value: int, rounding: Rounding) -> None:
-    """Write an axis parameter and read it back; `DeviceFault` (rail.setting) when the module has another value."""
-    link.set(axis, value)
+def set_checked(link: TmclLink, axis: Axis, value: int, rounding: Rounding, *, issued: int | None = None) -> None:
+    """Write an axis parameter and read it back; `DeviceFault` (rail.setting) when the module has another value.
+
+    With `issued` it is not written after a stop.
+    """
+    link.set(axis, value, issued=issued)
     found = link.get(axis)
     if not rounding.holds(value, found):
         raise DeviceFault(

@@ -6,27 +6,21 @@ what was asked for.
 
 from __future__ import annotations
 
-import math
-import threading
-from collections.abc import Callable
-
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, ConfigError, InterlockError
-from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState, Reading
-from drivers.quantities import check_positive, check_range, shown
+from drivers.errors import Aborted, ConfigError
+from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Reading
+from drivers.quantities import check_range
 from drivers.rail import health
-from drivers.rail.arrival import Arrival, Samples
+from drivers.rail.arrival import Arrival
+from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
-from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
-from drivers.rail.sweep import RailSweep
+from drivers.rail.motion import RailMotion, move_duration
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import ZeroMark
 
-_AT_START_M = 20e-6
 
-
-class TmclRail:
+class TmclRail(RailAxis):
     """A TMCL rail behind the serial port `url` (device path or pyserial URL).
 
     `lead` in m per turn, `travel` (low, high) in m, `max_speed` in m/s, `acceleration` in m/s²; `microsteps` per full
@@ -62,24 +56,24 @@ class TmclRail:
         reversed: bool = False,
         control: bool = True,
     ) -> None:
-        positive = {"lead": lead, "steps per turn": steps_per_turn, "speed": max_speed, "acceleration": acceleration}
-        _check_parameters(name, microsteps, travel, positive)
-        self.name = name
-        self.travel = travel
-        self.statistics = LinkStatistics()
-        self._clock = clock
-        self._counts = steps_per_turn * microsteps / lead
-        self._max_speed = max_speed
-        self._acceleration = acceleration
+        for what, value in {"lead": lead, "steps per turn": steps_per_turn}.items():
+            if not value > 0:
+                raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")
+        if microsteps not in (1, 2, 4, 8, 16, 32, 64, 128, 256):
+            raise ConfigError(f"{name}: microsteps {microsteps} must be a power of two from 1 to 256. Correct it")
+        super().__init__(
+            name,
+            clock,
+            travel=travel,
+            max_speed=max_speed,
+            acceleration=acceleration,
+            counts=steps_per_turn * microsteps / lead,
+            control=control,
+        )
         self._microsteps = microsteps
         self._reference_mode = reference_mode
         self._reversed = reversed
-        self._control = control
-        self._homing = False
-        self._motion: RailMotion | None = None
-        self._motion_issued = 0
-        self._starting = threading.Lock()
-        self._link = TmclLink(
+        self._link: TmclLink = TmclLink(
             name, url, address=address, motor=motor, baud=baud, clock=clock, statistics=self.statistics
         )
         self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode, reversed))
@@ -129,53 +123,21 @@ class TmclRail:
             right_switch=bool(self._link.get(Axis.RIGHT_SWITCH)),
         )
 
-    def home(self) -> RailMotion:
-        """Search the reference switch; position 0 is there afterwards."""
-        length = self.travel[1] - self.travel[0]
-        with self._starting:
-            issued = self._free()
-            self._homing = True
-            try:
-                self._zero.searching(issued=issued)
-                self._set_up()
-                self._link.reference_search(Reference.START, issued=issued)
-            except CellError:
-                self._homing = False
-                raise
-            self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=lambda: self._home_found(issued),
-                halt=self._halt(issued),
-                duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
-            )
-            return self._motion
+    def _position(self) -> float:
+        return self._link.get(Axis.POSITION) / self._counts
 
-    def move_to(self, position: float, speed: float | None = None) -> RailMotion:
-        """Move to `position` m at `speed` m/s (default the maximum); refused with `InterlockError` before homing."""
-        check_range(self.name, "position", position, *self.travel, "m")
-        speed = check_positive(self.name, "speed", self._max_speed if speed is None else speed, self._max_speed, "m/s")
-        with self._starting:
-            issued = self._free()
-            duration = self._start(position, speed, issued)
-            self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=self._arrival(position, issued, []),
-                halt=self._halt(issued),
-                duration=duration,
-            )
-            return self._motion
+    def _require_zero(self) -> None:
+        self._zero.require()
 
     def nudge(self, distance: float, speed: float) -> RailMotion:
         """Move by `distance` m, whether homed or not; see `drivers.interfaces.Nudged`."""
         check_range(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
-        speed = check_positive(self.name, "speed", speed, self._max_speed, "m/s")
+        speed = self._checked_speed("speed", speed)
         with self._starting:
             issued = self._free()
             here = self._link.get(Axis.POSITION)
             target = here + round(distance * self._counts)
-            self._link.set(Axis.MAX_VELOCITY, self._pulses(speed), issued=issued)
+            set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
             self._link.move_to(target, issued=issued)
             self._motion = RailMotion(
                 self.name,
@@ -188,85 +150,23 @@ class TmclRail:
             )
             return self._motion
 
-    def sweep_start(self, start: float, stop: float, speed: float) -> float:
-        """Where the rail has to stand before `sweep`: `start` less the start-up distance; `LimitError` if outside."""
-        return self._sweep_ends(start, stop, speed)[0]
+    def _begin_homing(self, issued: int) -> None:
+        self._zero.searching(issued=issued)
+        self._set_up()
+        self._link.reference_search(Reference.START, issued=issued)
 
-    def sweep(self, start: float, stop: float, speed: float) -> RailSweep:
-        """Move so that the velocity is constant from `start` to `stop`; see `drivers.interfaces.Rail`."""
-        begin, end = self._sweep_ends(start, stop, speed)
-        record: Samples = []
-        with self._starting:
-            issued = self._free()
-            self._zero.require()
-            here = self._link.get(Axis.POSITION) / self._counts
-            if abs(here - begin) > _AT_START_M:
-                raise InterlockError(
-                    self.name,
-                    f"stands at {shown(here, 'm')}, the sweep starts at {shown(begin, 'm')}. "
-                    "Move to sweep_start() first",
-                )
-            duration = self._start(end, speed, issued)
-            sweep = RailSweep(
-                self.name,
-                self._clock,
-                start=start,
-                stop=stop,
-                speed=speed,
-                resolution=1.0 / self._counts,
-                record=record,
-                arrived=self._arrival(end, issued, record),
-                halt=self._halt(issued),
-                duration=duration,
-            )
-            self._motion = sweep
-            return sweep
+    def _home_found(self, issued: int) -> bool:
+        searching = self._link.reference_search(Reference.STATUS) != 0
+        if self._link.stops != issued:
+            raise Aborted(f"{self.name}: stopped while searching the reference switch")
+        self._homing = searching
+        if not searching:
+            self._zero.found(issued=issued)
+        return not searching
 
-    def stop(self) -> None:
-        """Stop the motor now; every motion and every command still waiting ends with `Aborted`."""
-        self._require_control()
-        self._homing = False
-        self._link.stop()
-
-    def close(self) -> None:
-        """Stop the motor, unless it is only looked at, and close the port."""
-        if self._link.closed:
-            return
-        try:
-            if self._control:
-                self.stop()
-        finally:
-            self._link.close()
-            if self._motion is not None:
-                self._motion.join(2.0)
-
-    def _require_control(self) -> None:
-        if not self._control:
-            raise InterlockError(self.name, "was opened to be looked at only; nothing was sent. Open it for control")
-
-    def _pulses(self, value: float) -> int:
-        return max(1, round(value * self._counts))
-
-    def _sweep_ends(self, start: float, stop: float, speed: float) -> tuple[float, float]:
-        speed = check_positive(self.name, "sweep speed", speed, self._max_speed, "m/s")
-        if start == stop:
-            raise InterlockError(self.name, f"a sweep from {shown(start, 'm')} to the same place has no direction")
-        ramp = math.copysign(run_up_distance(speed, self._acceleration) + SWEEP_MARGIN_M, stop - start)
-        begin = check_range(self.name, "sweep start less its start-up", start - ramp, *self.travel, "m")
-        end = check_range(self.name, "sweep stop plus its run-out", stop + ramp, *self.travel, "m")
-        return begin, end
-
-    def _free(self) -> int:
-        """The count of stops to issue a motion under; `InterlockError` while another motion runs."""
-        self._require_control()
-        issued = self._link.stops
-        if self._motion is not None and not self._motion.done:
-            if self._link.stops != self._motion_issued:
-                self._motion.join(2.0)
-            if not self._motion.done:
-                raise InterlockError(self.name, "another motion runs. Wait for it or stop() it first")
-        self._motion_issued = issued
-        return issued
+    def _send(self, position: float, speed: float, issued: int) -> None:
+        set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
+        self._link.move_to(round(position * self._counts), issued=issued)
 
     def _arrival(self, position: float, issued: int, samples: Samples) -> Arrival:
         return Arrival(
@@ -288,36 +188,5 @@ class TmclRail:
         set_checked(self._link, Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * self._max_speed), SPEED)
         set_checked(self._link, Axis.REFERENCE_SWITCH_SPEED, self._pulses(0.1 * self._max_speed), SPEED)
 
-    def _start(self, position: float, speed: float, issued: int) -> float:
-        """Send it there; the seconds that it should take."""
-        self._zero.require()
-        here = self._link.get(Axis.POSITION) / self._counts
-        self._link.set(Axis.MAX_VELOCITY, self._pulses(speed), issued=issued)
-        self._link.move_to(round(position * self._counts), issued=issued)
-        return move_duration(position - here, speed, self._acceleration)
-
-    def _halt(self, issued: int) -> Callable[[], None]:
-        def halt() -> None:
-            if self._link.stops == issued:
-                self.stop()
-
-        return halt
-
-    def _home_found(self, issued: int) -> bool:
-        searching = self._link.reference_search(Reference.STATUS) != 0
-        if self._link.stops != issued:
-            raise Aborted(f"{self.name}: stopped while searching the reference switch")
-        self._homing = searching
-        if not searching:
-            self._zero.found(issued=issued)
-        return not searching
-
-
-def _check_parameters(name: str, microsteps: int, travel: tuple[float, float], positive: dict[str, float]) -> None:
-    for what, value in positive.items():
-        if not value > 0:
-            raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")
-    if microsteps not in (1, 2, 4, 8, 16, 32, 64, 128, 256):
-        raise ConfigError(f"{name}: microsteps {microsteps} must be a power of two from 1 to 256. Correct it")
-    if not travel[0] < travel[1]:
-        raise ConfigError(f"{name}: travel {travel} m must go from the lower to the higher limit. Correct it")
+    def _pulses(self, value: float) -> int:
+        return max(1, round(value * self._counts))

@@ -96,7 +96,10 @@ class ArmSetup:
 @dataclass(frozen=True)
 class RailSetup:
     """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round; `even` fits a sweep from times,
-    positions and round trips (n,) each."""
+    positions and round trips (n,) each.
+
+    `serial` is the number by which the cell knows it; None where it tells its own.
+    """
 
     lead: float
     steps_per_turn: int
@@ -106,6 +109,7 @@ class RailSetup:
     acceleration: float
     reversed: bool
     even: Callable[[Vector, Vector, Vector], EvenMotion]
+    serial: str | None = None
 
 
 @dataclass(frozen=True)

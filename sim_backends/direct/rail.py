@@ -47,8 +47,9 @@ class DirectRail:
         self._set_up()
 
     def identity(self) -> Identity:
-        """The model's own plate."""
-        return Identity("TMCM-1260", str(self.model.params.serial), "virtual", "in this process")
+        """The model's own plate, or the number by which the cell knows it."""
+        serial = self.setup.serial or str(self.model.params.serial)
+        return Identity("simulated rail", serial, "virtual", "in this process")
 
     def ping(self) -> float:
         """No wire: 0 s."""

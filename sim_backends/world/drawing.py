@@ -7,7 +7,7 @@ cell of `nominal`. Poses are (4, 4), m, named `a_from_b`; frames as in `nominal`
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -52,7 +52,8 @@ class CellDrawing:
     `baseline` (m) and `tan_theta` are the laser's in the scan camera's frame; `witness` is flange_from_witness of the
     plate on the claw, or None without one. `payload` in kg with its centre of gravity in m on the flange, `track` in m
     as the vehicle turns. Boards are named as in `sim_backends.optics.scene.Board.parse`. Outputs and `grip_input` are
-    numbers of the arm's connectors.
+    numbers of the arm's connectors, None where laser or claw hang on something else; `wires` says by device ("rail",
+    "laser", "claw") what that is, as its peer takes it, or what else than TMCL the rail speaks.
     """
 
     arm: str
@@ -66,13 +67,14 @@ class CellDrawing:
     baseline: float
     tan_theta: float
     witness: Pose | None
-    laser_output: int
-    claw_output: int
-    grip_input: int
+    laser_output: int | None
+    claw_output: int | None
+    grip_input: int | None
     fine_board: str
     base_from_fine_board: Pose
     deck_board: str
     base_from_deck_board: Pose
+    wires: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

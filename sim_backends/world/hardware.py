@@ -41,8 +41,9 @@ def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
         serial=f"2023{scene.serial}",
     )
     arm = ArmModel(params, stream(scene.seed, "arm"), clock)
-    closed = 1 << drawn.claw_output
-    arm.write_digital_outputs(closed, closed)
+    if drawn.claw_output is not None:
+        closed = 1 << drawn.claw_output
+        arm.write_digital_outputs(closed, closed)
     return arm
 
 

@@ -25,7 +25,7 @@ def truth(world: World) -> dict[str, Any]:
     base_from_flange = world.arm.base_from_flange(t)
     world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
     vehicle = world.vehicle.feedback(t)
-    shape, drawn = world.station.ground, scene.drawing.cell
+    shape = world.station.ground
     outputs = world.arm.digital_outputs
     return {
         "seed": scene.seed,
@@ -66,7 +66,7 @@ def truth(world: World) -> dict[str, Any]:
         "scan_clock": _timing(scene.scan_clock),
         "target_clock": _timing(scene.target_clock),
         "part": {"held": world.part.held},
-        "laser_on": bool(outputs >> drawn.laser_output & 1),
+        "laser_on": world.switched("laser"),
         "digital_outputs": [bool(outputs >> i & 1) for i in range(8)],
         "vehicle": {
             "stopped": vehicle.speed == 0.0 and vehicle.yaw_rate == 0.0,

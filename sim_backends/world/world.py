@@ -55,6 +55,8 @@ class World:
         self.rail = hardware.make_rail(self.scene, self.clock)
         self.vehicle = hardware.make_vehicle(self.scene)
         self.laser = SwitchHistory()
+        self.switches = {"laser": False, "claw": True}
+        """What switches laser and claw where no output of the arm does: set by their peers."""
         self.parts = 0
         """How often the claw was filled again."""
         self._cameras = Cameras(self.scene, self.station)
@@ -77,7 +79,7 @@ class World:
         )
         self._solid = ArmPoints(scene.drawing)
         self.collisions = Collisions(scene, self.part, found)
-        self.arm.set_digital_input(scene.drawing.cell.grip_input, self.part.held)
+        self._report_grip()
 
     def make_ready(self, station: StationDrawing) -> None:
         """As when a person makes all ready for a job: the station is set up, and its part is put into the claw.
@@ -91,8 +93,10 @@ class World:
         ready = Station.of(station)
         scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + 1)
         self.scene, self.station, self.parts = scene, ready, self.parts + 1
-        closed = 1 << drawing.cell.claw_output
-        self.arm.write_digital_outputs(closed, closed)
+        self.switches["claw"] = True
+        if drawing.cell.claw_output is not None:
+            closed = 1 << drawing.cell.claw_output
+            self.arm.write_digital_outputs(closed, closed)
         self._set_up(self.collisions.found)
         self._cameras.show(scene, ready)
 
@@ -172,15 +176,24 @@ class World:
 
     # --- what couples the devices ---
 
+    def switched(self, name: str) -> bool:
+        """Whether the "laser" is on, or the "claw" closed: by the arm's output, or by its own switch."""
+        drawn = self.scene.drawing.cell
+        output = drawn.laser_output if name == "laser" else drawn.claw_output
+        return self.switches[name] if output is None else bool(self.arm.digital_outputs >> output & 1)
+
+    def _report_grip(self) -> None:
+        if (grip := self.scene.drawing.cell.grip_input) is not None:
+            self.arm.set_digital_input(grip, self.part.held)
+
     def _touch(self, base_from_flange: Pose) -> NDArray[np.float64]:
         """Called by the arm at every tick: follow its outputs, then give the wrench (6,) on the flange in base axes."""
         t = self.arm.time
         world_from_base = self.world_from_base(t)
         world_from_flange = world_from_base @ base_from_flange
-        outputs, drawn = self.arm.digital_outputs, self.scene.drawing.cell
-        self.laser.record(t, bool(outputs >> drawn.laser_output & 1))
-        self.part.set_claw(bool(outputs >> drawn.claw_output & 1), world_from_flange)
-        self.arm.set_digital_input(drawn.grip_input, self.part.held)
+        self.laser.record(t, self.switched("laser"))
+        self.part.set_claw(self.switched("claw"), world_from_flange)
+        self._report_grip()
         self._meet(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
         if np.linalg.norm(wrench[:3]) > self.arm.params.force_limit and self.arm.safety is Safety.NORMAL:

@@ -78,7 +78,9 @@ def collect_timing(
             recoverable=True,
             hint="See what pushed the arm; the sweeps are of no use.",
         )
-    return find_timing(calibration.scan, base_from_flange, sweeps, config.scan_camera.late, config.rail.lead)
+    return find_timing(
+        calibration.scan, base_from_flange, sweeps, config.scan_camera.late + config.rail.late, config.rail.lead
+    )
 
 
 def _swept(

@@ -67,5 +67,16 @@ class ClawContract(DeviceContract):
         claw = bench.device
         held = claw.holding
         claw.stop()
-        claw.close()
         assert claw.holding == held
+        claw.close()
+        if bench.linked:
+            bench.over()
+        assert bench.device.holding == held
+
+    def test_a_held_part_is_held_again(self, bench: Bench[Claw]) -> None:
+        """`grip` on a part that is held comes back, and it is held still."""
+        claw = bench.device
+        if not claw.holding:
+            pytest.skip("no part is in it")
+        claw.grip()
+        assert claw.holding

@@ -1,0 +1,1 @@
+"""Grippers with a controller of their own."""

@@ -1,0 +1,198 @@
+"""A Robotiq gripper (2F-85, 2F-140, Hand-E) on the socket that its program opens on the arm's controller.
+
+That something is held is the gripper's own finding: its fingers were stopped before the position that they were sent
+to. Which side they were stopped on has to fit the way in which the part is gripped. Fingers that come to the end of
+their way hold nothing, whatever was commanded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.claw.robotiq_link import RobotiqLink
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, InterlockError
+from drivers.interfaces import Identity, LinkStatistics, Reading
+from drivers.quantities import UNTOLD
+
+ACTIVE = 3
+"""STA of a gripper that is activated and knows its fingers' way."""
+MOVING, STOPPED_OPENING, STOPPED_CLOSING, AT_POSITION = range(4)
+"""OBJ: what the gripper finds about an object."""
+SAME = 4
+"""Counts of POS by which fingers that have arrived may be off: they stop a little before."""
+STANDS_S = 0.2
+"""So long the fingers have to stand before it is believed that something stopped them."""
+_POLL_S = 0.02
+_WALL_FLOOR_S = 0.5
+_FAULTS = {
+    5: "its action is delayed until it is activated anew",
+    7: "it has to be activated before it moves",
+    8: "it is too hot, above 85 °C",
+    9: "it has heard nothing for 1 s",
+    10: "its supply is too low",
+    11: "its automatic release goes on",
+    12: "it found a fault in itself",
+    13: "its activation failed",
+    14: "its motor takes too much current",
+    15: "its automatic release has ended",
+}
+
+
+@dataclass(frozen=True)
+class Grip:
+    """How the part is gripped: positions (0 open to 255 closed), speed and force as the gripper counts them, 0 to 255.
+
+    With `inside` the fingers hold the part by spreading.
+    """
+
+    open_at: int
+    closed_at: int
+    speed: int
+    force: int
+    inside: bool = False
+
+    @property
+    def stopped(self) -> int:
+        """OBJ of fingers that hold the part."""
+        return STOPPED_OPENING if self.inside else STOPPED_CLOSING
+
+
+class RobotiqClaw:
+    """The gripper at `address` ("HOST:PORT"), which somebody has activated.
+
+    It is never activated from here: that drives its fingers all the way to and fro, with or without a part.
+    Raises `NotConnectedError` and `DeadlineError` when no gripper answers.
+    """
+
+    def __init__(self, name: str, address: str, grip: Grip, *, clock: Clock, control: bool = True) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self._grip = grip
+        self._clock = clock
+        self._control = control
+        self._link = RobotiqLink(name, address, self.statistics)
+        try:
+            self._link.get("STA")
+        except BaseException:
+            self._link.close()
+            raise
+
+    def identity(self) -> Identity:
+        """The gripper tells neither model nor serial number on this socket."""
+        self._link.get("STA")
+        return Identity("Robotiq gripper", UNTOLD, UNTOLD, self._link.address)
+
+    def ping(self) -> float:
+        """Read its status once; returns the round trip in wall seconds."""
+        self._link.get("STA")
+        return self.statistics.round_trips_s[-1]
+
+    def examine(self, seconds: float) -> list[Reading]:
+        """Whether it is active, and its fault."""
+        active, fault = self._link.get("STA"), self._link.get("FLT")
+        return [
+            Reading(
+                "status", float(active), "", least=ACTIVE, most=ACTIVE,
+                remedy="Activate the gripper at the pendant (Robotiq's toolbar); keep clear, its fingers move.",
+            ),
+            Reading("fault", float(fault), "", most=0.0, remedy=f"{_fault_text(fault)}: see the gripper's manual."),
+        ]  # fmt: skip
+
+    def grip(self, timeout: float = 2.0) -> None:
+        """Close; `DeviceFault` (claw.no_part) unless the fingers are stopped by a part within `timeout` s."""
+        found = self._move(self._grip.closed_at, timeout)
+        if found == self._grip.stopped:
+            return
+        self._require_well()
+        why = {
+            AT_POSITION: "the fingers went all the way and met nothing",
+            MOVING: "the fingers still move",
+        }.get(found, "the fingers were stopped on the wrong side")
+        raise DeviceFault(
+            self.name,
+            "claw.no_part",
+            f"closed, but after {timeout:.3g} s no part is held: {why} (OBJ {found}, POS {self._link.get('POS')})",
+            recoverable=True,
+            hint="See that the part lies between the fingers and that they may close farther than it is wide "
+            "(claw.closed_at), then grip again.",
+        )
+
+    def release(self, timeout: float = 2.0) -> None:
+        """Open; `DeviceFault` (claw.stuck) unless the fingers come to their open position within `timeout` s."""
+        found = self._move(self._grip.open_at, timeout)
+        if found == AT_POSITION:
+            return
+        self._require_well()
+        raise DeviceFault(
+            self.name,
+            "claw.stuck",
+            f"opened, but after {timeout:.3g} s the fingers are at {self._link.get('POS')} instead of "
+            f"{self._grip.open_at} (OBJ {found})",
+            recoverable=True,
+            hint="See whether something stops the fingers; the arm must not retreat before the part is free.",
+        )
+
+    @property
+    def holding(self) -> bool:
+        """Whether the gripper finds a part between its fingers now. Raises `DeviceFault` when it cannot know."""
+        found = self._link.get("OBJ")
+        self._require_well()
+        return found == self._grip.stopped and self._link.get("PRE") == self._grip.closed_at
+
+    def stop(self) -> None:
+        """Nothing to stop: the claw stays as it is, because opening would drop the part."""
+
+    def close(self) -> None:
+        """Leave the claw as it is, and end the connection."""
+        self._link.close()
+
+    def _move(self, position: int, timeout: float) -> int:
+        """Send the fingers there; what the gripper finds (OBJ) at their end, or when `timeout` s are over."""
+        if not self._control:
+            raise InterlockError(self.name, "was opened to be looked at only; nothing was sent. Open it for control")
+        self._require_well()
+        grip = self._grip
+        self._link.set({"POS": position, "SPE": grip.speed, "FOR": grip.force, "GTO": 1})
+        now = self._clock.now()
+        until, since = now + max(timeout, _WALL_FLOOR_S * self._clock.rate), now
+        before = (MOVING, -1)
+        while True:
+            taken = self._link.get("PRE") == position
+            seen = found, at = self._link.get("OBJ"), self._link.get("POS")
+            now = self._clock.now()
+            if seen != before:
+                before, since = seen, now
+            if taken and found == AT_POSITION and abs(at - position) <= SAME:
+                return found
+            # A finding may still be that of the motion before: fingers that are stopped stay where they are.
+            if taken and found in (STOPPED_OPENING, STOPPED_CLOSING) and now - since >= STANDS_S:
+                return found
+            if now >= until:
+                return MOVING
+            self._clock.sleep(_POLL_S)
+
+    def _require_well(self) -> None:
+        """Raise `DeviceFault`: claw.fault when the gripper reports one, claw.not_active when it is not activated."""
+        fault = self._link.get("FLT")
+        if fault:
+            raise DeviceFault(
+                self.name,
+                "claw.fault",
+                f"the gripper reports fault {fault}: {_fault_text(fault)}",
+                recoverable=False,
+                hint="Take the part out by hand if it is held, clear the fault at the pendant, then activate it anew.",
+            )
+        if (status := self._link.get("STA")) != ACTIVE:
+            raise DeviceFault(
+                self.name,
+                "claw.not_active",
+                f"the gripper is not activated (STA {status}, {ACTIVE} is active)",
+                recoverable=False,
+                hint="Take the part out of it and keep clear, then activate it at the pendant: its fingers go all the "
+                "way to and fro.",
+            )
+
+
+def _fault_text(fault: int) -> str:
+    return _FAULTS.get(fault & 0x0F, "one that this driver does not know") if fault else "none"

@@ -1,0 +1,245 @@
+"""What linear axes on any stepper drive share: limits, one motion at a time, sweeps, stops that overtake, the end.
+
+A make derives from it and says how its drive is asked and told.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.errors import CellError, ConfigError, InterlockError
+from drivers.interfaces import LinkStatistics
+from drivers.quantities import check_positive, check_range, shown
+from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
+from drivers.rail.sweep import RailSweep
+
+_AT_START_M = 20e-6
+
+Samples = list[tuple[float, float, float]]
+"""Host time in s, position in m, round trip in s of each reading."""
+
+
+class Link(Protocol):
+    """What an axis needs of the link to its drive."""
+
+    @property
+    def stops(self) -> int:
+        """How many stops were asked for: a command is only sent if none came since the caller read this."""
+
+    @property
+    def closed(self) -> bool:
+        """True once `close` was called."""
+
+    def stop(self) -> None:
+        """Stop whatever the drive does; commands issued earlier are refused."""
+
+    def close(self) -> None:
+        """Close the port; every later call raises `NotConnectedError`."""
+
+
+class RailAxis(ABC):
+    """An axis of `travel` (low, high) in m, up to `max_speed` m/s at `acceleration` m/s², `counts` to a metre.
+
+    With `control=False` the drive is only looked at: everything but reading is an `InterlockError`, and a motion that
+    runs on it runs on. Raises `ConfigError` on impossible parameters.
+    """
+
+    _link: Link
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        *,
+        travel: tuple[float, float],
+        max_speed: float,
+        acceleration: float,
+        counts: float,
+        control: bool,
+    ) -> None:
+        for what, value in {"speed": max_speed, "acceleration": acceleration, "counts to a metre": counts}.items():
+            if not value > 0:
+                raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")
+        if not travel[0] < travel[1]:
+            raise ConfigError(f"{name}: travel {travel} m must go from the lower to the higher limit. Correct it")
+        self.name = name
+        self.travel = travel
+        self.statistics = LinkStatistics()
+        self._clock = clock
+        self._counts = counts
+        self._max_speed = max_speed
+        self._acceleration = acceleration
+        self._control = control
+        self._homing = False
+        self._motion: RailMotion | None = None
+        self._motion_issued = 0
+        self._starting = threading.Lock()
+
+    # --- what a make says of its drive ---
+
+    @abstractmethod
+    def _position(self) -> float:
+        """Read the position, m."""
+
+    @abstractmethod
+    def _require_zero(self) -> None:
+        """Raise unless positions mean something: `InterlockError` when it was never homed."""
+
+    @abstractmethod
+    def _begin_homing(self, issued: int) -> None:
+        """Set the drive up and start its search for the reference switch."""
+
+    @abstractmethod
+    def _home_found(self, issued: int) -> bool:
+        """Whether the search has ended at its zero; raises when it never will."""
+
+    @abstractmethod
+    def _send(self, position: float, speed: float, issued: int) -> None:
+        """Send it to `position` m at `speed` m/s."""
+
+    @abstractmethod
+    def _arrival(self, position: float, issued: int, samples: Samples) -> Callable[[], bool]:
+        """What is asked again and again whether it has arrived; appends its readings to `samples`."""
+
+    # --- motions ---
+
+    def home(self) -> RailMotion:
+        """Search the reference switch; position 0 is there afterwards."""
+        length = self.travel[1] - self.travel[0]
+        with self._starting:
+            issued = self._free()
+            self._homing = True
+            try:
+                self._begin_homing(issued)
+            except CellError:
+                self._homing = False
+                raise
+            self._motion = RailMotion(
+                self.name,
+                self._clock,
+                arrived=lambda: self._home_found(issued),
+                halt=self._halt(issued),
+                duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
+            )
+            return self._motion
+
+    def move_to(self, position: float, speed: float | None = None) -> RailMotion:
+        """Move to `position` m at `speed` m/s (default the maximum); refused with `InterlockError` before homing."""
+        check_range(self.name, "position", position, *self.travel, "m")
+        speed = self._checked_speed("speed", self._max_speed if speed is None else speed)
+        with self._starting:
+            issued = self._free()
+            duration = self._start(position, speed, issued)
+            self._motion = RailMotion(
+                self.name,
+                self._clock,
+                arrived=self._arrival(position, issued, []),
+                halt=self._halt(issued),
+                duration=duration,
+            )
+            return self._motion
+
+    def sweep_start(self, start: float, stop: float, speed: float) -> float:
+        """Where the rail has to stand before `sweep`: `start` less the start-up distance; `LimitError` if outside."""
+        return self._sweep_ends(start, stop, speed)[0]
+
+    def sweep(self, start: float, stop: float, speed: float) -> RailSweep:
+        """Move so that the velocity is constant from `start` to `stop`; see `drivers.interfaces.Rail`."""
+        begin, end = self._sweep_ends(start, stop, speed)
+        record: Samples = []
+        with self._starting:
+            issued = self._free()
+            self._require_zero()
+            here = self._position()
+            if abs(here - begin) > self._at_start():
+                raise InterlockError(
+                    self.name,
+                    f"stands at {shown(here, 'm')}, the sweep starts at {shown(begin, 'm')}. "
+                    "Move to sweep_start() first",
+                )
+            duration = self._start(end, speed, issued)
+            sweep = RailSweep(
+                self.name,
+                self._clock,
+                start=start,
+                stop=stop,
+                speed=speed,
+                resolution=1.0 / self._counts,
+                record=record,
+                arrived=self._arrival(end, issued, record),
+                halt=self._halt(issued),
+                duration=duration,
+            )
+            self._motion = sweep
+            return sweep
+
+    def stop(self) -> None:
+        """Stop the motor now; every motion and every command still waiting ends with `Aborted`."""
+        self._require_control()
+        self._homing = False
+        self._link.stop()
+
+    def close(self) -> None:
+        """Stop the motor, unless it is only looked at, and close the port."""
+        if self._link.closed:
+            return
+        try:
+            if self._control:
+                self.stop()
+        finally:
+            self._link.close()
+            if self._motion is not None:
+                self._motion.join(2.0)
+
+    # --- inside ---
+
+    def _at_start(self) -> float:
+        """How far in m the rail may stand from where a sweep begins."""
+        return _AT_START_M
+
+    def _checked_speed(self, what: str, speed: float) -> float:
+        return check_positive(self.name, what, speed, self._max_speed, "m/s")
+
+    def _require_control(self) -> None:
+        if not self._control:
+            raise InterlockError(self.name, "was opened to be looked at only; nothing was sent. Open it for control")
+
+    def _sweep_ends(self, start: float, stop: float, speed: float) -> tuple[float, float]:
+        speed = self._checked_speed("sweep speed", speed)
+        if start == stop:
+            raise InterlockError(self.name, f"a sweep from {shown(start, 'm')} to the same place has no direction")
+        ramp = math.copysign(run_up_distance(speed, self._acceleration) + SWEEP_MARGIN_M, stop - start)
+        begin = check_range(self.name, "sweep start less its start-up", start - ramp, *self.travel, "m")
+        end = check_range(self.name, "sweep stop plus its run-out", stop + ramp, *self.travel, "m")
+        return begin, end
+
+    def _free(self) -> int:
+        """The count of stops to issue a motion under; `InterlockError` while another motion runs."""
+        self._require_control()
+        issued = self._link.stops
+        if self._motion is not None and not self._motion.done:
+            if self._link.stops != self._motion_issued:
+                self._motion.join(2.0)
+            if not self._motion.done:
+                raise InterlockError(self.name, "another motion runs. Wait for it or stop() it first")
+        self._motion_issued = issued
+        return issued
+
+    def _start(self, position: float, speed: float, issued: int) -> float:
+        """Send it there; the seconds that it should take."""
+        self._require_zero()
+        here = self._position()
+        self._send(position, speed, issued)
+        return move_duration(position - here, speed, self._acceleration)
+
+    def _halt(self, issued: int) -> Callable[[], None]:
+        def halt() -> None:
+            if self._link.stops == issued:
+                self.stop()
+
+        return halt

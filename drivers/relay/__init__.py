@@ -1,0 +1,1 @@
+"""Laser and claw on relay boards that hang on a serial port."""

@@ -1,0 +1,188 @@
+"""Two families of relay boards: one that can be asked for its relays and inputs, and one that only listens.
+
+Sources: docs/other-makes.md, section 2.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Protocol
+
+from drivers.errors import DeviceFault
+from drivers.interfaces import Identity
+from drivers.quantities import UNTOLD
+from drivers.relay.port import BadReply, RelayPort
+
+_DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUV"
+"""Relays and inputs as a Numato board counts them: those from 10 on by letters."""
+_PROMPT = b">"
+
+
+class Board(Protocol):
+    """One board, as the device behind `port` uses it. Relays and inputs are counted as the board counts them."""
+
+    port: RelayPort
+
+    @property
+    def reads_back(self) -> bool:
+        """Whether `shows` is what the board says; else it is what was last sent."""
+
+    def identity(self) -> Identity:
+        """Ask the board who it is."""
+
+    def ping(self) -> float:
+        """One harmless round trip in wall seconds; of a board that never answers, that its port is there: 0 s."""
+
+    def switch(self, relay: int, on: bool) -> None:
+        """Set a relay, and see that it took it where the board can be asked."""
+
+    def shows(self, relay: int) -> bool:
+        """What a relay shows; `DeviceFault` (KIND.unknown) where nobody can know."""
+
+    def off_words(self, relay: int) -> list[bytes]:
+        """What a process that outlives this one writes to switch the relay off."""
+
+
+class NumatoBoard:
+    """A board of Numato Lab with an ASCII command line: it echoes each command, answers, and ends with a prompt."""
+
+    reads_back = True
+
+    def __init__(self, port: RelayPort) -> None:
+        self.port = port
+
+    def identity(self) -> Identity:
+        """Its firmware's version and the id of eight characters that can be written into it."""
+        version, number = self._ask("ver"), self._ask("id get")
+        return Identity("Numato relay module", number or UNTOLD, version or UNTOLD, self.port.url)
+
+    def ping(self) -> float:
+        """Ask for its version."""
+        return self.port.ask(b"ver\r", _PROMPT, lambda data: _answer(data, "ver"))[1]
+
+    def switch(self, relay: int, on: bool) -> None:
+        """Set a relay and read it back; `DeviceFault` (KIND.relay) when it shows the other."""
+        self._ask(f"relay {'on' if on else 'off'} {_DIGITS[relay]}")
+        if self.shows(relay) != on:
+            raise DeviceFault(
+                self.port.name,
+                f"{self.port.kind}.relay",
+                f"relay {relay} of {self.port.url} shows {'off' if on else 'on'} after it was switched "
+                f"{'on' if on else 'off'}",
+                recoverable=False,
+                hint="See that the board has this relay and its supply, and that no other program switches it.",
+            )
+
+    def shows(self, relay: int) -> bool:
+        """Ask for a relay's state."""
+        return self._level(f"relay read {_DIGITS[relay]}")
+
+    def input(self, number: int) -> bool:
+        """Ask for an input: whether it is high. The board makes that pin an input with it."""
+        return self._level(f"gpio read {_DIGITS[number]}")
+
+    def off_words(self, relay: int) -> list[bytes]:
+        """An end of whatever the owner had begun, then the command."""
+        return [b"\r", f"relay off {_DIGITS[relay]}\r".encode()]
+
+    def _ask(self, command: str) -> str:
+        return self.port.ask(f"{command}\r".encode(), _PROMPT, lambda data: _answer(data, command))[0]
+
+    def _level(self, command: str) -> bool:
+        def level(data: bytes) -> bool:
+            told = _answer(data, command).lower()
+            if told in ("on", "1"):
+                return True
+            if told in ("off", "0"):
+                return False
+            raise BadReply(f"{told!r} is neither on nor off")
+
+        return self.port.ask(f"{command}\r".encode(), _PROMPT, level)[0]
+
+
+def _answer(data: bytes, command: str) -> str:
+    """The text between the echo of `command` and the prompt."""
+    lines = [line.strip() for line in re.split(r"[\r\n]+", data.decode("ascii", "replace").rstrip(">"))]
+    told = [line for line in lines if line]
+    if not told or told[0] != command:
+        raise BadReply(f"{data!r} came, which does not repeat the command")
+    return " ".join(told[1:])
+
+
+class LcusBoard:
+    """A board of the LCUS kind (CH340 and a microcontroller): four bytes set a relay, and nothing ever comes back.
+
+    What is known of a relay is what was last sent to it over this very port; as soon as the port was opened anew, that
+    is nothing. With `control` each relay that is used is switched off once on connecting, so that it is known.
+    """
+
+    reads_back = False
+
+    def __init__(self, port: RelayPort) -> None:
+        self.port = port
+        self._sent: dict[int, tuple[int, bool]] = {}
+
+    def identity(self) -> Identity:
+        """What the make says of itself: the board tells nothing."""
+        self.port.touch()
+        return Identity("LCUS relay board, cannot be asked", UNTOLD, UNTOLD, self.port.url)
+
+    def ping(self) -> float:
+        """See that the port is there; the board itself answers nothing."""
+        self.port.touch()
+        return 0.0
+
+    def switch(self, relay: int, on: bool) -> None:
+        """Set a relay. Off is said twice: nobody would notice that a byte was lost."""
+        self._sent.pop(relay, None)
+        words = _lcus(relay, on)
+        self.port.tell(words if on else words + words)
+        self._sent[relay] = self.port.opened, on
+
+    def shows(self, relay: int) -> bool:
+        """What was last sent; `DeviceFault` (KIND.unknown) when that is nothing, or was over a link that was lost."""
+        self.port.touch()
+        opened, on = self._sent.get(relay, (0, False))
+        if opened != self.port.opened:
+            raise DeviceFault(
+                self.port.name,
+                f"{self.port.kind}.unknown",
+                f"nobody knows what relay {relay} of {self.port.url} shows: such a board cannot be asked, and nothing "
+                "was sent to it since its port was opened",
+                recoverable=False,
+                hint="Switch it off (stop() does), or look at the lamp on the board.",
+            )
+        return on
+
+    def off_words(self, relay: int) -> list[bytes]:
+        """Twice, as `switch` does."""
+        return [_lcus(relay, False)] * 2
+
+
+def _lcus(relay: int, on: bool) -> bytes:
+    """Start, number of the relay from 1, what to do, and the sum of the three."""
+    head = bytes([0xA0, relay, int(on)])
+    return head + bytes([sum(head) & 0xFF])
+
+
+def open_board(name: str, kind: str, make: str, url: str, *, baud: int) -> NumatoBoard | LcusBoard:
+    """The board of that make ("numato", "lcus") at `url`, as the device `name` of that kind ("laser", "claw") uses it.
+
+    Raises `NotConnectedError` when there is no port, `DeadlineError` when a board that can be asked does not answer.
+    """
+    return (
+        open_numato(name, kind, url, baud=baud)
+        if make == "numato"
+        else LcusBoard(RelayPort(name, kind, url, baud=baud))
+    )
+
+
+def open_numato(name: str, kind: str, url: str, *, baud: int) -> NumatoBoard:
+    """See `open_board`."""
+    board = NumatoBoard(RelayPort(name, kind, url, baud=baud))
+    try:
+        board.ping()
+    except BaseException:
+        board.port.close()
+        raise
+    return board

@@ -1,0 +1,36 @@
+"""Opening a serial port for one program alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import serial
+
+from drivers.errors import NotConnectedError
+
+WRITE_TIMEOUT_S = 2.0
+"""Wall seconds after which a port that takes no bytes counts as stuck."""
+PARITIES = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
+FAILURES = (serial.SerialException, OSError)
+"""What a port raises when its other end is gone."""
+
+
+def open_port(name: str, url: str, *, baud: int, timeout: float, parity: str = "none", stop_bits: int = 1) -> Any:
+    """A device file or pyserial URL, opened; `timeout` in wall seconds is that of a read.
+
+    No other program that asks for a lock has the port meanwhile. Raises `NotConnectedError` for the device `name`.
+    """
+    try:
+        return serial.serial_for_url(
+            url,
+            baudrate=baud,
+            timeout=timeout,
+            write_timeout=WRITE_TIMEOUT_S,
+            parity=PARITIES[parity],
+            stopbits=stop_bits,
+            exclusive=True,
+        )
+    except (*FAILURES, ValueError) as error:
+        raise NotConnectedError(
+            name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
+        ) from error

@@ -1,0 +1,107 @@
+"""Laser and claw in this process that no output of the arm switches: behind their interfaces, straight on the world."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from drivers.errors import DeviceFault, InterlockError
+from drivers.interfaces import Identity, LinkStatistics
+from sim_backends.direct.clock import VirtualClock
+from sim_backends.world.world import World
+
+TAKES_S = 0.01
+"""From a command until the switch has switched, s."""
+_POLL_S = 0.01
+
+
+class _DirectSwitch:
+    """What both share: a switch of the world, "laser" or "claw"."""
+
+    def __init__(self, name: str, world: World, clock: VirtualClock) -> None:
+        self.name = name
+        self.statistics = LinkStatistics()
+        self._world = world
+        self._clock = clock
+
+    def identity(self) -> Identity:
+        """A switch has no plate."""
+        return Identity("simulated switch", "virtual", "virtual", "in this process")
+
+    def ping(self) -> float:
+        """No wire: 0 s."""
+        return 0.0
+
+    def _set(self, on: bool) -> None:
+        self._world.switches[self.name] = on
+        self._clock.sleep(TAKES_S)
+
+
+class DirectLaser(_DirectSwitch):
+    """The line laser; see `drivers.interfaces.Laser`."""
+
+    def __init__(self, name: str, world: World, clock: VirtualClock) -> None:
+        super().__init__(name, world, clock)
+        self._owner = threading.Lock()
+
+    @contextmanager
+    def lit(self) -> Iterator[None]:
+        """On inside the context, off after it."""
+        if not self._owner.acquire(blocking=False):
+            raise InterlockError(self.name, "is already lit by another owner. Wait until that one has finished")
+        try:
+            self._set(True)
+            yield
+        finally:
+            # The world's switch first: waiting may be what ends.
+            self._world.switches[self.name] = False
+            self._owner.release()
+
+    @property
+    def is_on(self) -> bool:
+        """What the world's switch shows."""
+        return self._world.switches[self.name]
+
+    def stop(self) -> None:
+        """Laser off now, whoever has it."""
+        self._world.switches[self.name] = False
+
+    def close(self) -> None:
+        """Laser off."""
+        self.stop()
+
+
+class DirectClaw(_DirectSwitch):
+    """The claw; see `drivers.interfaces.Claw`."""
+
+    def grip(self, timeout: float = 2.0) -> None:
+        """Close; `DeviceFault` (claw.no_part) when no part is held after `timeout` s."""
+        self._set(True)
+        self._held_becomes(
+            True, timeout, "claw.no_part", "See that the part lies between the fingers, then grip again."
+        )
+
+    def release(self, timeout: float = 2.0) -> None:
+        """Open; `DeviceFault` (claw.stuck) when a part is still held after `timeout` s."""
+        self._set(False)
+        self._held_becomes(False, timeout, "claw.stuck", "See whether the part sticks to the fingers.")
+
+    @property
+    def holding(self) -> bool:
+        """Whether the world's claw holds the part."""
+        return self._world.part.held
+
+    def stop(self) -> None:
+        """The claw stays as it is, because opening would drop the part."""
+
+    def close(self) -> None:
+        """The claw stays as it is."""
+
+    def _held_becomes(self, held: bool, timeout: float, code: str, hint: str) -> None:
+        until = self._clock.now() + timeout
+        while self.holding != held:
+            if self._clock.now() >= until:
+                text = f"after {timeout:.3g} s a part is {'not' if held else 'still'} held"
+                raise DeviceFault(self.name, code, text, recoverable=True, hint=hint)
+            self._clock.sleep(_POLL_S)

@@ -1,0 +1,167 @@
+"""Makes beside the stock cell's: their records as docs/other-makes.md prints them, what is refused, no wires."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymodbus.framer import FramerRTU
+
+from cell.config import CellConfig, load_config, tables_of, validate
+from cell.devices.assembly import safe_off_outputs
+from cell.devices.built_in import BUILT_IN
+from cell.devices.contracts import Bench
+from cell.devices.contracts.rail import RailContract
+from cell.devices.contracts.switches import ClawContract, LaserContract
+from cell.devices.described import Described
+from cell.devices.direct import VirtualCell
+from cell.devices.rail_makes import register_map
+from drivers.errors import ConfigError
+from drivers.rail import modbus_link
+from drivers.rail.registers import Number, Rate
+from sim_backends.peers.wired import rail_peer, switch_peers
+from sim_backends.world.drawing import read
+from sim_backends.world.world import World
+from tests.modbus_maps import EDGES, PATHS, RAIL
+from tests.test_direct_contracts import DirectFaults
+
+PRINTED = [
+    tomllib.loads(block)
+    for block in re.findall(
+        r"```toml\n(.*?)```",
+        (Path(__file__).parent.parent / "docs" / "other-makes.md").read_text(encoding="utf-8"),
+        re.DOTALL,
+    )
+]
+MODBUS, NUMATO, LCUS, ROBOTIQ = PRINTED
+
+
+def cell(*tables: dict[str, Any], **changed: Any) -> CellConfig:
+    """The stock cell with these tables instead of its own, and `device__key` values changed."""
+    made = tables_of(None)
+    for table in tables:
+        made |= table
+    for key, value in changed.items():
+        device, _, name = key.partition("__")
+        made[device] = {**made[device], name: value}
+    return validate(CellConfig, made, "cell.toml")
+
+
+@pytest.mark.parametrize("tables", [(MODBUS,), (NUMATO,), (LCUS, ROBOTIQ), (MODBUS, NUMATO, ROBOTIQ)])
+def test_what_the_document_prints_is_a_cell_that_is_simulated_as_it_is_described(tables: tuple[dict[str, Any]]) -> None:
+    """The drawing goes through its text, as it does to the serving process, and every device has its peer."""
+    config = cell(*tables)
+    drawing = Described.of("pot").drawing(config)
+    assert read(drawing.as_json()).cell.wires == drawing.cell.wires
+    world = World(1, "ideal", 1.0, drawing)
+    peers, endpoints = switch_peers(world)
+    for name in endpoints:
+        assert config.make(name).simulated is not None
+    assert set(endpoints) == {name for name in ("laser", "claw") if not config.make(name).on_arm}
+    for peer in (*peers, rail_peer(world)):
+        peer.stop()
+
+
+def test_a_rail_of_another_make_is_another_configuration_for_a_calibration_and_another_switch_is_none() -> None:
+    """What positions mean hangs on the rail's map, where the light plane lies does not hang on the laser's switch."""
+    stock = load_config(None).calibration_hash()
+    with_drive = cell(MODBUS).calibration_hash()
+    assert stock != with_drive
+    turned = {"rail": {**MODBUS["rail"], "counts_per_turn": 4000}}
+    homed_elsewhere = json.loads(json.dumps(MODBUS))
+    homed_elsewhere["rail"]["registers"]["home"]["value"] = 0x21
+    assert len({with_drive, cell(turned).calibration_hash(), cell(homed_elsewhere).calibration_hash()}) == 3
+    witness = {"witness": "0 mm"}
+    assert cell({"laser": {**LCUS["laser"], **witness}}, ROBOTIQ).calibration_hash() == stock
+
+
+def test_no_output_of_the_arm_belongs_to_a_laser_on_a_board() -> None:
+    assert safe_off_outputs(cell(LCUS)) == ()
+    assert [make.name for make in BUILT_IN if make.kind == "claw"] == ["arm_output", "numato", "robotiq"]
+
+
+def registers(**changed: Any) -> dict[str, Any]:
+    return {"rail": {**RAIL, "registers": {**PATHS, **changed}}}
+
+
+@pytest.mark.parametrize(
+    ("tables", "told"),
+    [
+        ((registers(alarm={"address": 0x6203, "words": 1}),), "speed and alarm both use register 0x6203"),
+        ((registers(target={"address": 0x6201, "input": True}),), "input registers cannot be written"),
+        ((registers(moving={"address": 0x1003, "bit": 16}),), "16 is outside the allowed range (allowed: 0 to 15)"),
+        ((registers(home={"address": 70000, "value": 1}),), "70000 is outside the allowed range (allowed: 0 to 65535)"),
+        ((registers(speed={"address": 0x6203, "unit": "mm/s"}),), '"mm/s" is not one of "counts/s"'),
+        ((registers(position={"address": 0x602C, "words": 1}),), "the drive's registers count to 32767"),
+        (({"rail": {key: value for key, value in RAIL.items() if key != "registers"}},), "rail.registers: missing"),
+        ((NUMATO, {"claw": {**NUMATO["claw"], "baud": 115200}}), "laser and claw are both at /dev/ttyACM1"),
+        ((NUMATO, {"claw": {**NUMATO["claw"], "relay": 0}}), "laser.url and claw.url are both"),
+        ((NUMATO, {"rail": {**tables_of(None)["rail"], "url": "/dev/ttyACM1"}}), "each has a port of its own"),
+        (({"laser": {**LCUS["laser"], "relay": 0}},), "relays as the board counts them, from 1"),
+        (({"claw": {**ROBOTIQ["claw"], "force": 300}},), "0 open, slowest, weakest; 255 the other end"),
+        (({"claw": {**ROBOTIQ["claw"], "address": "192.0.2.10"}},), "has no port; write HOST:PORT"),
+        (({"claw": {**LCUS["laser"]}},), '"lcus" is not one of'),
+    ],
+)  # fmt: skip
+def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(
+    tables: tuple[dict[str, Any], ...], told: str
+) -> None:
+    with pytest.raises(ConfigError) as met:
+        cell(*tables)
+    assert told in str(met.value)
+
+
+def test_frames_carry_the_checksum_that_pymodbus_computes() -> None:
+    for frame in (bytes(range(n)) for n in range(2, 40)):
+        assert modbus_link._crc(frame) == FramerRTU.compute_CRC(frame).to_bytes(2, "big")
+
+
+@pytest.mark.parametrize("value", [0, 1, -1, 65_536, -70_000, 2**31 - 1, -(2**31)])
+def test_a_number_of_two_registers_comes_back_in_either_order(value: int) -> None:
+    high, low = Number(0, 2), Number(0, 2, high_first=False)
+    assert high.decode(high.encode(value)) == value == low.decode(low.encode(value))
+    assert high.encode(value) == low.encode(value)[::-1]
+    with pytest.raises(ValueError, match="16 bits"):
+        Number(0).encode(70_000)
+
+
+def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned() -> None:
+    """v²/2a has to hold: the acceleration is rounded up, the time that stands for it down."""
+    for unit in ("rpm/s", "1/6 rps/s", "counts/s^2", "ms to 1000 rpm"):
+        rate = Rate(Number(0), unit)
+        for turns in (0.7, 3.3, 41.7, 100.0, 777.7):
+            assert rate.decode(rate.encode(turns, 4096), 4096) >= turns * (1 - 1e-12)
+
+
+def test_the_map_of_a_drive_reaches_the_driver_as_it_is_written() -> None:
+    made = register_map(cell({"rail": {**RAIL, "registers": EDGES}}).rail.registers)  # type: ignore[attr-defined]
+    assert made.position == Number(0x00CC, 2, True, False)
+    assert made.start.writes == [8, 0]
+    assert made.moving.decode(0) and not made.moving.decode(1 << 5)
+
+
+class _Virtual:
+    NAME = ""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def bench(cls) -> Bench[Any]:
+        virtual = VirtualCell(cell(MODBUS, LCUS, ROBOTIQ), seed=4, level="ideal")
+        device = getattr(virtual.devices, cls.NAME).bare
+        return Bench(lambda: device, virtual.clock, linked=False, faults=DirectFaults(virtual))
+
+
+class TestVirtualRail(_Virtual, RailContract):
+    NAME = "rail"
+
+
+class TestVirtualLaser(_Virtual, LaserContract):
+    NAME = "laser"
+
+
+class TestVirtualClaw(_Virtual, ClawContract):
+    NAME = "claw"

@@ -1,0 +1,178 @@
+"""Laser and claw on relay boards over a pseudo terminal: what is known of a relay, and when; and who else can tell."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+from numato_usb_relay.relay import Relay as VendorsClient
+
+from drivers.clock import Clock
+from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.relay.boards import LcusBoard, open_board, open_numato
+from drivers.relay.port import RelayPort
+from drivers.relay.switched import BoardClaw, BoardLaser
+from sim_backends.peers.relays import LcusPeer, NumatoPeer, RelayBoard
+
+pytestmark = pytest.mark.wire
+
+LASER, CLAW, FEEDBACK = 2, 3, 1
+
+
+@dataclass
+class Wired:
+    """What hangs on the board: a laser, and a claw whose feedback is low while it holds."""
+
+    on: dict[int, bool] = field(default_factory=lambda: {LASER: False, CLAW: True})
+    held: bool = True
+    told: list[tuple[int, bool]] = field(default_factory=list)
+
+    def board(self, first: int) -> RelayBoard:
+        def setter(relay: int) -> object:
+            def set_it(on: bool) -> None:
+                self.told.append((relay, on))
+                self.on[relay] = on
+                self.held = self.held and self.on[CLAW]
+
+            return set_it, lambda: self.on[relay]
+
+        wired = {relay: setter(relay) for relay in self.on}
+        return RelayBoard(wired, {FEEDBACK: lambda: not self.held}, first)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def wired() -> Wired:
+    return Wired()
+
+
+@pytest.fixture
+def numato(wired: Wired) -> Iterator[str]:
+    peer = NumatoPeer(wired.board(0), pty=True)
+    peer.start()
+    yield str(peer.pty)
+    peer.stop()
+
+
+@pytest.fixture
+def lcus(wired: Wired) -> Iterator[LcusPeer]:
+    peer = LcusPeer(wired.board(1), pty=True)
+    peer.start()
+    yield peer
+    peer.stop()
+
+
+def lcus_laser(url: str) -> BoardLaser:
+    return BoardLaser(LcusBoard(RelayPort("laser", "laser", url, baud=9600)), LASER)
+
+
+def becomes(value: bool, wired: Wired, relay: int = LASER) -> bool:
+    """Whether the relay is, within half a second of the wall."""
+    until = time.monotonic() + 0.5
+    while wired.on[relay] != value and time.monotonic() < until:
+        Clock().sleep(0.005)
+    return wired.on[relay] == value
+
+
+def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired) -> None:
+    laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
+    board = open_numato("claw", "claw", numato, baud=19200)
+    claw = BoardClaw(board, CLAW, FEEDBACK, active_high=False, clock=Clock())
+    assert claw.holding
+    with laser.lit():
+        assert (wired.on[LASER], laser.is_on) == (True, True)
+        laser.close()
+        assert not wired.on[LASER]
+    claw.release()
+    assert not claw.holding
+    with pytest.raises(DeviceFault, match="input 1 of the board does not show a held part") as met:
+        claw.grip(0.1)
+    assert met.value.code == "claw.no_part"
+    claw.close()
+    with pytest.raises(NotConnectedError):
+        claw.ping()
+
+
+def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wired: Wired) -> None:
+    client = VendorsClient(numberRelays=8, port=numato, name="usb", timeout=0.1)
+    assert (client.version, client.id) == ("00000009", "sim00001")
+    client.relay_on(LASER)
+    assert becomes(True, wired)
+    assert (client.relay_read(LASER), client.relay_read(5), client.gpio_read(FEEDBACK)) == ("on", "off", "0")
+
+
+def test_a_board_of_another_make_is_told_by_what_it_does_not_answer(lcus: LcusPeer) -> None:
+    with pytest.raises(DeadlineError, match="of this make"):
+        open_board("laser", "laser", "numato", str(lcus.pty), baud=9600)
+
+
+def test_a_board_that_cannot_be_asked_is_first_switched_off_and_said_to_be_so(lcus: LcusPeer, wired: Wired) -> None:
+    wired.on[LASER] = True
+    laser = lcus_laser(str(lcus.pty))
+    assert becomes(False, wired)
+    assert not laser.is_on
+    assert "cannot be asked" in laser.how_known
+    with laser.lit():
+        assert becomes(True, wired)
+    assert becomes(False, wired)
+    assert wired.told[-2:] == [(LASER, False)] * 2
+    laser.close()
+
+
+def test_after_a_lost_link_nobody_knows_such_a_relay_until_it_is_switched_off(lcus: LcusPeer, wired: Wired) -> None:
+    laser = lcus_laser(lcus.url)
+    with pytest.raises(DeviceFault) as lost, laser.lit():
+        assert becomes(True, wired)
+        lcus.drop()
+        Clock().sleep(0.1)
+        _ = laser.is_on
+    assert lost.value.code == "laser.link_lost"
+    # What ends the context opens the port anew, and says it again.
+    assert becomes(False, wired)
+    lcus.drop()
+    Clock().sleep(0.1)
+    for code in ("laser.link_lost", "laser.unknown"):
+        with pytest.raises(DeviceFault) as met:
+            _ = laser.is_on
+        assert met.value.code == code
+    laser.stop()
+    assert not laser.is_on
+    laser.close()
+
+
+def test_who_only_looks_sends_nothing(lcus: LcusPeer, wired: Wired) -> None:
+    laser = BoardLaser(LcusBoard(RelayPort("laser", "laser", str(lcus.pty), baud=9600)), LASER, control=False)
+    with pytest.raises(InterlockError), laser.lit():
+        pass
+    with pytest.raises(DeviceFault, match=r"laser\.unknown"):
+        _ = laser.is_on
+    laser.close()
+    assert wired.told == []
+
+
+OWNER = """
+import sys, time
+from drivers.relay.boards import open_board
+from drivers.relay.switched import BoardLaser
+laser = BoardLaser(open_board("laser", "laser", sys.argv[1], sys.argv[2], baud=9600), 2)
+with laser.lit():
+    print("lit", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("make", ["numato", "lcus"])
+def test_the_laser_goes_off_when_its_owner_is_killed(make: str, wired: Wired, request: pytest.FixtureRequest) -> None:
+    port = request.getfixturevalue(make)
+    url = port if isinstance(port, str) else str(port.pty)
+    with subprocess.Popen([sys.executable, "-c", OWNER, make, url], stdout=subprocess.PIPE) as owner:
+        assert owner.stdout is not None
+        assert owner.stdout.readline() == b"lit\n"
+        assert becomes(True, wired)
+        os.kill(owner.pid, signal.SIGKILL)
+    assert becomes(False, wired)
