@@ -181,7 +181,7 @@ def _camera_check(name: str, other: tuple[str, ...]) -> list[Check]:
         Check(
             f"{kind}_mounting", f"{name}: its mounting, and the board's pitch, from shifted and turned views",
             "the flange by small steps before the board", "5 mm and 12 deg" if kind == "scan" else "30 mm and 12 deg",
-            "15 deg/s, 150 mm/s", "within 5 deg and 20 mm of the drawing, board within 2.5 % of its name",
+            "15 deg/s, 150 mm/s", "within 8 deg and 20 mm of the drawing, board within 2.5 % of its name",
             keys, (f"{kind}_picture",), partial(_mounting, name),
         ),
     ]  # fmt: skip

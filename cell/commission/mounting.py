@@ -21,7 +21,7 @@ from drivers.errors import RefusedError
 
 LEAST_SHIFT_SHARE = 0.2
 """The shortest of three directions in which the flange was shifted, in shares of the longest."""
-SNAP_RAD, SNAP_M = math.radians(5.0), 0.020
+SNAP_RAD, SNAP_M = math.radians(8.0), 0.020
 """A mounting that is this near to a drawn one is that one: rough views tell no more, and calibration does."""
 
 

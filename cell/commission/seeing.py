@@ -27,6 +27,8 @@ TILT = math.radians(15.0)
 RAIL_STEP = 0.015
 """How far apart the places are, m, at which a rail that is not homed is thought to stand."""
 PHOTO_RATE = 10.0
+CENTRED_SHARE = 0.03
+"""How far off its middle, in shares of the picture's width, the board may be."""
 CENTRINGS = 3
 """How often the camera goes on towards what is bright in its picture."""
 LEAST_CONTRAST, LEAST_WAY_SHARE = 25.0, 0.03
@@ -133,6 +135,7 @@ def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
                 continue
             if tried > 1:
                 result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
+            seen, goal = _nearer_the_middle(desk, eye, seen, goal, hand)
             desk.last_views[eye.name] = goal
             return seen
     raise RefusedError(
@@ -140,6 +143,32 @@ def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
         f"light on, the lens in focus at {1e3 * eye.depth:.0f} mm, that the board on the deck is the one of "
         f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reason}"
     )
+
+
+def _nearer_the_middle(desk: Desk, eye: Eye, seen: Seen, goal: pin.SE3, hand: pin.SE3) -> tuple[Seen, pin.SE3]:
+    """The view with the board nearer to the picture's middle, if the camera sits as `hand` has it; else as it is."""
+    way = _off_middle(seen)
+    if np.linalg.norm(way) < CENTRED_SHARE * eye.config.width:
+        return seen, goal
+    nearer = goal * from_parts(hand.rotation @ (np.array([*way, 0.0]) * eye.depth / eye.model.fx))
+    try:
+        desk.mover().to(nearer, f"{eye.name} with its board nearer to the middle")
+        moved = see(desk, eye)
+    except DeviceFault:
+        raise
+    except CellError:
+        moved = None
+    if moved is not None and np.linalg.norm(_off_middle(moved)) < np.linalg.norm(way):
+        return moved, nearer
+    desk.mover().to(goal, "back to where the board was seen")
+    return see(desk, eye), goal
+
+
+def _off_middle(seen: Seen) -> Array:
+    """From the picture's middle to that of the board's points, (2,) px."""
+    width, height = seen.view.size
+    low, high = seen.view.pixels.min(axis=0), seen.view.pixels.max(axis=0)
+    return np.asarray(0.5 * (low + high) - 0.5 * np.array([width - 1, height - 1]))
 
 
 def towards_bright(image: Image) -> Array | None:
