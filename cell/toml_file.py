@@ -64,7 +64,7 @@ def validate(kind: type[T], data: dict[str, Any], where: str) -> T:
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        lines = dict.fromkeys(f"  {_key(problem['loc'])}{_wording(problem)}" for problem in error.errors())
+        lines = dict.fromkeys(f"  {_key(problem['loc'])}{wording(problem)}" for problem in error.errors())
         raise ConfigError(f"{where} is not valid:\n" + "\n".join(lines)) from error
 
 
@@ -75,7 +75,7 @@ def _key(place: tuple[int | str, ...]) -> str:
     return f"{key}: "
 
 
-def _wording(problem: Any) -> str:
+def wording(problem: Any) -> str:
     """What is wrong, for each kind of problem that a record's types can have."""
     kind, value, context = problem["type"], shown(problem.get("input")), problem.get("ctx", {})
     match kind:

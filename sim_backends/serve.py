@@ -31,12 +31,12 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.agilex import AgilexPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.truth import TruthPeer
 from sim_backends.peers.wired import rail_peer, switch_peers
+from sim_backends.peers.wired_vehicle import vehicle_peer
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
@@ -89,7 +89,7 @@ class ServedCell:
         with contextlib.ExitStack() as bound:
             self._arm = _bound(bound, RtdePeer(world.arm, clock))
             self._rail = _bound(bound, rail_peer(world))
-            self._vehicle = _bound(bound, AgilexPeer(world.vehicle, clock))
+            self._vehicle = _bound(bound, vehicle_peer(world))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
                     bound,
@@ -140,7 +140,7 @@ class ServedCell:
         return {
             "arm": {"address": self._arm.address},
             "rail": {"url": self._rail.url},
-            "vehicle": {"interface": self._vehicle.interface, "channel": self._vehicle.channel},
+            "vehicle": self._vehicle.endpoint,
             **{
                 f"{name}_camera": {
                     "address": camera.address,

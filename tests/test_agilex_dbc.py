@@ -8,7 +8,7 @@ import struct
 import pytest
 from cantools.database.can import Database
 
-from drivers.vehicle.can_link import load_database
+from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.odometry import PlanarOdometry
 
 TRACK = 0.583

@@ -15,8 +15,8 @@ from drivers.arm.health import Watched
 from drivers.arm.health import readings as arm_readings
 from drivers.interfaces import Reading
 from drivers.rail.health import readings as rail_readings
+from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.can_interface import CanInterface, parse_interface
-from drivers.vehicle.can_link import load_database
 from drivers.vehicle.health import most_bits
 from drivers.vehicle.health import readings as vehicle_readings
 

@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import cell.job as job_module
+from cell import Cell
+from cell.calibration.store import save_calibration
+from cell.check.fit import require_fit
+from cell.check.place import way_problems
 from cell.config import default_toml, load_config
 from cell.devices.assembly import connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
+from cell.devices.described import Described
+from cell.devices.diagnosis import _vehicle_state
+from cell.devices.direct import VirtualCell
 from cell.job import load_job
+from cell.lab.bench.whole_job import JobRecord
 from cell.steps.drive_to_target import stand_at_target
 from cell.steps.photograph import BoardFix
 from cell.steps.whereabouts import Whereabouts
 from drivers.clock import Clock
-from drivers.errors import InterlockError, RefusedError
+from drivers.errors import ConfigError, InterlockError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
 
 JOB = load_job("pot")[0]
+JOB_FILE = Path(job_module.__file__).parent / "jobs" / "pot.toml"
 
 
 class TestFixedVehicle(DeviceContract):
@@ -44,12 +55,66 @@ def test_it_stands_braked_and_is_not_driven() -> None:
         vehicle.drive(0.1, 0.0)
 
 
-def test_a_configuration_names_it_with_nothing_else(tmp_path: Path) -> None:
+def fixed_cell(folder: Path) -> Path:
+    """The shipped configuration with no vehicle."""
     text = default_toml()
     begin, end = text.index("[vehicle]"), text.index("[scan_camera]")
-    path = tmp_path / "cell.toml"
+    path = folder / "cell.toml"
     path.write_text(text[:begin] + '[vehicle]\ndriver = "fixed"\n\n' + text[end:])
-    config = load_config(path)
+    return path
+
+
+def job_at(folder: Path, *, target: str = "-1050 mm", start: str = "-600 mm") -> Path:
+    """The job `pot` with its target so far from the place, and its start so high."""
+    shutil.copy(JOB_FILE.parent / "pot.stl", folder)
+    text = JOB_FILE.read_text(encoding="utf-8")
+    text = text.replace('target = { translation = ["-1050 mm"', f'target = {{ translation = ["{target}"')
+    text = text.replace('["-3050 mm", "0 mm", "-600 mm"]', f'["-3050 mm", "0 mm", "{start}"]')
+    path = folder / "pot.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_place_out_of_reach_is_refused_with_how_much_is_missing(tmp_path: Path) -> None:
+    """And start and staging, which nothing drives over, are not looked at."""
+    config = load_config(fixed_cell(tmp_path))
+    job, _ = load_job(job_at(tmp_path, start="-100 mm"))
+    assert list(way_problems(job, config)) == []
+    assert "they need one height" in next(way_problems(job, load_config(None)))
+    far, mesh = load_job(job_at(tmp_path, target="-1800 mm"))
+    with pytest.raises(ConfigError, match=r"out of reach; the nearest pose found stays \d+\.\d mm"):
+        require_fit(far, config, mesh)
+
+
+@pytest.mark.parametrize("level", ["nominal", "workshop"])
+def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path, level: str) -> None:
+    config = load_config(fixed_cell(tmp_path))
+    cell = VirtualCell(config, 3, level, Described.of("pot"))
+    assert cell.devices.vehicle.bare.identity().address == "fixed"
+    x, y, yaw = cell.world.vehicle.planar(0.0)
+    assert math.hypot(x + 1.05, y) < JOB.approach.tolerance
+    assert abs(yaw) < JOB.approach.tolerance_angle
+    stood = cell.world.world_from_base(0.0)
+    cell.clock.sleep(0.63)
+    assert np.array_equal(cell.world.world_from_base(0.63), stood)
+    assert cell.truth()["vehicle"]["braked"]
+    assert _vehicle_state(cell.devices.vehicle) == "braked, errors 0x0000"
+
+
+@pytest.mark.campaign
+def test_a_whole_job_ends_placed_without_a_vehicle(placed_pot: JobRecord, tmp_path: Path) -> None:
+    assert placed_pot.calibration is not None
+    cell = fixed_cell(tmp_path)
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    with Cell.open(cell, sim="all", clock="virtual", seed=2, job="pot") as opened:
+        report = opened.run("pot").report
+    assert (report["outcome"], report["end_state"]["collisions"]) == ("placed", [])
+    assert report["truth"]["error_mm"]["d"]["mean"] / report["truth"]["bound_mm"] <= 1.5
+    assert report["steps"][0]["result"]["driven"] is False
+
+
+def test_a_configuration_names_it_with_nothing_else(tmp_path: Path) -> None:
+    config = load_config(fixed_cell(tmp_path))
     assert not config.vehicle.DRIVES
     assert config.calibration_hash() == load_config(None).calibration_hash()
     assert connect_one(config, "vehicle", Clock()).identity().model == "no vehicle, a fixed frame"

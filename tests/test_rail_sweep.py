@@ -40,9 +40,15 @@ def nothing(cell: VirtualCell) -> None:
     """Nobody meddles."""
 
 
-def sweep(meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0, errors: SweepErrors = ERRORS) -> Swath:
+def sweep(
+    meddle: Meddle = nothing,
+    late: float = 0.0,
+    camera_late: float = 0.0,
+    errors: SweepErrors = ERRORS,
+    made: VirtualCell | None = None,
+) -> Swath:
     """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
-    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
     devices = cell.devices
     devices.vehicle.brake()
     devices.interlocks.work_with(CONFIG.calibration_hash())
@@ -94,6 +100,14 @@ def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres() -> None
     # Half a round trip of 0.5 ms of the camera's, at 20 mm/s, and next to nothing of the rail's many readings.
     assert 0.0 < swath.shift < 10e-6
     assert np.sqrt(np.linalg.eigvalsh(swath.covariance)[-1]) == pytest.approx(swath.shift / np.sqrt(3), rel=0.3)
+
+
+def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream() -> None:
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.scan_camera.lingers = 2.0
+    swath = sweep(made=cell)
+    assert cell.world.laser.at(swath.times[-1])
+    assert not cell.world.laser.at(cell.clock.now() - 1.9)
 
 
 def test_a_rail_that_somebody_drives_slower_meanwhile_is_uneven() -> None:

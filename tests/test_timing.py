@@ -11,21 +11,30 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration import ScanCalibration
-from cell.calibration.collect.timing import collect_timing
+from cell.calibration.collect.timing import collect_timing, look_at_shutter
 from cell.calibration.solve.reference import Reference
 from cell.calibration.solve.results import KEPT, Quality
 from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing
-from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_timing
+from cell.calibration.timing import Shutter, Timing, changed, link_of
+from cell.calibration.timing_fit import (
+    TimedFrame,
+    TimedSweep,
+    find_shutter,
+    find_timing,
+    refuse_late,
+    refuse_rolling,
+    roughly_late,
+)
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
 from cell.inversion import NominalSurface
 from cell.job import load_job
-from cell.lab.bench.whole_job import run_whole_job
+from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
+from cell.steps.laser_sweep import times_known
 from cell.steps.moves import Mover
 from cell.vision import BoardView, parse_board
 from drivers.errors import RefusedError
@@ -37,7 +46,7 @@ CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 BOARD = parse_board("chessboard:9x7:3mm")
 FAR_MM = 130.0
 MOST_LATE_S, LEAD_M = 2e-3, 2e-3
-FOUND = Timing(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9)
+FOUND = Timing(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(CONFIG))
 
 
 def calibration() -> ScanCalibration:
@@ -93,7 +102,7 @@ def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() ->
     here, off = pin.SE3.Identity(), []
     for seed in range(10):
         late = np.random.default_rng(100 + seed).uniform(-0.5e-3, 2e-3)
-        found = find_timing(calibration(), here, sweeps(seed, late), MOST_LATE_S, LEAD_M)
+        found = find_timing(calibration(), here, sweeps(seed, late), MOST_LATE_S, LEAD_M, {})
         assert found.sigma < 0.12e-3
         assert abs(found.readout) < 0.1e-3
         assert found.play == pytest.approx(12e-6, abs=4 * found.play_sigma)
@@ -104,7 +113,9 @@ def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() ->
 
 def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatters() -> None:
     """A link whose shortest round trip is kept: what it left open once, it leaves open in every sweep."""
-    found = find_timing(calibration(), pin.SE3.Identity(), sweeps(5, 1e-3 + 0.2e-3, jitter=0.0), MOST_LATE_S, LEAD_M)
+    found = find_timing(
+        calibration(), pin.SE3.Identity(), sweeps(5, 1e-3 + 0.2e-3, jitter=0.0), MOST_LATE_S, LEAD_M, {}
+    )
     assert found.sigma == pytest.approx(0.25e-3 / np.sqrt(3), rel=0.1)
     assert abs(found.late - 1e-3) < 2 * found.sigma
 
@@ -121,13 +132,69 @@ def test_clocks_that_are_off_alike_in_all_sweeps_are_stated_though_nothing_scatt
 )
 def test_what_no_correction_mends_is_refused_by_name(spoilt: dict[str, float], words: str) -> None:
     with pytest.raises(RefusedError, match=words):
-        find_timing(calibration(), pin.SE3.Identity(), sweeps(3, **{"late": 0.5e-3, **spoilt}), MOST_LATE_S, LEAD_M)
+        find_timing(calibration(), pin.SE3.Identity(), sweeps(3, **{"late": 0.5e-3, **spoilt}), MOST_LATE_S, LEAD_M, {})
 
 
 def test_sweeps_that_hardly_show_the_board_are_refused() -> None:
     few = [replace(one, frames=one.frames[:2]) for one in sweeps(1, 0.0)]
     with pytest.raises(RefusedError, match="2 pictures of the sweep at \\+40 mm/s"):
-        find_timing(calibration(), pin.SE3.Identity(), few, MOST_LATE_S, LEAD_M)
+        find_timing(calibration(), pin.SE3.Identity(), few, MOST_LATE_S, LEAD_M, {})
+
+
+def test_one_sweep_to_and_fro_tells_a_rolling_shutter() -> None:
+    here = pin.SE3.Identity()
+    found = find_shutter(calibration(), here, sweeps(3, 1e-3, readout=12e-3)[:2], {})
+    assert found.readout == pytest.approx(12e-3, abs=4 * found.sigma)
+    assert found.sigma < 0.15e-3
+    with pytest.raises(RefusedError, match=r"rolling shutter: its last row is exposed 12\.0 ms after"):
+        refuse_rolling(found.readout, found.sigma)
+    found = find_shutter(calibration(), here, sweeps(4, 1e-3)[:2], {})
+    refuse_rolling(found.readout, found.sigma)
+    crawling = [replace(one, velocity=1e-2 * one.velocity) for one in sweeps(4, 1e-3)[:2]]
+    with pytest.raises(RefusedError, match="known to ±"):
+        find_shutter(calibration(), here, crawling, {})
+
+
+@pytest.mark.parametrize("late", [0.0, 1.5e-3, -1e-3, 30e-3])
+def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) -> None:
+    found, sigma = roughly_late(calibration(), pin.SE3.Identity(), sweeps(6, late)[:2])
+    assert sigma < 0.5e-3
+    assert abs(found - late) < 3 * sigma
+    if late > MOST_LATE_S:
+        with pytest.raises(RefusedError, match=r'come (29|30)\.\d+ ms late, .*scan_camera.late = "3[01] ms"'):
+            refuse_late(found, sigma, MOST_LATE_S)
+    else:
+        refuse_late(found, sigma, MOST_LATE_S)
+
+
+def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:
+    assert placed_pot.calibration is not None
+    shutter = placed_pot.calibration.scan.shutter
+    assert shutter is not None
+    assert abs(shutter.readout) < 5 * shutter.sigma < 0.25e-3
+    assert times_known(placed_pot.calibration.scan, CONFIG) == (None, ())
+
+
+def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord) -> None:
+    made = placed_pot.calibration
+    assert made is not None
+    cell = VirtualCell(CONFIG, 2, "nominal+rolling_shutter")
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
+    with pytest.raises(RefusedError, match=r"rolling shutter: its last row is exposed (9\.9|10\.0|10\.1) ms after"):
+        look_at_shutter(CONFIG, cell.devices, mover, made, lambda: None, lambda what, frame: None)
+
+
+def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord) -> None:
+    made = placed_pot.calibration
+    assert made is not None
+    spoilt = replace(made, scan=replace(made.scan, shutter=None))
+    short = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"travel": (0.04, 0.055)})})
+    cell = VirtualCell(CONFIG, 2)
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
+    seen = look_at_shutter(short, cell.devices, mover, spoilt, lambda: None, lambda what, frame: None)
+    assert seen.scan.shutter is None
+    assert "whether the scan camera has a rolling shutter was not seen: the fine board stays" in seen.scan.notes[-1]
 
 
 def test_it_is_stored_with_the_calibration() -> None:
@@ -136,6 +203,42 @@ def test_it_is_stored_with_the_calibration() -> None:
     assert "timing" not in calibration().as_dict()
     with pytest.raises(ValueError, match="time stamps"):
         Timing.read(FOUND.as_dict() | {"sigma": 0.0})
+
+
+SPOILT = [{"sigma": 0.0}, {"late": float("nan")}, {"late": "much"}, {"link": None}, {"made": None}]
+
+
+@pytest.mark.parametrize("spoilt", SPOILT)
+def test_kept_lateness_that_cannot_be_read_is_left_out_by_name_and_the_calibration_holds(
+    spoilt: dict[str, object],
+) -> None:
+    head = replace(calibration(), timing=FOUND, shutter=Shutter(1e-5, 2e-5, link_of(CONFIG)))
+    stored = head.as_dict()
+    read = ScanCalibration.from_dict(stored | {"timing": stored["timing"] | spoilt})
+    assert read.timing is None
+    assert read.shutter == head.shutter
+    timing, doubts = times_known(read, CONFIG)
+    assert timing is None
+    assert len(doubts) == 1
+    assert "timing cannot be read" in doubts[0]
+    assert "scan_camera.late until `cell calibrate timing`" in doubts[0]
+
+
+def test_times_hold_for_the_settings_they_were_measured_with() -> None:
+    """By the rail's baud rate, that is when its readings come; where a device is does not matter, nor what it sees."""
+    faster = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"baud": 115200})})
+    elsewhere = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"url": "/dev/ttyACM7"})})
+    assert changed(link_of(CONFIG), link_of(elsewhere)) == ""
+    assert changed(link_of(CONFIG), link_of(faster)) == "rail.baud was 9600, is 115200"
+    head = replace(calibration(), timing=FOUND)
+    assert times_known(head, CONFIG) == (FOUND, ())
+    timing, (late, shutter) = times_known(head, faster)
+    assert timing is None
+    assert "with other settings (rail.baud was 9600, is 115200)" in late
+    assert "rolling shutter is not known" in shutter
+    less = CONFIG.model_copy(update={"scan_camera": CONFIG.scan_camera.model_copy(update={"late": 1e-3})})
+    assert "it is 1.4 ms, scan_camera.late and rail.late allow 1 ms" in times_known(head, less)[1][0]
+    assert times_known(calibration(), CONFIG)[1] == (shutter,)
 
 
 def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:

@@ -16,7 +16,7 @@ from cell.devices.rules import RULES
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
-from drivers.vehicle.can_link import load_database
+from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams

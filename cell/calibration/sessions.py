@@ -8,7 +8,7 @@ from typing import Any
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
-from cell.calibration.collect.timing import collect_timing
+from cell.calibration.collect.timing import collect_timing, look_at_shutter
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.finding import find_calibration
 from cell.calibration.store import (
@@ -80,7 +80,9 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
         tell(0.96, "solving")
         observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
-        return observations, solve_observations(observations).calibration
+        made = solve_observations(observations).calibration
+        tell(0.98, "looking at the scan camera's shutter")
+        return observations, look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
 
     observations, calibration = cell.recorded(run, "calibration", work)
     save_with_observations(calibration, observations, cell.calibrations_folder)

@@ -136,7 +136,8 @@ class CellCalibration:
                 "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation],
             },
             "target_quality": _quality(target.quality),
-            "notes": list(scan.notes),
+            "shutter": None if scan.shutter is None else scan.shutter.summary(),
+            "notes": [*scan.notes, *scan.unread],
         }
 
 

@@ -1,6 +1,8 @@
-"""How late the scan camera's time stamps come against the rail's positions, as kept with a calibration.
+"""How late the scan camera's stamps come against the rail's positions, and its shutter, as kept with a calibration.
 
-Found by `cell.calibration.timing_fit`, from sweeps of `cell.calibration.collect.timing`.
+Found by `cell.calibration.timing_fit`, from sweeps of `cell.calibration.collect.timing`. Both hold for the settings of
+camera and rail with which they were found: another driver, packet size or baud rate makes stamps or readings come
+otherwise.
 """
 
 from __future__ import annotations
@@ -11,6 +13,60 @@ from typing import Any
 
 import numpy as np
 
+from cell.config import CellConfig
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig
+
+LINKED: dict[str, type[DeviceConfig]] = {"scan_camera": CameraConfig, "rail": RailConfig}
+"""The devices whose times are compared. What their makes ask for beyond this is how they are linked and set up."""
+
+
+def link_of(config: CellConfig) -> dict[str, str]:
+    """Every setting of the scan camera's and the rail's make, by "device.key", but not where the device is."""
+    made: dict[str, str] = {}
+    for name, kind in LINKED.items():
+        record = config.device(name)
+        own = type(record).model_fields.keys() - kind.model_fields.keys() - {type(record).ADDRESS} | {"driver"}
+        made |= {f"{name}.{key}": str(getattr(record, key)) for key in sorted(own)}
+    return made
+
+
+def most_late(config: CellConfig) -> float:
+    """The most, s, that stamps may be late against the rail's readings, as the configuration has it."""
+    return config.scan_camera.late + config.rail.late
+
+
+def changed(was: dict[str, str], now: dict[str, str]) -> str:
+    """What is set otherwise, for people; "" where nothing is."""
+    names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
+    return "; ".join(f"{name} was {was.get(name, 'not there')}, is {now.get(name, 'not there')}" for name in names)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """The scan camera's last row is exposed `readout` ± `sigma` s after its first one, set up as `link` says."""
+
+    readout: float
+    sigma: float
+    link: dict[str, str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return dict(vars(self))
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Shutter | None:
+        """From storage; KeyError, TypeError, AttributeError or ValueError when it is none."""
+        if data is None:
+            return None
+        made = cls(float(data["readout"]), float(data["sigma"]), _link(data))
+        if not (np.isfinite(made.readout) and 0 < made.sigma < np.inf):
+            raise ValueError(f"a readout of {made.readout} ± {made.sigma} s")
+        return made
+
+    def summary(self) -> dict[str, float]:
+        """For reports and people, units in the names."""
+        return {"readout_ms": round(1e3 * self.readout, 4), "sigma_ms": round(1e3 * self.sigma, 4)}
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -18,7 +74,7 @@ class Timing:
 
     `play` ± `play_sigma` m is by how much the carriage stands otherwise when it came from the other side; `readout` ±
     `readout_sigma` s from the first row's exposure to the last one's; `by_exposure` s of lateness per s of exposure.
-    `made` is in seconds since the epoch.
+    `made` is in seconds since the epoch, `link` how camera and rail were set up.
     """
 
     late: float
@@ -29,20 +85,31 @@ class Timing:
     readout_sigma: float
     by_exposure: float
     made: float
+    link: dict[str, str]
 
-    def as_dict(self) -> dict[str, float]:
+    def as_dict(self) -> dict[str, Any]:
         """For storage."""
         return dict(vars(self))
 
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> Timing | None:
-        """From storage; KeyError, TypeError or ValueError when it is none."""
+        """From storage; KeyError, TypeError, AttributeError or ValueError when it is none."""
         if data is None:
             return None
-        made = cls(**{name: float(data[name]) for name in cls.__dataclass_fields__})
-        if not (np.isfinite(list(vars(made).values())).all() and made.sigma > 0):
+        figures = {name: float(data[name]) for name in cls.__dataclass_fields__ if name != "link"}
+        made = cls(**figures, link=_link(data))
+        if not (np.isfinite(list(figures.values())).all() and made.sigma > 0):
             raise ValueError(f"time stamps that are {made.late} ± {made.sigma} s late")
         return made
+
+    def doubt(self, config: CellConfig) -> str:
+        """Why it does not hold for the cell as it is configured now, for people; "" where it does."""
+        if told := changed(self.link, link_of(config)):
+            return f"it was measured with other settings ({told})"
+        most = most_late(config)
+        if abs(self.late) > most + 3 * self.sigma:
+            return f"it is {1e3 * self.late:g} ms, scan_camera.late and rail.late allow {1e3 * most:g} ms"
+        return ""
 
     @property
     def date(self) -> str:
@@ -61,3 +128,7 @@ class Timing:
             "late_per_exposure": round(self.by_exposure, 4),
             "date": self.date,
         }
+
+
+def _link(data: dict[str, Any]) -> dict[str, str]:
+    return {str(name): str(value) for name, value in data["link"].items()}

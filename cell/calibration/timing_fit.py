@@ -18,7 +18,7 @@ import pinocchio as pin
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.blocks import BOARD, POSITION, State, dots_block
 from cell.calibration.solve.results import ScanCalibration
-from cell.calibration.timing import Timing
+from cell.calibration.timing import Shutter, Timing
 from cell.calibration.verify.evidence import dots_of
 from cell.geometry.camera import Array
 from cell.vision import BoardView
@@ -33,6 +33,8 @@ SURE = 5.0
 LEAST_READOUT_S = 0.5e-3
 BY_EXPOSURE = 0.25
 """Cameras stamp the beginning, the middle or the end of an exposure: 0, 0.5 or 1 of its length later."""
+USUAL_PLAY_M = 30e-6
+"""One standard deviation of the play of a screw that nobody has measured."""
 _TIME_S, _PLACE_M = 0.15e-3, 1e-6
 """About what a sweep's times and its places scatter by: only their ratio counts, what they are shows in the sweeps."""
 _ROUNDS = 3
@@ -49,34 +51,65 @@ class TimedFrame:
 @dataclass(frozen=True, eq=False)
 class TimedSweep:
     """The frames of one sweep over the board at `velocity` m/s, negative backwards, each exposed for `exposure` s; the
-    camera's clock was known to ±`bound` s."""
+    camera's clock was known to ±`bound` s, the times of the rail's readings to ±`rail_bound` s."""
 
     velocity: float
     exposure: float
     bound: float
     frames: Sequence[TimedFrame]
+    rail_bound: float = 0.0
+
+
+def find_shutter(
+    scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep], link: dict[str, str]
+) -> Shutter:
+    """From sweeps to and fro, the arm standing at `base_from_flange`, camera and rail set up as `link` says.
+
+    Raises `RefusedError` where the sweeps do not tell; whether the shutter will do is for `refuse_rolling` to say.
+    """
+    _require_frames(sweeps)
+    _, slopes, _ = _displacements(scan, base_from_flange, sweeps)
+    readout, sigma = _readout(slopes, sweeps)
+    if sigma > WANTED_S:
+        raise RefusedError(
+            f"how the scan camera's rows are exposed is known to ±{1e3 * sigma:.2f} ms only",
+            Measured("readout of the scan camera, one sigma", 1e3 * sigma, "ms", most=1e3 * WANTED_S),
+        )
+    return Shutter(readout, sigma, link)
+
+
+def roughly_late(scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep]) -> tuple[float, float]:
+    """How late the stamps come, s, and its deviation, from sweeps at one speed, to and fro.
+
+    One speed does not tell lateness from the play of a screw: what a usual one makes of it is in the deviation.
+    """
+    _require_frames(sweeps)
+    shifts, _, _ = _displacements(scan, base_from_flange, sweeps)
+    velocities = np.array([sweep.velocity for sweep in sweeps for _ in sweep.frames])
+    (_, late), (_, sigma), _ = _least_squares(
+        np.column_stack([np.ones(len(shifts)), velocities]), shifts, np.ones(len(shifts))
+    )
+    by_play = 0.5 * USUAL_PLAY_M / float(np.mean(np.abs(velocities)))
+    by_clocks = np.sqrt(np.mean([sweep.bound**2 + sweep.rail_bound**2 for sweep in sweeps]) / 3.0)
+    return float(late), float(np.sqrt(sigma**2 + by_play**2 + by_clocks**2))
 
 
 def find_timing(
-    scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep], most_late: float, lead: float
+    scan: ScanCalibration,
+    base_from_flange: pin.SE3,
+    sweeps: Sequence[TimedSweep],
+    most_late: float,
+    lead: float,
+    link: dict[str, str],
 ) -> Timing:
     """From sweeps at two speeds and two exposures, to and fro, the arm standing at `base_from_flange`.
 
-    The rail's screw moves the carriage by `lead` m a turn.
+    The rail's screw moves the carriage by `lead` m a turn; camera and rail are set up as `link` says.
 
     Raises `RefusedError` for a rolling shutter, for stamps that depend on the exposure, for ones later than `most_late`
     s, and when the sweeps differ among themselves by more than `WANTED_S` leaves room for.
     """
-    if scan.reference is None:
-        raise CalibrationStale(
-            "the stored calibration holds no reference, an older program made it; run `cell calibrate`"
-        )
-    for sweep in sweeps:
-        if len(sweep.frames) < LEAST_FRAMES:
-            raise RefusedError(
-                f"{len(sweep.frames)} pictures of the sweep at {1e3 * sweep.velocity:+.0f} mm/s show the fine board, "
-                f"{LEAST_FRAMES} are needed: clean it, see that it is lit, and run `cell calibrate timing` again"
-            )
+    _require_frames(sweeps)
     shifts, slopes, places = _displacements(scan, base_from_flange, sweeps)
     of = np.repeat(np.arange(len(sweeps)), [len(sweep.frames) for sweep in sweeps])
     velocities = np.array([sweep.velocity for sweep in sweeps])
@@ -94,12 +127,37 @@ def find_timing(
     sigma = np.sqrt(sigma**2 + max(0.0, common))
     longer = np.column_stack([columns, velocities * (exposures - exposures.mean())])
     by_exposure, by_sigma = (float(v[3]) for v in _least_squares(longer, offsets, weights)[:2])
-    by_row = np.column_stack([np.ones(len(of)), velocities[of]])
-    readout, readout_sigma = (float(v[1]) for v in _least_squares(by_row, slopes, np.ones(len(of)))[:2])
-    found = float(late), float(sigma), float(play), float(play_sigma), readout, readout_sigma, by_exposure
-    made = Timing(*found, time.time())
+    found = float(late), float(sigma), float(play), float(play_sigma), *_readout(slopes, sweeps), by_exposure
+    made = Timing(*found, time.time(), link)
     _require(made, by_sigma, most_late)
     return made
+
+
+def refuse_rolling(readout: float, sigma: float) -> None:
+    """Raise `RefusedError` for a last row that is exposed `readout` ± `sigma` s after the first one."""
+    if abs(readout) > max(LEAST_READOUT_S, SURE * sigma):
+        raise RefusedError(
+            f"the scan camera has a rolling shutter: its last row is exposed {1e3 * readout:.1f} ms after its "
+            f"first one, allowed are {1e3 * LEAST_READOUT_S:g} ms. Switch it to a global shutter, or take another one",
+            Measured("readout of the scan camera", 1e3 * readout, "ms", most=1e3 * LEAST_READOUT_S),
+        )
+
+
+def _require_frames(sweeps: Sequence[TimedSweep]) -> None:
+    for sweep in sweeps:
+        if len(sweep.frames) < LEAST_FRAMES:
+            raise RefusedError(
+                f"{len(sweep.frames)} pictures of the sweep at {1e3 * sweep.velocity:+.0f} mm/s show the fine board, "
+                f"{LEAST_FRAMES} are needed: clean it, see that it is lit, and run `cell calibrate timing` again"
+            )
+
+
+def _readout(slopes: Array, sweeps: Sequence[TimedSweep]) -> tuple[float, float]:
+    """The readout and its deviation, s, from how much farther the last row of each frame has the carriage, m."""
+    velocities = np.array([sweep.velocity for sweep in sweeps for _ in sweep.frames])
+    by_row = np.column_stack([np.ones(len(velocities)), velocities])
+    found, sigma, _ = _least_squares(by_row, slopes, np.ones(len(velocities)))
+    return float(found[1]), float(sigma[1])
 
 
 def _displacements(
@@ -107,7 +165,10 @@ def _displacements(
 ) -> tuple[Array, Array, Array]:
     """For each frame how much farther the carriage is read to be than the picture has it, m, how much farther on the
     last row has it than the first, m, and the reading, m."""
-    assert scan.reference is not None
+    if scan.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference, an older program made it; run `cell calibrate`"
+        )
     state = State(
         scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
     )  # fmt: skip
@@ -146,12 +207,7 @@ def _least_squares(columns: Array, values: Array, weights: Array) -> tuple[Array
 
 def _require(made: Timing, by_sigma: float, most_late: float) -> None:
     """Raise `RefusedError` for what no correction of the stamps mends."""
-    if abs(made.readout) > max(LEAST_READOUT_S, SURE * made.readout_sigma):
-        raise RefusedError(
-            f"the scan camera has a rolling shutter: its last row is exposed {1e3 * made.readout:.1f} ms after its "
-            f"first one, allowed are {1e3 * LEAST_READOUT_S:g} ms. Switch it to a global shutter, or take another one",
-            Measured("readout of the scan camera", 1e3 * made.readout, "ms", most=1e3 * LEAST_READOUT_S),
-        )
+    refuse_rolling(made.readout, made.readout_sigma)
     if abs(made.by_exposure) > max(BY_EXPOSURE, SURE * by_sigma):
         raise RefusedError(
             f"the scan camera's time stamps come later by {made.by_exposure:.2f} times what an exposure is longer, "
@@ -166,10 +222,16 @@ def _require(made: Timing, by_sigma: float, most_late: float) -> None:
             "calibrate timing` again; until then jobs go on with scan_camera.late",
             Measured("time stamps, one sigma", 1e3 * made.sigma, "ms", most=1e3 * WANTED_S),
         )
-    if abs(made.late) > most_late + 3 * made.sigma:
+    refuse_late(made.late, made.sigma, most_late)
+
+
+def refuse_late(late: float, sigma: float, most_late: float) -> None:
+    """Raise `RefusedError` for stamps that come `late` ± `sigma` s late, which is more than `most_late` s."""
+    if abs(late) > most_late + 3 * sigma:
         raise RefusedError(
-            f"the scan camera's time stamps come {1e3 * made.late:.2f} ms late, scan_camera.late allows "
+            f"the scan camera's time stamps come {1e3 * late:.2f} ms late, scan_camera.late allows "
             f"{1e3 * most_late:g} ms: see the camera's and its driver's settings, or, if that is how this camera is, "
-            f'write scan_camera.late = "{np.ceil(1e3 * abs(made.late)):g} ms" and run `cell calibrate timing` again',
-            Measured("time stamps are late by", 1e3 * made.late, "ms", most=1e3 * most_late),
+            f'write scan_camera.late = "{np.ceil(1e3 * abs(late)):g} ms", calibrate again and run `cell calibrate '
+            "timing`",
+            Measured("time stamps are late by", 1e3 * late, "ms", most=1e3 * most_late),
         )

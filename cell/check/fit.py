@@ -79,15 +79,17 @@ def _speeds(job: Job, config: CellConfig) -> Iterator[str]:
             f"{1e3 * room:g} mm"
         )
     fastest = (rail.max_speed, "rail.max_speed") if by_rail else (arm.max_tool_speed, "arm.max_tool_speed")
-    for name, asked, allowed, limit in (
+    speeds = [
         ("scan.speed", scan.speed, *fastest),
-        ("approach.speed", job.approach.speed, config.vehicle.max_speed, "vehicle.max_speed"),
         ("place.speed", job.place.speed, arm.max_tool_speed, "arm.max_tool_speed"),
-    ):
+    ]
+    if config.vehicle.DRIVES:
+        speeds.insert(1, ("approach.speed", job.approach.speed, config.vehicle.max_speed, "vehicle.max_speed"))
+    for name, asked, allowed, limit in speeds:
         if asked > allowed:
             yield f"{name} {1e3 * asked:g} mm/s exceeds {limit}, {1e3 * allowed:g} mm/s"
     poses = [pose.se3().translation for pose in (job.approach.start, job.approach.staging, job.approach.target)]
-    way = float(np.linalg.norm(poses[1] - poses[0]) + np.linalg.norm(poses[2] - poses[1]))
+    way = float(np.linalg.norm(poses[1] - poses[0]) + np.linalg.norm(poses[2] - poses[1])) * config.vehicle.DRIVES
     descent = 2 * job.place.approach / job.place.speed + 2 * job.place.contact_travel / job.place.contact_speed
     for what, time, longest, remedy in (
         (f"the way of {way:.2f} m at approach.speed", way / job.approach.speed, LONGEST_DRIVE_S, "approach.speed"),
@@ -121,11 +123,14 @@ def _boards(job: Job, config: CellConfig) -> Iterator[str]:
 
 
 def _sight(job: Job, config: CellConfig) -> Iterator[str]:
-    """The board has to be seen while the vehicle drives, from staging to target, with the arm in its looking pose."""
+    """The board has to be seen with the arm in its looking pose, from staging to target while the vehicle drives."""
     board, camera = parse_board(job.board.spec), nominal_camera(config.target_camera)
     hand = config.target_camera.flange_from_camera.se3()
     vehicle_from_camera = config.arm.vehicle_from_base.se3() * look_pose(config, job, board, hand) * hand
-    for name, stand in (("staging", job.approach.staging), ("target", job.approach.target)):
+    stands = {"staging": job.approach.staging, "target": job.approach.target}
+    if not config.vehicle.DRIVES:
+        del stands["staging"]
+    for name, stand in stands.items():
         camera_from_board = (stand.se3() * vehicle_from_camera).inverse() * job.place_from_board
         points = transform(camera_from_board, board.points())
         middle = points.mean(axis=0)

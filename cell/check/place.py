@@ -36,22 +36,36 @@ SCANNED_ACROSS = 0.02
 
 
 def way_problems(job: Job, config: CellConfig) -> Iterator[str]:
-    """What is wrong with the vehicle's poses: not on one floor, in the wrong order, or through the table."""
+    """What is wrong with the vehicle's poses: not on one floor, in the wrong order, or through the table.
+
+    Of an arm on a fixed frame only the target counts.
+    """
     plan = job.approach
-    named = {"start": plan.start.se3(), "staging": plan.staging.se3(), "target": plan.target.se3()}
+    named = {"target": plan.target.se3()}
+    if config.vehicle.DRIVES:
+        named = {"start": plan.start.se3(), "staging": plan.staging.se3(), **named}
     heights = [pose.translation[2] for pose in named.values()]
     tilted = [name for name, pose in named.items() if pose.rotation[2, 2] < math.cos(math.radians(0.5))]
     if tilted:
         yield f"approach.{tilted[0]} is tilted; the vehicle stands upright, only the third angle may differ from 0 deg"
         return
-    if max(heights) - min(heights) > 0.001 or not -2.0 <= heights[2] <= 0.0:
+    if max(heights) - min(heights) > 0.001 or not -2.0 <= heights[-1] <= 0.0:
         shown = ", ".join(f"{1e3 * z:g}" for z in heights)
         yield (
-            f"approach: start, staging and target stand at {shown} mm above the table's top; they need one height, the "
-            "floor's (allowed: -2000 to 0 mm)"
+            f"approach: {', '.join(named)} at {shown} mm above the table's top; they need one height, the floor's "
+            "(allowed: -2000 to 0 mm)"
         )
         return
-    start, staging, target = (Planar.of(pose) for pose in named.values())
+    stands = {name: Planar.of(pose) for name, pose in named.items()}
+    yield from _order_problems(stands)
+    yield from _table_problems(stands, heights[-1], job, config)
+
+
+def _order_problems(stands: dict[str, Planar]) -> Iterator[str]:
+    """Staging lies between start and target, and the way there is about straight."""
+    if len(stands) == 1:
+        return
+    start, staging, target = stands.values()
     ahead = [(target.inverse() * pose).x for pose in (start, staging)]
     if not ahead[0] <= ahead[1] + 1e-6 <= 2e-6:
         yield (
@@ -66,15 +80,23 @@ def way_problems(job: Job, config: CellConfig) -> Iterator[str]:
                 f"{math.degrees(beside.yaw):.0f} deg (allowed: {1e3 * ASIDE:.0f} mm, "
                 f"{math.degrees(MAX_HEADING):.0f} deg)"
             )
+
+
+def _table_problems(stands: dict[str, Planar], height: float, job: Job, config: CellConfig) -> Iterator[str]:
+    """The first place of the way where the deck comes too close to the table."""
+    plan = job.approach
     deck, table = vehicle_bodies()[0], station_bodies(pin.SE3.Identity(), from_parts((0.0, 0.0, 0.1)))[0]
     base = config.arm.vehicle_from_base.se3()
-    for (before, after), (first, second) in zip(pairwise(named), pairwise((start, staging, target)), strict=True):
+    only = next(iter(stands.items()))
+    ways = list(pairwise(stands.items())) or [(only, only)]
+    for (before, first), (after, second) in ways:
         for share in np.linspace(0.0, 1.0, 2 + int(np.hypot(second.x - first.x, second.y - first.y) / STEP)):
-            stand = _between(first, second, float(share), heights[2])
+            stand = _between(first, second, float(share), height)
             if (room := _distance(deck, stand * base, table, pin.SE3.Identity())) < plan.tolerance:
                 x, y = (1e3 * v for v in stand.translation[:2])
+                where = f"between {before} and {after}" if before != after else f"at {after}"
                 yield (
-                    f"approach: between {before} and {after}, at ({x:.0f}, {y:.0f}) mm, the vehicle comes to "
+                    f"approach: {where}, at ({x:.0f}, {y:.0f}) mm, the vehicle comes to "
                     f"{1e3 * max(0.0, room):.0f} mm of the table (allowed: at least approach.tolerance, "
                     f"{1e3 * plan.tolerance:g} mm)"
                 )

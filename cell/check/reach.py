@@ -51,6 +51,20 @@ def reach_problems(
     part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))
     tool = part if calibrates else tool_bodies(None, None, mounted(config))
     yield from _unreached(Planner(kinematics, CollisionModel(kinematics, [*arm, *tool, *deck])), _views(config))
+    held = station_planner(job, config, extent)
+    try:
+        held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")
+    except CollisionError as error:
+        yield str(error)
+        return
+    yield from _unreached(held, _goals(job, config))
+
+
+def station_planner(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Planner:
+    """The arm as drawn, with the job's part in its claw, at the job's station. `extent` as in `reach_problems`."""
+    kinematics = arm_kinematics(config.arm.model, None)
+    deck = [*vehicle_bodies(deck_plates(config)), *vehicle_obstacles(config.obstacle)]
+    part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))
     board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
     x, y, z = extent[1].tolist()
     station = station_bodies(
@@ -58,13 +72,13 @@ def reach_problems(
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
     station += station_obstacles(job.obstacle, base_from_place_at_target(config, job))
-    held = Planner(kinematics, CollisionModel(kinematics, [*arm, *part, *deck, *station]))
-    try:
-        held.collisions.require_free(HOME, "arm folded, with the part of grasp.size")
-    except CollisionError as error:
-        yield str(error)
-        return
-    yield from _unreached(held, _goals(job, config))
+    return Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(config.arm.model), *part, *deck, *station]))
+
+
+def sweep_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:
+    """The same for the ends of the job's sweeps alone."""
+    surface = base_from_place_at_target(config, job) * job.surface.place_from_surface.se3()
+    yield from _unreached(station_planner(job, config, extent), _sweeps(job, config, surface))
 
 
 def nominal_scan(config: CellConfig) -> ScanCalibration:
@@ -97,11 +111,7 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
     photo = photo_pose(job, board, base_from_place * job.place_from_board, camera)
     yield "the photograph's pose (board.place_from_board, photo.stand_off)", photo, ()
     surface = base_from_place * job.surface.place_from_surface.se3()
-    for k, plan in enumerate(scan_plans(config, job, surface, nominal_scan(config))):
-        way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
-        run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)
-        yield f"the begin of sweep {k + 1} (scan, surface)", from_parts(-run_up) * plan.base_from_flange, ()
-        yield f"the end of sweep {k + 1} (scan, surface)", from_parts(run_up) * plan.base_from_flange_end, ()
+    yield from _sweeps(job, config, surface)
     part = surface * job.place.surface_from_part.se3()
     part_from_flange = job.grasp.flange_from_part.se3().inverse()
     for what, height, touching in (
@@ -109,6 +119,15 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
         ("the place pose (place, surface)", -job.place.contact_travel, TOUCHES),
     ):
         yield what, part * from_parts((0.0, 0.0, height)) * part_from_flange, touching
+
+
+def _sweeps(job: Job, config: CellConfig, base_from_surface: pin.SE3) -> Iterator[Goal]:
+    """Where each sweep begins and ends, run-ups included."""
+    for k, plan in enumerate(scan_plans(config, job, base_from_surface, nominal_scan(config))):
+        way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
+        run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)
+        yield f"the begin of sweep {k + 1} (scan, surface)", from_parts(-run_up) * plan.base_from_flange, ()
+        yield f"the end of sweep {k + 1} (scan, surface)", from_parts(run_up) * plan.base_from_flange_end, ()
 
 
 def _unreached(planner: Planner, goals: Iterator[Goal]) -> Iterator[str]:

@@ -169,6 +169,8 @@ def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
     if (timing := summary["timing"]) is not None:
         late = f"time stamps late, measured {timing['date']}"
         values.add_row(late, f"{timing['late_ms']:+.4f}", f"{timing['sigma_ms']:.4f}", "ms")
+    if (shutter := summary["shutter"]) is not None:
+        values.add_row("last row after the first", f"{shutter['readout_ms']:+.4f}", f"{shutter['sigma_ms']:.4f}", "ms")
     console.print(values)
     fit = Table(title="residuals; held-out views are predicted from the others")
     for name in ("camera", "views", "chi²/dof", "dots px", "held-out px", "stripe mm", "held-out mm"):

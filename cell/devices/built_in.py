@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 
 from pydantic import StrictBool, model_validator
 
-from cell.addresses import Endpoint, Host, Port, checked_can
+from cell.addresses import Endpoint, Host, Port
 from cell.device_config import (
     MOST_PAYLOAD,
     ArmConfig,
@@ -20,12 +20,12 @@ from cell.device_config import (
     LaserConfig,
     RailConfig,
     VehicleConfig,
-    real_path,
 )
 from cell.devices.camera_makes import FOLDER, GIGE, OPTICS, USB3, V4L2
 from cell.devices.make import AnyMake, Make, Surroundings
 from cell.devices.rail_makes import MODBUS
 from cell.devices.switch_makes import SWITCH_MAKES
+from cell.devices.vehicle_makes import CANOPEN, CanVehicleConfig
 from cell.units import quantity, whole
 
 if TYPE_CHECKING:
@@ -91,30 +91,10 @@ class UrArmConfig(ArmConfig):
     address: Annotated[str, Host]
 
 
-class AgilexVehicleConfig(VehicleConfig):
+class AgilexVehicleConfig(CanVehicleConfig):
     """A carrier that speaks AgileX protocol v2 on CAN."""
 
-    ADDRESS: ClassVar[str] = "channel"
-
     driver: Literal["agilex"] = "agilex"
-    interface: str
-    channel: str
-    bitrate: Annotated[float, quantity("kbit/s", 10, 1000)]
-
-    @model_validator(mode="after")
-    def _reachable(self) -> Self:
-        checked_can(self.interface, self.channel, self.bitrate)
-        return self
-
-    @property
-    def place(self) -> str:
-        """The channel, without the speed of a serial line behind it."""
-        return self.channel.partition("@")[0]
-
-    @property
-    def held(self) -> str:
-        """Interface and channel: two interfaces may count their channels alike."""
-        return f"{self.interface}:{real_path(self.place)}"
 
 
 class FixedVehicleConfig(VehicleConfig):
@@ -122,6 +102,10 @@ class FixedVehicleConfig(VehicleConfig):
 
     ADDRESS: ClassVar[str] = "driver"
     DRIVES: ClassVar[bool] = False
+    CAUTION: ClassVar[str] = (
+        "nothing drives; drive_to_target looks whether the station stands where approach.target has it, within "
+        "approach.tolerance, and refuses otherwise"
+    )
 
     driver: Literal["fixed"] = "fixed"
     track: Annotated[float, quantity("mm", 100, 3000)] = 1.0
@@ -266,7 +250,8 @@ BUILT_IN: tuple[AnyMake, ...] = (
     ),
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
-    Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle),
+    Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle, simulated=_with()),
+    CANOPEN,
     Make("camera", "stream", StreamCameraConfig, _camera, OPTICS, simulated=_with("address")),
     Make(
         "laser", "arm_output", ArmOutputLaserConfig, _laser, frozenset(("baseline", "tan_theta")),

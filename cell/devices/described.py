@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, RailConfig, of_make
-from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, OnArm, TmclRailConfig
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig, of_make
+from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
+from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.geometry.poses import from_parts, transform
 from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job, shipped_mesh
@@ -68,7 +69,7 @@ class Described:
                 f"this cell cannot be simulated as it is described (job {self.job.job.name}):\n  "
                 + "\n  ".join(problems)
             )
-        return drawn.settled(Drawing(_cell(config), _station(self.job, self.mesh)), STOCK)
+        return drawn.settled(Drawing(_cell(config), _station(self.job, self.mesh, config.vehicle.DRIVES)), STOCK)
 
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:
@@ -80,7 +81,7 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         payload=arm.payload,
         payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
-        track=TURNS_WIDER * config.vehicle.track,
+        track=_turning_track(config.vehicle),
         rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin), reverses(rail)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
@@ -94,7 +95,8 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         base_from_fine_board=_matrix(config.calibration.fine.base_from_board.se3()),
         deck_board=config.calibration.large.board,
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
-        wires={name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
+        wires=_vehicle(config.vehicle)
+        | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
     )
 
 
@@ -126,12 +128,38 @@ def _wire(record: DeviceConfig) -> dict[str, Any]:
     return {}
 
 
-def _station(job: Job, mesh: Path) -> drawn.StationDrawing:
+def _turning_track(vehicle: VehicleConfig) -> float:
+    """The track that counts when it turns: two driven wheels slide by far less sideways than four."""
+    return vehicle.track if isinstance(vehicle, CanopenVehicleConfig) else TURNS_WIDER * vehicle.track
+
+
+def _vehicle(record: VehicleConfig) -> dict[str, Any]:
+    """The vehicle's wire, for its peer; none for the stock cell's."""
+    match record:
+        case FixedVehicleConfig():
+            return {"vehicle": {"make": "fixed"}}
+        case CanopenVehicleConfig():
+            keys = {
+                "left_node", "right_node", "wheel_radius", "gear", "counts_per_turn", "velocity_unit", "left_reversed",
+                "right_reversed",
+            }  # fmt: skip
+            lines = {
+                "brake_bit": record.brake_bit if record.brake == "output" else None,
+                "brake_locks": record.brake_locks == "high",
+                "stop_bit": record.stop_input,
+                "stop_active": record.stop_pressed == "high",
+            }
+            return {"vehicle": {"make": "canopen", **record.model_dump(include=keys), **lines}}
+    return {}
+
+
+def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
     approach, there = job.approach, job.surface
     shipped = _closed_form(job, mesh)
     return drawn.StationDrawing(
         height=-float(approach.target.se3().translation[2]),
-        place_from_start=_matrix(approach.start.se3()),
+        # To a fixed frame the station is brought, to where the job has it.
+        place_from_start=_matrix((approach.start if drives else approach.target).se3()),
         board=job.board.spec,
         place_from_board=_matrix(job.place_from_board),
         place_from_surface=_matrix(there.place_from_surface.se3()),

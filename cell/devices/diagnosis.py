@@ -154,7 +154,8 @@ def _vehicle_state(vehicle: Vehicle) -> str:
     # The brake's feedback is not on the bus.
     brake = {None: "brake unknown", True: "braked", False: "brake open"}[state.braked]
     errors = "; ".join(state.trouble) or f"errors {state.error_bits:#06x}"
-    return f"{brake}, {state.battery_volts:.1f} V, {errors}"
+    volts = "" if state.battery_volts is None else f"{state.battery_volts:.1f} V, "
+    return f"{brake}, {volts}{errors}"
 
 
 def _camera_state(camera: Camera) -> str:

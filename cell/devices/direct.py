@@ -17,6 +17,7 @@ from cell.devices.built_in import TmclRailConfig
 from cell.devices.described import Described, reverses
 from cell.devices.devices import Devices
 from cell.devices.rail_makes import ModbusRailConfig
+from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
@@ -30,6 +31,11 @@ from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
+
+AGILEX_COUNT_M = 0.001
+"""In which AgileX v2 tells the way of a side."""
+_VEHICLES = {"agilex": "AgileX v2", "canopen": "CiA 402"}
+"""What the makes call themselves."""
 
 
 class VirtualCell(DirectCell):
@@ -60,8 +66,9 @@ class VirtualCell(DirectCell):
         self.arm.set_payload(config.arm.payload, np.array(config.arm.payload_centre))
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
+        vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
         self.devices: Devices = behind_gate(
-            config, self.clock, self.arm, self.rail, self.vehicle, self.scan_camera, self.target_camera, laser, claw
+            config, self.clock, self.arm, self.rail, vehicle, self.scan_camera, self.target_camera, laser, claw
         )
 
     def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
@@ -91,6 +98,7 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> Setup:
     """What the devices are given: the configuration's values and the drivers' logic."""
+    count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
     return Setup(
         ArmSetup(
@@ -117,9 +125,11 @@ def setup_of(config: CellConfig) -> Setup:
         VehicleSetup(
             vehicle.max_speed,
             vehicle.max_yaw_rate,
-            PlanarOdometry(vehicle.track),
+            PlanarOdometry(vehicle.track, count),
             lambda bits: system_trouble(bits, commanded=True),
             lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+            _VEHICLES.get(vehicle.driver, vehicle.driver),
+            count,
         ),
         CameraSetup(ClockMap, Latch),
     )

@@ -166,15 +166,21 @@ def rocking_covariance(rocking: Rocking, base_from_vehicle: pin.SE3, at: Array) 
     axes = base_from_vehicle.rotation[:, :2]
     beside = float(np.linalg.norm(axes.T @ arm))
     angle = rocking.height / beside
-    if angle > LARGEST_RAD:
-        raise RefusedError(
-            f"the vehicle rocks by ±{1e3 * angle:.2f} mrad at {rocking.hz:.1f} Hz, which moves the place by "
-            f"±{1e3 * rocking.height:.2f} mm; allowed are ±{1e3 * LARGEST_RAD:g} mrad. Wait until it is quiet, see "
-            "what shakes it, or lower its supports",
-            Measured("the vehicle rocks by", 1e3 * angle, "mrad", most=1e3 * LARGEST_RAD),
-        )
+    require_firm(angle, rocking.height, "the place", rocking.hz)
     columns = np.concatenate([np.cross(axes.T, arm).T, axes])
     return np.asarray(0.5 * angle**2 * columns @ columns.T)
+
+
+def require_firm(angle: float, moved: float, what: str, hz: float | None = None) -> None:
+    """Raise `RefusedError` for a vehicle that rocks by ±`angle` rad, which moves `what` by ±`moved` m."""
+    if angle > LARGEST_RAD:
+        often = "" if hz is None else f" at {hz:.1f} Hz"
+        raise RefusedError(
+            f"the vehicle rocks by ±{1e3 * angle:.2f} mrad{often}, which moves {what} by ±{1e3 * moved:.2f} mm; "
+            f"allowed are ±{1e3 * LARGEST_RAD:g} mrad. Wait until it is quiet, see what shakes it, or lower its "
+            "supports",
+            Measured("the vehicle rocks by", 1e3 * angle, "mrad", most=1e3 * LARGEST_RAD),
+        )
 
 
 def words(rocking: Rocking) -> str:

@@ -168,7 +168,7 @@ class ArmKinematics:
             f"flange pose ({x:.3f}, {y:.3f}, {z:.3f}) m in the arm base cannot be reached: {why}; the nearest pose "
             f"found stays {1e3 * float(np.linalg.norm(gap[:3])):.1f} mm and "
             f"{np.degrees(np.linalg.norm(gap[3:])):.2f} deg away. "
-            "Bring the vehicle nearer or change the pose in the job"
+            "Bring arm and station nearer to each other, or change the pose in the job"
         )
 
     def track(self, base_from_flange: pin.SE3, previous: Joints) -> Joints:

@@ -52,7 +52,8 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     # Before anything is lit and moved in vain.
     shift_by_times([TimeBound(arm.name, "arm", clocks.uncertainty)], scan.speed, errors)
     laser, purpose = devices.laser, devices.interlocks.purpose("sweep")
-    with purpose, laser.lit(), arm.record() as states, camera.stream() as frames:
+    # The laser within all else: it goes off first, however long arm and camera take to end what they send.
+    with purpose, arm.record() as states, camera.stream() as frames, laser.lit():
         motion, patience = mover.begin(line)
         over: list[float] = []
         deadline = devices.clock.now() + patience

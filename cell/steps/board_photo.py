@@ -1,8 +1,12 @@
-"""The board photograph: the target camera square in front of the board, several pictures, one pose."""
+"""The board photograph: the target camera square in front of the board, several pictures, one pose.
+
+They also show whether the vehicle is quiet: while it is not, they are taken anew, up to a few seconds.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pinocchio as pin
 
@@ -10,35 +14,75 @@ from cell.steps.camera_poses import photo_pose
 from cell.steps.drive_to_target import Arrival
 from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
+from cell.steps.quiet import swing_covariance, words
 from cell.steps.step import JobStep
 from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
 from statemachine.policy import Step
 from statemachine.runner import StepContext
 
+WAIT_S, WAITS = 1.0, 4
+"""How long a vehicle that rocks is waited for, and how often. One that has stopped is quiet by then."""
+
 
 def board_photo(
     base_from_flange: pin.SE3,
+    base_from_vehicle: pin.SE3,
     mover: Mover,
-    photograph: Callable[[int], BoardFix],
-    count: int,
+    photograph: Callable[[], BoardFix],
+    wait: Callable[[float], None],
     progress: Callable[[float, str], None],
 ) -> BoardFix:
-    """Move to the planned photograph pose, settle, and take the board's pose from `count` photographs.
+    """Move to the planned photograph pose, settle, and take the board's pose from photographs of a quiet vehicle.
 
-    Refusals (not found, too oblique, residual too high, ambiguous) come from `photograph` with their reason.
+    Refusals (not found, too oblique, residual too high, ambiguous) come from `photograph` with their reason, those of
+    `until_quiet` likewise.
     """
     progress(0.1, "arm to the photograph pose")
     mover.to(base_from_flange, "the photograph pose")
     progress(0.7, "photographing the board")
-    return photograph(count)
+    return until_quiet(base_from_vehicle, photograph, wait, progress)
+
+
+def until_quiet(
+    base_from_vehicle: pin.SE3,
+    photograph: Callable[[], BoardFix],
+    wait: Callable[[float], None],
+    progress: Callable[[float, str], None],
+) -> BoardFix:
+    """What `photograph` gives once it shows no rocking; `wait` is given the seconds to wait before the next.
+
+    Where the vehicle does not come to rest, that is in the covariance, and noted. Raises `RefusedError` where it rocks
+    too much to put anything down.
+    """
+    fix = photograph()
+    for _ in range(WAITS):
+        if not fix.swung:
+            return fix
+        progress(0.8, f"waiting until the vehicle is quiet: the board goes to and fro by ±{1e3 * fix.swung:.2f} mm")
+        wait(WAIT_S)
+        fix = photograph()
+    if not fix.swung:
+        return fix
+    unknown = swing_covariance(fix.swung, fix.base_from_board, base_from_vehicle)
+    return replace(fix, covariance=fix.covariance + unknown, notes=(words(fix.swung, WAITS * WAIT_S),))
+
+
+def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str], None]) -> BoardFix:
+    """`board_photo` at `goal`, base_from_flange, of where a job is done."""
+    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    vehicle = here.config.arm.vehicle_from_base.se3().inverse()
+    count, wait = here.job.photo.count, here.devices.clock.sleep
+    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait, progress)
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(Arrival), here.job
     here.mover.meet_station(arrival.base_from_place, job, here.board, here.nominal.extent)
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    return board_photo(goal, here.mover, here.photograph, job.photo.count, context.progress)
+    fix = photographed(here, goal, context.progress)
+    for note in fix.notes:
+        context.note(text=note)
+    return fix
 
 
 STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(Arrival,))

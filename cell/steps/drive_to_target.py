@@ -31,7 +31,10 @@ SETTLE_S = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad."""
+    """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad.
+
+    `driven` is false for an arm on a fixed frame, which was only looked at.
+    """
 
     base_from_place: pin.SE3
     fix: BoardFix
@@ -39,6 +42,7 @@ class Arrival:
     error_across: float
     error_yaw: float
     photographs: int
+    driven: bool = True
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -47,7 +51,16 @@ class Arrival:
             "error_across_mm": round(1e3 * self.error_across, 2),
             "error_yaw_deg": round(math.degrees(self.error_yaw), 3),
             "photographs": self.photographs,
+            **({} if self.driven else {"driven": False}),
         }
+
+    def told(self) -> str:
+        """What became of the step where nothing drives, in words."""
+        return (
+            "no vehicle: the arm stands on a fixed frame and nothing was driven. By the board the station stands "
+            f"{1e3 * self.error_along:.1f} mm along, {1e3 * self.error_across:.1f} mm across and "
+            f"{math.degrees(self.error_yaw):.2f} deg from where the job has it"
+        )
 
 
 def drive_to_target(
@@ -145,7 +158,13 @@ def stand_at_target(
 
     Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
     """
-    fix = photograph()
+    try:
+        fix = photograph()
+    except RefusedError as unseen:
+        raise RefusedError(
+            f"the arm stands on a fixed frame and does not see the board: {unseen}. Bring the station to where "
+            "approach.target has it, or correct approach.target"
+        ).showing(*unseen.numbers, seen=unseen.seen) from unseen
     base_from_place = fix.base_from_board * job.place_from_board.inverse()
     stands = Planar.of((vehicle_from_base * base_from_place).inverse())
     whereabouts.see(stands)
@@ -156,7 +175,7 @@ def stand_at_target(
             error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
         )
     vehicle.brake()
-    return Arrival(base_from_place, fix, error.x, error.y, error.yaw, 1)
+    return Arrival(base_from_place, fix, error.x, error.y, error.yaw, 1, driven=False)
 
 
 def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
@@ -195,7 +214,10 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     if not here.config.vehicle.DRIVES:
         stand = here.config.arm.vehicle_from_base.se3()
-        return stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
+        context.progress(0.3, "nothing to drive: looking whether the station stands where the job has it")
+        arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
+        context.note(text=arrival.told())
+        return arrival
     vehicle.enable()
     return drive_to_target(
         here.job,

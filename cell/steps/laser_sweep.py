@@ -6,14 +6,17 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from cell.calibration import ScanCalibration
 from cell.calibration.collect.witness import require_witness
+from cell.calibration.timing import Timing, changed, link_of
 from cell.calibration.witness import Pointing
 from cell.calibration.witness import pointing as pointing_since
+from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
-from cell.steps.board_photo import board_photo
+from cell.steps.board_photo import photographed
 from cell.steps.camera_poses import ScanPlan, photo_pose, scan_plans
 from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
@@ -22,7 +25,7 @@ from cell.steps.step import JobStep
 from cell.steps.stored_sweep import FILE, moved_by, save_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
-from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.steps.workplace import Workplace
 from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame
 from statemachine.policy import Step
@@ -98,10 +101,7 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
 def _require_unmoved(here: Workplace, context: StepContext, fix: BoardFix) -> None:
     """After a fault the arm's base may stand elsewhere: photograph the board again. `RefusedError` if it does."""
     goal = photo_pose(here.job, here.board, fix.base_from_board, here.calibration.target.flange_from_camera)
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    now = board_photo(
-        goal, here.mover, here.photograph, here.job.photo.count, lambda share, text: context.progress(0.0, text)
-    )
+    now = photographed(here, goal, lambda share, text: context.progress(0.0, text))
     if (moved := moved_by(now, fix.base_from_board, fix.covariance)) is not None:
         raise RefusedError(
             f"the board has moved by {moved} since it was photographed, before the fault that ended the sweep. See "
@@ -118,6 +118,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
     head, pointing = here.calibration.scan, _pointing(here, context)
+    timing, doubts = times_known(head, here.config)
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
     record = laser_sweep(
@@ -130,7 +131,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
             math.hypot(here.config.scan_camera.late, here.config.rail.late),
-            head.timing,
+            timing,
         ),
         here.mover,
         devices,
@@ -138,10 +139,29 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.check,
         context.progress,
     )
-    record = replace(record, pointing=pointing)
+    record = replace(record, pointing=pointing, doubts=(*doubts, *here.notes))
     for note in record.notes:
         context.note(text=note)
     return record
+
+
+def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | None, tuple[str, ...]]:
+    """How late the camera's stamps come, if that was measured with the settings of now; and for people what of the
+    camera's times is not known."""
+    timing, doubts = head.timing, list(head.unread)
+    if timing is not None and (doubt := timing.doubt(config)):
+        doubts.append(
+            f"how late the scan camera's time stamps come is kept since {timing.date}, but {doubt}; the sweep goes on "
+            "with scan_camera.late. Run `cell calibrate timing`"
+        )
+        timing = None
+    seen = timing is not None or (head.shutter is not None and not changed(head.shutter.link, link_of(config)))
+    if not seen:
+        doubts.append(
+            "whether the scan camera has a rolling shutter is not known: nobody looked with these settings of it, and "
+            "a sweep does not show it. Run `cell calibrate timing`"
+        )
+    return timing, tuple(doubts)
 
 
 def _pointing(here: Workplace, context: StepContext) -> Pointing | None:

@@ -10,8 +10,9 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration import TargetCalibration
-from cell.geometry.poses import compose_covariance, from_ur, mean
+from cell.geometry.poses import compose_covariance, from_ur, mean, transform
 from cell.job import PhotoSection
+from cell.steps.quiet import swing
 from cell.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
@@ -21,7 +22,8 @@ from drivers.interfaces import Arm, Camera, Frame, Vector
 class BoardFix:
     """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad.
 
-    `views` are the points found in each of the `frames`.
+    `views` are the points found in each of the `frames`; by ±`swung` m the board moved between them, 0 where that does
+    not show. `notes` are for people.
     """
 
     base_from_board: pin.SE3
@@ -30,6 +32,8 @@ class BoardFix:
     obliquity: float
     frames: tuple[Frame, ...]
     views: tuple[BoardView, ...] = ()
+    swung: float = 0.0
+    notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -39,6 +43,7 @@ class BoardFix:
             "obliquity_deg": round(math.degrees(self.obliquity), 2),
             "sigma_mm": [round(1e3 * s, 4) for s in sigma[:3]],
             "sigma_mrad": [round(1e3 * s, 4) for s in sigma[3:]],
+            "swung_mm": round(1e3 * self.swung, 4),
         }
 
 
@@ -51,16 +56,20 @@ def photograph(
     repeatability: Vector,
     count: int = 1,
     keep: Callable[[Frame], None] = lambda frame: None,
+    pause: Callable[[], None] = lambda: None,
 ) -> BoardFix:
     """Photograph the board `count` times with arm and vehicle at rest and average its pose.
 
-    `repeatability` is the (6, 6) covariance of base_from_flange; `keep` is given each frame before it is looked at.
+    `repeatability` is the (6, 6) covariance of base_from_flange; `keep` is given each frame before it is looked at;
+    `pause` is called between two.
     Raises `RefusedError` with the reason: board not found, seen more obliquely than `limits.max_obliquity`, residual
     above `limits.max_residual`, or pose ambiguous; it shows the "frame" and the "view", as far as there is one.
     """
     base_from_flange = from_ur(arm.state().flange)
     frames: list[Frame] = []
-    for _ in range(count):
+    for k in range(count):
+        if k:
+            pause()
         frames.append(camera.grab())
         keep(frames[-1])
     views: list[BoardView] = []
@@ -86,7 +95,10 @@ def photograph(
     covariance = compose_covariance(
         base_from_camera, hand_eye, camera_from_board, np.mean([pose.covariance for pose in poses], axis=0) / count
     )
-    return BoardFix(base_from_camera * camera_from_board, covariance, residual, obliquity, tuple(frames), tuple(views))
+    centre = transform(camera_from_board, views[0].object_points.mean(axis=0)[None])[0]
+    swung = swing(views, float(centre[2]) / calibration.camera.fx)
+    seen = base_from_camera * camera_from_board, covariance, residual, obliquity
+    return BoardFix(*seen, tuple(frames), tuple(views), swung)
 
 
 def _require(pose: BoardPose, limits: PhotoSection) -> None:

@@ -29,7 +29,8 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
     base_from_flange = from_ur(arm.state().flange)
     laser = devices.laser
-    with devices.interlocks.purpose("sweep"), laser.lit(), devices.scan_camera.stream() as frames:
+    # The laser within the stream: it goes off first, however long the camera takes to end its frames.
+    with devices.interlocks.purpose("sweep"), devices.scan_camera.stream() as frames, laser.lit():
         sweep = rail.sweep(plan.rail_start, plan.rail_stop, scan.speed)
 
         def ended() -> float | None:

@@ -14,10 +14,12 @@ from drivers.interfaces import Frame
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """What the sweeps brought, in their order; at least one. `pointing` of the laser, where a witness told it."""
+    """What the sweeps brought, in their order; at least one. `pointing` of the laser, where a witness told it; `doubts`
+    for people: what of calibration and arm is not as one would have it."""
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def base_from_flange(self) -> pin.SE3:
@@ -37,7 +39,8 @@ class SweepRecord:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
-        return (self.pointing.words,) if self.pointing is not None and self.pointing.open else ()
+        turned = (self.pointing.words,) if self.pointing is not None and self.pointing.open else ()
+        return (*turned, *self.doubts)
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""

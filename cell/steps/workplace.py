@@ -18,6 +18,7 @@ from cell.run.frames import FrameStore
 from cell.steps.moves import Mover
 from cell.steps.part import PartProgress
 from cell.steps.photograph import BoardFix, photograph
+from cell.steps.quiet import APART_S
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import BoardSpec, parse_board
 from drivers.interfaces import Vector
@@ -75,6 +76,17 @@ class Workplace:
         arm = self.config.arm
         return self._scattered(arm.kinematic_sigma, arm.kinematic_sigma_angle)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people: what of the arm is not as configured."""
+        if self._scatter == 1.0:
+            return ()
+        return (
+            f"in the calibration the arm's poses scattered {self._scatter:.1f} times as much as arm.repeatability says "
+            "(uneven gears, that is joint harmonics, or sag, or lengths that its controller does not know); as much is "
+            "stated of sweep and place",
+        )
+
     def _scattered(self, translation: float, rotation: float) -> Vector:
         """What is configured, as far as the calibration bore it out; more scatter comes from the joints.
 
@@ -114,4 +126,5 @@ class Workplace:
             self.repeatability,
             count,
             lambda frame: self.frames.keep(what, frame),
+            lambda: self.devices.clock.sleep(APART_S),
         )

@@ -14,9 +14,9 @@ class VehicleState:
 
     Odometry is integrated by the driver from the wheel distances since it was opened: x, y in m and yaw in rad in the
     frame where the vehicle stood then; `speed` m/s and `yaw_rate` rad/s as reported. `braked` is None as long as this
-    driver has not commanded the brake, and when somebody else may have released it since. `trouble` says in words what
-    ends motion, `warnings` what does not. `interruptions` counts how often odometry lost its connection to where the
-    vehicle was before, and `interruption` says why it did last.
+    driver has not commanded the brake, and when somebody else may have released it since; `battery_volts` where nobody
+    tells it. `trouble` says in words what ends motion, `warnings` what does not. `interruptions` counts how often
+    odometry lost its connection to where the vehicle was before, and `interruption` says why it did last.
     """
 
     stamp: float
@@ -29,7 +29,7 @@ class VehicleState:
     braked: bool | None
     emergency_stop: bool
     error_bits: int
-    battery_volts: float
+    battery_volts: float | None
     trouble: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     interruptions: int = 0
@@ -37,7 +37,7 @@ class VehicleState:
 
 
 class Vehicle(Device, Protocol):
-    """A skid-steered carrier."""
+    """A carrier that turns by the speeds of its two sides."""
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` seconds old, else `DeadlineError`."""

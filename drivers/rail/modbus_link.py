@@ -37,6 +37,8 @@ _LEAST_SILENCE_S = 0.00175
 """The standard's, above 19200 baud."""
 _QUIET_S = 0.05
 _ATTEMPTS = 2
+_LONGEST_BYTES = 16
+"""Of a request or a reply."""
 
 
 class FrameError(Exception):
@@ -81,8 +83,10 @@ class ModbusLink:
         self.url = url
         self._unit = unit
         self._line = f"{baud} baud, parity {parity}, {stop_bits} stop bit{'s' * (stop_bits - 1)}"
-        self._byte_s = _BITS_PER_BYTE / baud
-        self._silence_s = max(_LEAST_SILENCE_S, _SILENCE_BYTES * self._byte_s)
+        byte_s = _BITS_PER_BYTE / baud
+        self._silence_s = max(_LEAST_SILENCE_S, _SILENCE_BYTES * byte_s)
+        # Set once: to change it asks the system for the port's settings each time.
+        self._timeout_s = REPLY_TIMEOUT_S + 2 * _LONGEST_BYTES * byte_s
         self._clock = clock
         self._statistics = statistics
         self._stop_action = stop_action
@@ -92,7 +96,7 @@ class ModbusLink:
         self._echoes: bool | None = None
         self._quiet_since = 0.0
         self._last_words: LastWords | None = None
-        self._port: Any = open_port(name, url, baud=baud, timeout=REPLY_TIMEOUT_S, parity=parity, stop_bits=stop_bits)
+        self._port: Any = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
 
     @property
     def stops(self) -> int:
@@ -182,7 +186,7 @@ class ModbusLink:
                 except FrameError as error:
                     failure = error
                     self._statistics.count("bad_replies")
-                    self._drain()
+                    self._rest()
                 except ModbusRefused as refused:
                     if refused.number not in _BUSY or attempt + 1 == _ATTEMPTS:
                         raise
@@ -206,7 +210,7 @@ class ModbusLink:
     def _once(self, request: bytes, length: int, what: str) -> tuple[bytes, float, float]:
         if self._port.in_waiting:
             self._statistics.count("stale_input")
-            self._drain()
+            self._rest()
         left = self._quiet_since + self._silence_s - time.monotonic()
         if left > 0:
             time.sleep(left)
@@ -235,10 +239,7 @@ class ModbusLink:
 
     def _learn_echo(self, request: bytes) -> bytes:
         """The first reply, and whether this line repeats what is sent: many adapters to two wires hear themselves."""
-        came = self._get(1)
-        self._port.timeout = _QUIET_S
-        while more := self._port.read(256):
-            came += bytes(more)
+        came = self._get(1) + self._rest()
         echoed = came.startswith(request)
         reply = came[len(request) :] if echoed else came
         if len(reply) >= 5 and _crc(reply[:-2]) == reply[-2:]:
@@ -246,19 +247,23 @@ class ModbusLink:
         return reply
 
     def _get(self, count: int) -> bytes:
-        self._port.timeout = REPLY_TIMEOUT_S + 2 * count * self._byte_s
         data = bytes(self._port.read(count))
         if len(data) < count:
             self._statistics.count("timeouts")
             raise FrameError(f"{len(data)} of {count} bytes came")
         return data
 
-    def _drain(self) -> None:
-        """Throw away what still comes in, until the line was quiet, so that a late reply answers nothing else."""
+    def _rest(self) -> bytes:
+        """What still comes in, until the line was quiet: thrown away, so that a late reply answers nothing else."""
         end = time.monotonic() + REPLY_TIMEOUT_S
+        rest = b""
         self._port.timeout = _QUIET_S
-        while self._port.read(256) and time.monotonic() < end:
-            pass
+        try:
+            while (more := bytes(self._port.read(256))) and time.monotonic() < end:
+                rest += more
+        finally:
+            self._port.timeout = self._timeout_s
+        return rest
 
 
 def _words(*values: int) -> bytes:

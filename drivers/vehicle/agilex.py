@@ -20,8 +20,8 @@ from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, Inter
 from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
 from drivers.quantities import check_range
 from drivers.vehicle import health
+from drivers.vehicle.agilex_link import AgilexLink, load_database
 from drivers.vehicle.can_interface import can_interface
-from drivers.vehicle.can_link import CanLink, load_database
 from drivers.vehicle.faults import OUT_OF_COMMAND
 from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, Feedback, patience
 from drivers.vehicle.version import TEXT_REQUEST, UNKNOWN
@@ -80,7 +80,7 @@ class AgilexVehicle:
         self._stopping = 0
         self._closed = threading.Event()
         self._open = partial(
-            CanLink,
+            AgilexLink,
             name,
             interface,
             channel,

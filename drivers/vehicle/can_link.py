@@ -1,4 +1,4 @@
-"""The CAN bus with its message table: sending, and a receive thread that never dies unnoticed.
+"""The CAN bus: sending frames, and a receive thread that never dies unnoticed.
 
 python-can's own notifier thread ends silently on a bus error; this one keeps the reason, and every later use of the
 link raises it.
@@ -9,15 +9,12 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib.resources import as_file, files
-from typing import Any, cast
+from typing import Any
 
 import can
-import cantools
 import serial
-from cantools.database.can import Database, Message
 
 from drivers.errors import ConfigError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
@@ -31,18 +28,13 @@ RECEIVE_TIMEOUT_S = 0.1
 SEND_TIMEOUT_S = 0.5
 
 
-def load_database() -> Database:
-    """The AgileX v2 messages of `agilex_v2.dbc`."""
-    with as_file(files("drivers.vehicle") / "agilex_v2.dbc") as path:
-        return cast(Database, cantools.database.load_file(path))
-
-
 class CanLink:
-    """An open CAN bus; `receive` is called in the receive thread with each known message's name and signal values,
-    and `idle` with the seconds on the wall for which it has waited before each frame, whoever sent that.
+    """An open CAN bus; `receive` is called in the receive thread with each frame, error frames excepted, and `idle`
+    with the seconds on the wall for which it has waited before each frame, whoever sent that.
 
-    `wanted` names the messages that are decoded; others are ignored. Raises `NotConnectedError` when the bus cannot be
-    opened, `ConfigError` when python-can has no such interface.
+    `alone` says, in the text of a failed bus, what the vehicle then does by itself. A frame that `receive` refuses with
+    ValueError or IndexError is counted as malformed. Raises `NotConnectedError` when the bus cannot be opened,
+    `ConfigError` when python-can has no such interface.
     """
 
     def __init__(
@@ -53,18 +45,14 @@ class CanLink:
         *,
         bitrate: int,
         options: Mapping[str, Any],
-        database: Database,
-        wanted: frozenset[str],
-        receive: Callable[[str, dict[str, float]], None],
+        receive: Callable[[can.Message], None],
         idle: Callable[[float], None],
         statistics: LinkStatistics,
+        alone: str,
     ) -> None:
         self._name = name
         self._address = f"{interface}:{channel}"
-        self._database = database
-        self._wanted: dict[int, Message] = {
-            message.frame_id: message for message in database.messages if message.name in wanted
-        }
+        self._alone = alone
         self._receive = receive
         self._idle = idle
         self._statistics = statistics
@@ -92,7 +80,7 @@ class CanLink:
                 self._name,
                 "vehicle.link_lost",
                 f"the CAN bus at {self._address} failed: {self._failure or 'the receive thread has ended'}; "
-                "the vehicle stops by itself 0.5 s after the last command",
+                f"{self._alone}",
                 recoverable=True,
                 hint="Check the adapter and its cable, then enable() the vehicle, which opens the bus again.",
             )
@@ -108,25 +96,23 @@ class CanLink:
         finally:
             self._heard = None
 
-    def send(self, name: str, **signals: float) -> None:
-        """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
-        self._send(name, self._frame(name, **signals))
-
-    def send_data(self, identifier: int, data: bytes) -> None:
-        """Send a frame that is not in the message table. Raises as `check` does."""
-        self._send(f"0x{identifier:03X}", can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-
-    def _send(self, name: str, frame: can.Message) -> None:
+    def send(self, frame: can.Message, what: str) -> None:
+        """Send a frame; `what` names it in errors. Raises as `check` does."""
         self.check()
-        if name == "ControlModeCommand" and self._last_words is None:
-            # Who never commanded it has nothing to end.
-            self._last_words = self._stop_after_death(self._interface)
         try:
             with self._sending:
                 self._bus.send(frame, timeout=SEND_TIMEOUT_S)
         except (can.CanError, OSError) as error:
-            self._fail(f"sending {name}: {error}")
+            self._fail(f"sending {what}: {error}")
             self.check()
+
+    def say_in_the_end(self, frames: Sequence[can.Message]) -> None:
+        """These frames are sent when this process is killed; a second call changes nothing.
+
+        Nothing where the bus has no file of its own: there the vehicle has to stop by itself.
+        """
+        if self._last_words is None:
+            self._last_words = self._after_death(frames)
 
     def close(self) -> None:
         """End the receive thread and shut the bus down; idempotent."""
@@ -160,28 +146,18 @@ class CanLink:
                 "Check interface, channel and adapter",
             ) from error
 
-    def _stop_after_death(self, interface: str) -> LastWords | None:
-        """Zero velocity, then the brake, when this process is killed; None where the bus has no file of its own.
-
-        There the vehicle stops by itself, 0.5 s after the last command.
-        """
-        zero = self._frame("MotionCommand", Speed=0.0, YawRate=0.0, LateralSpeed=0.0, Steering=0.0)
-        frames = (*[zero] * 3, self._frame("BrakeCommand", Locked=1))
+    def _after_death(self, frames: Sequence[can.Message]) -> LastWords | None:
         bus: Any = self._bus
-        if interface == "slcan":
+        if self._interface == "slcan":
             # The first return ends a frame that was cut off.
             words = [b"\rt%03X%d%s\r" % (f.arbitration_id, f.dlc, f.data.hex().encode()) for f in frames]
             port = descriptor_of(bus.serialPortOrig)
-        elif interface == "socketcan":
+        elif self._interface == "socketcan":
             words = [struct.pack("=IB3x8s", f.arbitration_id, f.dlc, bytes(f.data)) for f in frames]
             port = descriptor_of(bus)
         else:
             return None
         return None if port is None else LastWords(self._name, port, words)
-
-    def _frame(self, name: str, **signals: float) -> can.Message:
-        message = self._database.get_message_by_name(name)
-        return can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
 
     def _fail(self, reason: str) -> None:
         if self._failure is None:
@@ -208,10 +184,4 @@ class CanLink:
         if frame.is_error_frame:
             self._statistics.count("error_frames")
             return
-        message = self._wanted.get(frame.arbitration_id)
-        if message is None or frame.is_extended_id or frame.is_remote_frame:
-            return
-        if len(frame.data) != message.length:
-            self._statistics.count("malformed")
-            return
-        self._receive(message.name, cast(dict[str, float], message.decode(bytes(frame.data), decode_choices=False)))
+        self._receive(frame)

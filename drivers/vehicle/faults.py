@@ -81,6 +81,28 @@ def command_lost(name: str, mode: int) -> DeviceFault:
     )
 
 
+def emergency_stop(name: str) -> DeviceFault:
+    """The fault of a vehicle whose emergency stop is pressed."""
+    return DeviceFault(
+        name,
+        "vehicle.emergency_stop",
+        "the emergency stop is pressed",
+        recoverable=False,
+        hint="Release the button when it is safe, then enable() the vehicle.",
+    )
+
+
+def no_feedback(name: str, what: str) -> DeviceFault:
+    """The fault of a vehicle, or of a part of it, that is silent."""
+    return DeviceFault(
+        name,
+        "vehicle.silent",
+        what,
+        recoverable=True,
+        hint="Check that the vehicle is on and the CAN bus is connected.",
+    )
+
+
 def disturbed(name: str, what: str) -> DeviceFault:
     """The fault of a vehicle that somebody else commanded or moved."""
     return DeviceFault(

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceFault
+from drivers.errors import DeadlineError
 from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.faults import (
     command_lost,
     disturbed,
     driver_trouble,
+    emergency_stop,
+    no_feedback,
     system_trouble,
     system_warnings,
     vehicle_error,
 )
-from drivers.vehicle.odometry import PlanarOdometry
+from drivers.vehicle.travel import Travel
 from drivers.vehicle.version import ANSWERS, VersionAnswer
 
 CAN_MODE = 1
@@ -28,10 +29,6 @@ WALL_FLOOR_S = 0.5
 QUIET_S = 2.0
 """A vehicle that nothing was heard of for this long, on the wall, while this program did listen, may have been
 restarted meanwhile: its odometry no longer tells where it is."""
-REST_AFTER_S = 4.0
-"""After its last command to move the vehicle stands within this."""
-STANDS_MM = 5
-"""A side that counts more than this without a command has been moved by somebody else."""
 CYCLIC = ("MotionState", "Odometry", "SystemState")
 _DRIVERS = {f"MotorDriver{motor}": motor for motor in range(1, 9)}
 _COMMANDS = ("MotionCommand", "BrakeCommand")
@@ -40,8 +37,6 @@ WANTED = frozenset({*CYCLIC, *_DRIVERS, *_COMMANDS, *ANSWERS})
 _FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
-_JUMP_M = 0.05
-"""What a side may count from one reading to the next besides what it can have driven: readings come in bursts."""
 STILL = 0.0035
 """Reported speeds up to this, m/s and rad/s, count as standstill: at rest they waver by three steps of the protocol."""
 
@@ -66,18 +61,11 @@ class Feedback:
     ) -> None:
         self._name = name
         self._clock = clock
-        self._side_speed = max_speed + 0.5 * track * max_yaw_rate
-        self._statistics = statistics
-        self._odometry = PlanarOdometry(track)
+        self._travel = Travel(clock, statistics, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate)
         self._news = threading.Condition(threading.RLock())
         self._newest: dict[str, tuple[float, dict[str, float]]] = {}
-        self._commanded = -math.inf
-        self._rest: tuple[int, int] | None = None
         self._quiet = 0.0
         self._version = VersionAnswer()
-        self._disturbed = ""
-        self._interruptions = 0
-        self._interruption = ""
 
     def take(self, message: str, signals: dict[str, float]) -> None:
         """Keep a message that has just come in, and count odometry on."""
@@ -88,11 +76,11 @@ class Feedback:
                     self.interrupt(f"nothing was heard of it for {self._quiet:.1f} s")
                 self._quiet = 0.0
             if message == "Odometry":
-                self._count(now, int(signals["Left"]), int(signals["Right"]))
+                self._travel.count(now, int(signals["Left"]), int(signals["Right"]))
             elif message == "MotionCommand" and (signals["Speed"] or signals["YawRate"]):
-                self._disturb("somebody else on the CAN bus commands it to move")
+                self._travel.disturb("somebody else on the CAN bus commands it to move")
             elif message == "BrakeCommand" and not signals["Locked"]:
-                self._disturb("somebody else on the CAN bus released its brake")
+                self._travel.disturb("somebody else on the CAN bus released its brake")
             elif message in ANSWERS:
                 self._version.take(message, signals)
             self._newest[message] = (now, signals)
@@ -104,44 +92,24 @@ class Feedback:
             self._quiet += seconds
 
     def commanded_to_move(self) -> None:
-        """The driver has just sent a velocity: what moves for the next `REST_AFTER_S` moves by that."""
-        self._commanded = self._clock.now()
+        """The driver has just sent a velocity."""
+        self._travel.commanded_to_move()
 
     def interrupt(self, why: str) -> None:
         """From now on odometry does not tell where the vehicle is relative to where it was before."""
         with self._news:
-            self._interruptions += 1
-            self._interruption = why
+            self._travel.interrupt(why)
 
     @property
     def interruptions(self) -> int:
         """How often odometry lost its connection to where the vehicle was before."""
         with self._news:
-            return self._interruptions
+            return self._travel.interruptions
 
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what others did before."""
         with self._news:
-            self._disturbed, self._rest = "", None
-
-    def _count(self, now: float, left: int, right: int) -> None:
-        before = self._newest["Odometry"][0] if "Odometry" in self._newest else now
-        # It has driven no longer than since its last reading, and only until it came to rest after its last command.
-        driven = max(0.0, min(now, self._commanded + REST_AFTER_S) - before)
-        if not self._odometry.update(left, right, _JUMP_M + self._side_speed * driven):
-            self._statistics.count("odometry_restarted")
-            self.interrupt("its odometers jumped, so it was restarted")
-        if now - self._commanded < REST_AFTER_S:
-            self._rest = None
-        elif self._rest is None:
-            self._rest = (left, right)
-        elif (moved := max(abs(left - self._rest[0]), abs(right - self._rest[1]))) > STANDS_MM:
-            self._disturb(f"it moved by {moved} mm without a command")
-            self._rest = (left, right)
-
-    def _disturb(self, what: str) -> None:
-        self._disturbed = what
-        self.interrupt(what)
+            self._travel.acknowledge()
 
     def _trouble(self, *, commanded: bool) -> tuple[str, ...]:
         found = list(system_trouble(int(self._newest["SystemState"][1]["ErrorBits"]), commanded=commanded))
@@ -204,12 +172,10 @@ class Feedback:
             max_age = max(max_age, _FAST_AGE_WALL_S * self._clock.rate)
         with self._news:
             (moved, motion), (counted, _), (reported, system) = (self._newest[message] for message in CYCLIC)
-            x, y, yaw = self._odometry.x, self._odometry.y, self._odometry.yaw
-            trouble, interruptions, interruption = (
-                self._trouble(commanded=True),
-                self._interruptions,
-                self._interruption,
-            )
+            travel = self._travel
+            x, y, yaw = travel.odometry.x, travel.odometry.y, travel.odometry.yaw
+            interruptions, interruption = travel.interruptions, travel.interruption
+            trouble = self._trouble(commanded=True)
         age = self._clock.now() - min(moved, counted, reported + _SYSTEM_STATE_SLACK_S)
         if age > max_age:
             raise DeadlineError(
@@ -242,29 +208,16 @@ class Feedback:
         """
         with self._news:
             oldest, which = min((self._newest[message][0], message) for message in CYCLIC)
-            system, disturbance = self._newest["SystemState"][1], self._disturbed
+            system, disturbance = self._newest["SystemState"][1], self._travel.disturbance
             trouble = self._trouble(commanded=in_command)
             quiet = self._quiet
         silent = self._clock.now() - oldest
         if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
-            raise DeviceFault(
-                self._name,
-                "vehicle.silent",
-                f"no feedback for {silent:.2f} s ({which} came last before that)",
-                recoverable=True,
-                hint="Check that the vehicle is on and the CAN bus is connected.",
-            )
+            raise no_feedback(self._name, f"no feedback for {silent:.2f} s ({which} came last before that)")
         if system["State"] == _EMERGENCY_STOP:
-            raise DeviceFault(
-                self._name,
-                "vehicle.emergency_stop",
-                "the emergency stop is pressed",
-                recoverable=False,
-                hint="Release the button when it is safe, then enable() the vehicle.",
-            )
+            raise emergency_stop(self._name)
         if system["State"] != _OK or trouble:
-            driven = self._clock.now() - self._commanded < REST_AFTER_S
-            raise vehicle_error(self._name, int(system["ErrorBits"]), trouble, driven=driven)
+            raise vehicle_error(self._name, int(system["ErrorBits"]), trouble, driven=self._travel.driven)
         if in_command and system["Mode"] != CAN_MODE:
             self.interrupt("it left CAN command")
             raise command_lost(self._name, int(system["Mode"]))

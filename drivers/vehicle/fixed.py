@@ -5,15 +5,13 @@ It stands and is braked, always; whoever wants to drive it is told that there is
 
 from __future__ import annotations
 
-import math
-
 from drivers.clock import Clock
 from drivers.errors import InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, VehicleState
 
 
 class FixedVehicle:
-    """A vehicle that is none; see `drivers.interfaces.Vehicle`. Odometry stays at 0, the battery's voltage is NaN."""
+    """A vehicle that is none; see `drivers.interfaces.Vehicle`. Odometry stays at 0; there is no battery."""
 
     def __init__(self, name: str, clock: Clock) -> None:
         self.name = name
@@ -45,7 +43,7 @@ class FixedVehicle:
             braked=True,
             emergency_stop=False,
             error_bits=0,
-            battery_volts=math.nan,
+            battery_volts=None,
         )
 
     def check(self) -> None:

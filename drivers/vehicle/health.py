@@ -53,18 +53,21 @@ def readings(
             "bus load, at most", 100.0 * bits / (bitrate * seconds), "%",
             most=MOST_LOAD if judge_times else None, remedy="Take others off the CAN bus, or raise its bit rate.",
         ),
-        Reading(
-            "error frames", float(sum(frame.is_error_frame for _, frame in heard)), "",
-            most=0.0, remedy=_WIRING,
-        ),
+        *bus_readings([frame for _, frame in heard], interface),
     ]  # fmt: skip
+    return found + _told(heard, database)
+
+
+def bus_readings(heard: Sequence[can.Message], interface: CanInterface | None) -> list[Reading]:
+    """Error frames among what was heard, and the counters of the computer's `interface`, where it has one."""
+    found = [Reading("error frames", float(sum(frame.is_error_frame for frame in heard)), "", most=0.0, remedy=_WIRING)]
     if interface is not None:
         for what, count in (("sending", interface.sent_errors), ("receiving", interface.received_errors)):
             if count is not None:
                 found.append(
                     Reading(f"error counter, {what}", float(count), "", most=WARNING_COUNT - 1.0, remedy=_WIRING)
                 )
-    return found + _told(heard, database)
+    return found
 
 
 def _told(heard: Heard, database: Database) -> list[Reading]:

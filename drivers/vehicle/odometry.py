@@ -9,13 +9,14 @@ _HALF = 1 << 31
 
 
 class PlanarOdometry:
-    """Integrates the left and right odometers, mm as signed 32-bit counters, for wheels `track` m apart.
+    """Integrates the left and right odometers, signed 32-bit counters of `unit` m, for wheels `track` m apart.
 
     `x`, `y` in m and `yaw` in rad in the frame where the vehicle stood at the first reading.
     """
 
-    def __init__(self, track: float) -> None:
+    def __init__(self, track: float, unit: float = 1e-3) -> None:
         self._track = track
+        self._unit = unit
         self._last: tuple[int, int] | None = None
         self.x = 0.0
         self.y = 0.0
@@ -30,7 +31,7 @@ class PlanarOdometry:
         last, self._last = self._last, (left, right)
         if last is None:
             return True
-        way_left, way_right = (1e-3 * _difference(new, old) for new, old in zip((left, right), last, strict=True))
+        way_left, way_right = (self._unit * _difference(new, old) for new, old in zip((left, right), last, strict=True))
         if max(abs(way_left), abs(way_right)) > farthest:
             return False
         way = 0.5 * (way_left + way_right)

@@ -52,6 +52,8 @@ class DirectCamera:
         self.clock = clock
         self.late = 0.0
         """By how many seconds each latch comes later than the camera answers."""
+        self.lingers = 0.0
+        """How many seconds a stream takes to end."""
         self.shape = (self.model.spec.height, self.model.spec.width)
         self.shots: dict[int, Shot] = {}
         """The truth at each exposure so far, by the frame's id."""
@@ -113,6 +115,7 @@ class DirectCamera:
         try:
             yield stream
         finally:
+            self.clock.sleep(self.lingers)
             self._streams.remove(stream)
             stream.close()
 

@@ -116,7 +116,8 @@ class RailSetup:
 class VehicleSetup:
     """Limits in m/s and rad/s; `trouble` tells error bits in words, `error` makes a fault of them.
 
-    `error` takes the device's name, its error bits, their words, and whether it was driven lately.
+    `error` takes the device's name, its error bits, their words, and whether it was driven lately. `make` is what it
+    calls itself, `count` the way of a side, m, that its counters count in.
     """
 
     max_speed: float
@@ -124,6 +125,8 @@ class VehicleSetup:
     odometry: Odometry
     trouble: Callable[[int], tuple[str, ...]]
     error: Callable[[str, int, tuple[str, ...], bool], DeviceFault]
+    make: str
+    count: float
 
 
 @dataclass(frozen=True)

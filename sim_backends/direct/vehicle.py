@@ -1,4 +1,4 @@
-"""The vehicle in this process: commands and odometry in the steps of 1 mm and 1 mrad/s that its bus carries."""
+"""The vehicle in this process: commands in steps of 1 mm/s and 1 mrad/s, odometry in those that its bus carries."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class DirectVehicle:
 
     def identity(self) -> Identity:
         """The protocol has no serial number."""
-        return Identity("AgileX v2", "", "virtual", "in this process")
+        return Identity(self._setup.make, "", "virtual", "in this process")
 
     def ping(self) -> float:
         """No wire: 0 s."""
@@ -171,4 +171,5 @@ class DirectVehicle:
 
     def _count(self) -> None:
         feedback = self.model.feedback(self._clock.now())
-        self._setup.odometry.update(round(1e3 * feedback.left), round(1e3 * feedback.right), _FARTHEST_M)
+        left, right = (round(way / self._setup.count) for way in (feedback.left, feedback.right))
+        self._setup.odometry.update(left, right, _FARTHEST_M)

@@ -112,6 +112,7 @@ class VehicleModel:
         self._left = self._right = 0.0
         self._command = (0.0, 0.0)
         self._commanded_at = -math.inf
+        self._hard = False
         self._mode = Mode.STANDBY
         self._motion_mode = 0
         self._braked = False
@@ -176,8 +177,11 @@ class VehicleModel:
             self._advance(t)
             self._motion_mode = motion_mode
 
-    def command(self, t: float, speed: float, yaw_rate: float) -> None:
-        """Drive at `speed` m/s and `yaw_rate` rad/s until `command_timeout` has passed; ignored outside CAN mode."""
+    def command(self, t: float, speed: float, yaw_rate: float, hard: bool = False) -> None:
+        """Drive at `speed` m/s and `yaw_rate` rad/s until `command_timeout` has passed; ignored outside CAN mode.
+
+        With `hard` it slows down as its brakes would slow it.
+        """
         p = self.params
         with self._lock:
             self._advance(t)
@@ -188,6 +192,7 @@ class VehicleModel:
                 min(max(yaw_rate, -p.max_yaw_rate), p.max_yaw_rate),
             )
             self._commanded_at = t
+            self._hard = hard
 
     def set_brake(self, t: float, locked: bool) -> None:
         """Lock (stopping hard if moving) or release the brake."""
@@ -251,7 +256,7 @@ class VehicleModel:
     def _step(self, dt: float) -> None:
         p = self.params
         speed, yaw_rate = self._wanted(self._t)
-        hard = self._braked or self._emergency
+        hard = self._braked or self._emergency or self._hard
         linear = p.brake_deceleration if hard else p.acceleration
         turning = linear / (0.5 * p.track) if hard else p.yaw_acceleration
         old_speed, old_yaw_rate = self._speed, self._yaw_rate

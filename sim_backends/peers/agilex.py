@@ -52,6 +52,11 @@ class AgilexPeer:
         self._count = 0
         self._schedule = [_Cyclic(identifier, *entry) for identifier, entry in _CYCLES.items()]
 
+    @property
+    def endpoint(self) -> dict[str, str]:
+        """Where python-can finds it."""
+        return {"interface": self.interface, "channel": self.channel}
+
     def start(self) -> None:
         """Begin to serve."""
         self._bus.start()

@@ -26,6 +26,8 @@ FINGERS_ABOVE = 0.015
 """The fingertips end this far, m, from the part's underside."""
 LEAST_TOUCHING = 40
 """Of the points of a part's underside that are tried so many have to have a surface below them."""
+CLEARANCE, CLEARANCE_STEP, WALL = 3e-4, 1e-4, 2.5
+"""Room that a part has beside walls, m, the step in which they are looked for, m, and how steep, m/m, a wall is."""
 _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
 
@@ -64,7 +66,7 @@ class PartContact:
         across = np.linspace(-0.97, 0.97, 13) * surface.half_y + surface.centre[1]
         grid = np.meshgrid(along, across)
         x, y = (axis.ravel() for axis in grid)
-        there = np.isfinite(surface.relief(x, y)[0])
+        there = np.isfinite(surface.relief(x, y)[0]) & ~_beside_wall(surface, x, y)
         if there.sum() < LEAST_TOUCHING:
             raise ValueError(
                 f"the surface {surface.name!r} lies below {there.sum()} of {len(there)} points of the part's underside "
@@ -157,6 +159,17 @@ class PartContact:
         wrench[:3] = forces.sum(axis=0)
         wrench[3:] = np.cross(points - world_from_flange[:3, 3], forces).sum(axis=0)
         return wrench
+
+
+def _beside_wall(surface: Surface, x: Vector, y: Vector) -> NDArray[np.bool_]:
+    """Where (n,) a wall is nearer than `CLEARANCE`: there a part is made with room around it, else it would jam."""
+    found = np.zeros(len(x), dtype=np.bool_)
+    for ways in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        steps = CLEARANCE_STEP * np.arange(round(CLEARANCE / CLEARANCE_STEP) + 1)
+        heights = surface.relief(x[:, None] + ways[0] * steps, y[:, None] + ways[1] * steps)[0]
+        # Beside the surface there is no height, and a comparison with none is false.
+        found |= (np.abs(np.diff(heights, axis=1)) > WALL * CLEARANCE_STEP).any(axis=1)
+    return found
 
 
 def _moved(points: Vector, a_from_b: Pose) -> Vector:

@@ -53,7 +53,8 @@ class CellDrawing:
     plate on the claw, or None without one. `payload` in kg with its centre of gravity in m on the flange, `track` in m
     as the vehicle turns. Boards are named as in `sim_backends.optics.scene.Board.parse`. Outputs and `grip_input` are
     numbers of the arm's connectors, None where laser or claw hang on something else; `wires` says by device ("rail",
-    "laser", "claw") what that is, as its peer takes it, or what else than TMCL the rail speaks.
+    "laser", "claw") what that is, as its peer takes it, or what else than TMCL the rail speaks; "vehicle": what else
+    than AgileX v2 it speaks, or that there is none.
     """
 
     arm: str
@@ -75,6 +76,11 @@ class CellDrawing:
     deck_board: str
     base_from_deck_board: Pose
     wires: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the arm stands on a frame that is bolted down, with no vehicle below it."""
+        return bool(self.wires.get("vehicle", {}).get("make") == "fixed")
 
 
 @dataclass(frozen=True, eq=False)

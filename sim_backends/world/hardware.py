@@ -69,7 +69,10 @@ def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
 
 
 def make_vehicle(scene: Scene) -> VehicleModel:
-    """The vehicle standing at its start; its drift sideways and in yaw follow the odometry's errors."""
+    """The vehicle standing at its start, braked for good where it is a fixed frame.
+
+    Its drift sideways and in yaw follow the odometry's errors.
+    """
     start = scene.world_from_vehicle_start
     yaw = float(np.arctan2(start[1, 0], start[0, 0]))
     params = VehicleParams(
@@ -80,7 +83,10 @@ def make_vehicle(scene: Scene) -> VehicleModel:
         lateral_walk=0.1 * scene.deviations.odometry_scale,
         yaw_walk=0.1 * scene.deviations.odometry_yaw,
     )
-    return VehicleModel(params, stream(scene.seed, "vehicle"))
+    model = VehicleModel(params, stream(scene.seed, "vehicle"))
+    if scene.drawing.cell.fixed:
+        model.set_brake(0.0, True)
+    return model
 
 
 def camera_spec(scene: Scene, camera: str) -> CameraSpec:

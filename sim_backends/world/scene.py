@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,12 +154,19 @@ class _Draws:
         return at @ made
 
 
+DOCKED = 0.1
+"""How much of a vehicle's deviation from its start a station has that is pushed against a fixed frame's stops."""
+
+
 def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Scene:
     """Draw the world of `seed` at `level` around `drawing`; the claw holds its next part after so many `parts`.
 
     Raises ValueError for an unknown level or a negative seed.
     """
     sigma, effects = deviations(level), effects_of(level)
+    if drawing.cell.fixed:
+        # No tyres, no springs.
+        effects = replace(effects, rocking=0.0)
     if seed < 0:
         raise ValueError(f"seed {seed} must be 0 or greater")
     d = _Draws(seed)
@@ -167,8 +174,11 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
     normal, distance, origin = _light_plane(d, sigma, cell)
     world_from_place = pose((0.0, 0.0, station.height), (1, 0, 0), (0, 0, 1))
     start = world_from_place @ station.place_from_start
-    start[:2, 3] += d.vector("start.translation", sigma.start_translation, 2)
-    start[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar("start.rotation", sigma.start_rotation)])) @ start[:3, :3]
+    # A station is brought to a fixed frame against stops.
+    loose = DOCKED if cell.fixed else 1.0
+    start[:2, 3] += loose * d.vector("start.translation", sigma.start_translation, 2)
+    turned = loose * d.scalar("start.rotation", sigma.start_rotation)
+    start[:3, :3] = rotation(np.array([0.0, 0.0, turned])) @ start[:3, :3]
     surface = d.moved(
         "station", world_from_place @ station.place_from_surface, sigma.station_translation, sigma.station_rotation
     )
@@ -209,7 +219,7 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
         dh_error=_dh_error(d, sigma),
         odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
         odometry_yaw=d.scalar("odometry_yaw", sigma.odometry_yaw),
-        suspension=np.abs(d.vector("suspension", sigma.suspension, 2)),
+        suspension=(not cell.fixed) * np.abs(d.vector("suspension", sigma.suspension, 2)),
         light_level=1.0 + d.scalar("light_level", sigma.ambient),
         light_gradient=d.vector("light_gradient", sigma.ambient, 2),
         scan_clock=_clock(d, "scan_clock", sigma, effects),

@@ -1,27 +1,41 @@
-"""Sweeps to and fro over the fine board, laser off: what the lateness of the camera's time stamps is found from."""
+"""Sweeps to and fro over the fine board, laser off: they tell how late the camera's stamps come, and its shutter."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
 from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing
-from cell.calibration.timing_fit import TimedFrame, TimedSweep, find_timing
+from cell.calibration.timing import Timing, link_of, most_late
+from cell.calibration.timing_fit import (
+    TimedFrame,
+    TimedSweep,
+    find_shutter,
+    find_timing,
+    refuse_late,
+    refuse_rolling,
+    roughly_late,
+)
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import rail_ends, verification_views
 from cell.steps.moves import HOME, Mover
 from cell.vision import BoardSpec, find_board, parse_board
-from drivers.errors import DeviceFault, RefusedError
+from drivers.errors import DeviceFault, LimitError, RefusedError
 
 SLOW_SHARE = 0.25
 """Of the rail's highest speed: what does not grow with the speed is no lateness."""
 EXPOSURES = 0.25, 0.5
 """Of what photographs of a board at rest are exposed: short, for the board is smeared by what it moves meanwhile."""
+MOST_SMEAR_M = 0.4e-3
+"""What the board may move by during an exposure: less than its dots are apart."""
+ROOM_M = 2e-3
+"""To either side of a sweep and its run-up."""
 FRAMES = 7
 """Of each sweep, about."""
 STAGGER_M = 4e-3
@@ -44,27 +58,83 @@ def collect_timing(
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
     """
-    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
-    view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
-    assert calibration.scan.reference is not None
-    base_from_board = calibration.scan.reference.base_from_board
-    ends = rail_ends(calibration.scan, base_from_board, view, fine, config.rail.travel)
-    if not devices.rail.state().homed_here:
-        progress(0.0, "homing the rail")
-        devices.rail.home().wait(60.0)
-    mover.to_joints(HOME)
-    move_to_view(devices, mover, view, 0)
-    base_from_flange = from_ur(devices.arm.state().flange)
-    fast, (short, long) = config.rail.max_speed, (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    short, long = (share * config.scan_camera.photo_exposure for share in EXPOSURES)
+    fast = min(config.rail.max_speed, MOST_SMEAR_M / long)
     slow = SLOW_SHARE * fast
     # The clocks are compared before each sweep, and differ by what that leaves open: many short sweeps, not few long.
     pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
     pairs.append((fast, short))
+
+    def tell(k: int, count: int) -> None:
+        check()
+        progress(k / count, f"fine board, sweep {k + 1} of {count}")
+
+    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, tell, keep)
+    given = most_late(config), config.rail.lead, link_of(config)
+    return find_timing(calibration.scan, base_from_flange, sweeps, *given)
+
+
+def look_at_shutter(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    check: Check,
+    keep: Keep,
+) -> CellCalibration:
+    """A new `calibration` with what one sweep to and fro over the fine board tells of the scan camera's shutter.
+
+    Where that tells nothing, for instance because pictures from a moving rail do not show the board, or the camera is
+    too slow for them, a note says so.
+    Raises `RefusedError` for a rolling shutter and for stamps that come later than the configuration allows: a sweep's
+    rows would lie askew, or all of it elsewhere, and nothing of a job shows it.
+    """
+    exposure = min(EXPOSURES) * config.scan_camera.photo_exposure
+    pairs = [(min(config.rail.max_speed, MOST_SMEAR_M / exposure), exposure)]
+    scan = calibration.scan
+    devices.interlocks.work_with(calibration.configuration)
+    try:
+        base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, lambda k, count: check(), keep)
+        shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
+        late, sigma = roughly_late(scan, base_from_flange, sweeps)
+    except (RefusedError, LimitError) as unseen:
+        note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
+        return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
+    refuse_rolling(shutter.readout, shutter.sigma)
+    refuse_late(late, sigma, most_late(config))
+    return replace(calibration, scan=replace(scan, shutter=shutter))
+
+
+def _sweeps(
+    config: CellConfig,
+    devices: Devices,
+    mover: Mover,
+    calibration: CellCalibration,
+    pairs: Sequence[tuple[float, float]],
+    tell: Callable[[int, int], None],
+    keep: Keep,
+) -> tuple[pin.SE3, list[TimedSweep]]:
+    """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
+
+    `tell` is given each sweep's number and how many there are.
+    """
+    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
+    view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
+    assert calibration.scan.reference is not None
+    base_from_board = calibration.scan.reference.base_from_board
+    # Within the travel the rail has to gain its speed, and to lose it.
+    room = max(speed for speed, _ in pairs) ** 2 / (2 * config.rail.acceleration) + ROOM_M
+    low, high = config.rail.travel
+    ends = rail_ends(calibration.scan, base_from_board, view, fine, (low + room, high - room))
+    if not devices.rail.state().homed_here:
+        devices.rail.home().wait(60.0)
+    mover.to_joints(HOME)
+    move_to_view(devices, mover, view, 0)
+    base_from_flange = from_ur(devices.arm.state().flange)
     plan = [(speed, exposure, way) for speed, exposure in pairs for way in (1, -1)]
     sweeps = []
     for k, (speed, exposure, way) in enumerate(plan):
-        check()
-        progress(k / len(plan), f"fine board, sweep {k + 1} of {len(plan)}")
+        tell(k, len(plan))
         # Pictures at other places each time: an error of the screw that they share would pass for lateness.
         inner = STAGGER_M * (k * GOLDEN % 1.0)
         between = (ends[0] + inner, ends[1] - STAGGER_M + inner)[::way]
@@ -78,9 +148,7 @@ def collect_timing(
             recoverable=True,
             hint="See what pushed the arm; the sweeps are of no use.",
         )
-    return find_timing(
-        calibration.scan, base_from_flange, sweeps, config.scan_camera.late + config.rail.late, config.rail.lead
-    )
+    return base_from_flange, sweeps
 
 
 def _swept(
@@ -117,4 +185,4 @@ def _swept(
             f"no picture of a sweep over the fine board shows it ({refused or 'none came'}); clean it, see that it is "
             "lit, and that scan_camera.photo_exposure is enough for a quarter of it"
         )
-    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made)
+    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made, sweep.time_bound)

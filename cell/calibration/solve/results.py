@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,7 @@ from cell.calibration.solve.blocks import HAND, SHARED, State
 from cell.calibration.solve.bow import FLAT
 from cell.calibration.solve.joint import Joint, effective_hand_eye_covariance
 from cell.calibration.solve.reference import Reference
-from cell.calibration.timing import Timing
+from cell.calibration.timing import Shutter, Timing
 from cell.calibration.witness import ConfirmedTurn, Pointing, Witness, turned
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.covariance import covariance_root
@@ -27,6 +28,7 @@ PARAMETERS = (
 """Names of the parameters that a calibration keeps the covariance of, in its order; px, 1, m and rad."""
 
 KEPT = HAND.stop
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,8 @@ class ScanCalibration:
     other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual. With a
     `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
     camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the camera's
-    time stamps were found to come.
+    time stamps were found to come, `shutter` how its rows are exposed; `unread` says what of these a file held that
+    cannot be read.
     """
 
     camera: CameraModel
@@ -80,6 +83,8 @@ class ScanCalibration:
     exit_point: Array = field(default_factory=lambda: np.zeros(3))
     confirmed: ConfirmedTurn | None = None
     timing: Timing | None = None
+    shutter: Shutter | None = None
+    unread: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:
@@ -143,7 +148,7 @@ class ScanCalibration:
 
     def as_dict(self) -> dict[str, Any]:
         """For storage. What was found out since the calibration has its key only where there is any."""
-        found = {"confirmed": self.confirmed, "timing": self.timing}
+        found = {"confirmed": self.confirmed, "timing": self.timing, "shutter": self.shutter}
         return {name: one.as_dict() for name, one in found.items() if one is not None} | {
             "camera": _camera_dict(self.camera),
             "light_plane": {
@@ -165,7 +170,21 @@ class ScanCalibration:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ScanCalibration:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
-        plane = data["light_plane"]
+        plane, unread = data["light_plane"], []
+
+        def found(name: str, read: Callable[[Any], Found | None], instead: str) -> Found | None:
+            # The calibration holds without it.
+            try:
+                return read(data.get(name))
+            except (KeyError, TypeError, AttributeError, ValueError) as error:
+                unread.append(f"the stored calibration's {name} cannot be read ({error!r}) and is left out: {instead}")
+                return None
+
+        again = "jobs go on with scan_camera.late until `cell calibrate timing` has measured it again"
+        timing = found("timing", Timing.read, again)
+        shutter = found("shutter", Shutter.read, "run `cell calibrate timing`, which looks at it again")
+        alone = "jobs go by the plate on the claw alone until `cell calibrate verify` has seen the laser again"
+        confirmed = found("confirmed", ConfirmedTurn.read, alone)
         return cls(
             _camera(data["camera"]),
             LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
@@ -178,8 +197,10 @@ class ScanCalibration:
             np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
             tuple(data.get("notes", ())),
             Witness.read(data.get("witness")),
-            confirmed=ConfirmedTurn.read(data.get("confirmed")),
-            timing=Timing.read(data.get("timing")),
+            confirmed=confirmed,
+            timing=timing,
+            shutter=shutter,
+            unread=tuple(unread),
         )
 
 

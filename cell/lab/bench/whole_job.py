@@ -13,6 +13,7 @@ import numpy as np
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.timing import look_at_shutter
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.sessions import arm_table
 from cell.calibration.store import CellCalibration
@@ -167,7 +168,8 @@ class _WholeJob:
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
         known = identities, self.config, arm_table(self.config, self.cell.devices), witness
-        return CellCalibration.solve(scan, target, *known)
+        made = CellCalibration.solve(scan, target, *known)
+        return look_at_shutter(self.config, devices, mover, made, hands.check, keep)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""

@@ -1,0 +1,85 @@
+"""Whether the planned sweeps tell where the surface is, before anything is swept; and which motion they leave open.
+
+The same inversion that a job does, on the points that the sweeps will see of the drawn surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config import CellConfig
+from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.inversion.observability import FREE, Verdict, judge
+from cell.job import Job
+from cell.new_job.rays import Array
+from cell.new_job.sweeps import Seen, as_cloud
+from cell.reconstruction import flange_motions
+
+OVER = 1e-4
+"""How far points of the drawing may lie from the surface that was cut out of it, m."""
+BARELY = 1.5
+"""So many times what the inversion takes for no information counts as none here: a scan may bring less than drawn."""
+
+
+def prior_of(job: Job) -> Array:
+    """Covariance (6, 6) of where the board puts the surface, S, m² and rad²."""
+    surface = job.surface
+    return np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
+
+
+def shared_by_all(config: CellConfig) -> Array:
+    """Covariance (6, 6) of what all points have in common: the arm's geometry as configured, m² and rad²."""
+    arm = config.arm
+    return np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
+
+
+def verdict(information: Array, points: int, radius: float, job: Job, config: CellConfig) -> Verdict:
+    """What a scan of this information (6, 6) in `points` points leaves open. A motion that the scan hardly determines
+    is left to the board altogether: what there is of it may be noise, or the drawing's facets."""
+    length = np.array([1.0] * 3 + [radius] * 3)
+    variance = points / max(float(np.trace(information[:3, :3])), 1e-9)
+    spectrum, ways = np.linalg.eigh(information / np.outer(length, length))
+    spectrum = np.where(spectrum * variance / points < BARELY * FREE, 0.0, spectrum)
+    information = (ways * spectrum) @ ways.T * np.outer(length, length)
+    known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
+    gain = known @ information
+    covariance = known + gain @ shared_by_all(config) @ gain.T
+    return judge(covariance, information, variance, points, radius, _tolerance(job))
+
+
+def known(seen: Sequence[Seen], surface: NominalSurface, job: Job, config: CellConfig) -> Verdict:
+    """What these sweeps leave open, by the points that the inversion uses: those over `surface`, not at its borders."""
+    used = [each.valid for each in seen]
+    for mask, each in zip(used, seen, strict=True):
+        index, feet = surface.feet(each.points[mask], OVER)
+        over = np.zeros(int(mask.sum()), dtype=np.bool_)
+        over[index] = feet.inner
+        mask[mask] = over
+    information = sum((each.information(mask) for each, mask in zip(seen, used, strict=True)), np.zeros((6, 6)))
+    return verdict(information, sum(int(mask.sum()) for mask in used), surface.radius, job, config)
+
+
+def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
+    """The place as the job's own inversion would tell it from these sweeps, without noise.
+
+    Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover
+    too little of the surface.
+    """
+    cloud = as_cloud(list(seen), config.calibration.rail_sigma).require()
+    arm = config.arm
+    rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+    return invert_pose(
+        cloud,
+        nominal,
+        Prior(pin.SE3.Identity(), prior_of(job)),
+        _tolerance(job),
+        systematic=shared_by_all(config),
+        sweeps=lambda lines, rows: flange_motions(cloud, lines, rows, [rest] * len(seen)),
+    )
+
+
+def _tolerance(job: Job) -> Tolerance:
+    return Tolerance(job.place.tolerance, job.place.tolerance_angle)

@@ -1,0 +1,193 @@
+"""A new job, from its mesh to its files: asked, proposed, checked as the cell will check it, drawn, then written.
+
+Nothing is written before the job has passed the checks of `cell check`; nothing moves.
+"""
+
+from __future__ import annotations
+
+import shlex
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from cell.check.fit import require_fit
+from cell.check.reach import sweep_problems
+from cell.config import CellConfig
+from cell.devices.described import Described
+from cell.inversion import NominalSurface, PlacePose
+from cell.job import Job, load_job
+from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
+from cell.new_job.knowledge import known, place_from
+from cell.new_job.mesh_file import Drawn, read_drawing
+from cell.new_job.picture import draw_proposal
+from cell.new_job.proposal import Proposal, propose
+from cell.new_job.questions import Asker, choice
+from cell.new_job.rays import Array
+from cell.new_job.rivals import FITS, rivals
+from cell.new_job.sight import sight_problems
+from cell.new_job.surface import about, written
+from cell.new_job.text import job_text, pose_text
+from cell.units import parse_quantity
+from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
+
+STEP_MM = (0.1, 2.0)
+"""How far apart lines may be, mm."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """The files of a new job: `job`, `mesh`, `picture`; what is known of its place beforehand, and what is not as
+    usual, in words."""
+
+    job: Path
+    mesh: Path
+    picture: Path
+    name: str
+    seen: float
+    place: PlacePose
+    notes: tuple[str, ...]
+
+
+def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) -> Made:
+    """Ask, propose, check, draw, write. Raises `ConfigError` for answers that fit neither each other nor the cell,
+    `NotObservable` when the surface does not tell where it is."""
+    drawn = asker.get("mesh", "The mesh of the surface (STL, PLY, STEP)", None, _read)
+    mesh = drawn.path
+    laid, unit = laid_mesh(asker, drawn)
+    name = job_name(asker, mesh)
+    targets = Path(folder / f"{name}.toml"), Path(folder / f"{name}.stl"), Path(folder / f"{name}.png")
+    targets = (targets[0], _beside(targets[1], mesh), targets[2])
+    _require_room(asker, targets, overwrite)
+    like = template(asker)
+    job = station(asker, like, name, targets[1].name, laid)
+    step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
+
+    def reachable(tried: Job) -> str | None:
+        return next(iter(sweep_problems(tried, config, laid.box)), None)
+
+    asker.tell("choosing sweeps …")
+    proposal = propose(laid, job, config, step, reachable)
+    if proposal.open and asker.given.get("turn") is None:
+        # The light comes aslant from behind: from the other side it falls on other flanks.
+        other = propose(about(laid), job, config, step, reachable)
+        if not other.open:
+            laid, proposal = (
+                about(laid),
+                replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks")),
+            )
+    heading = [
+        f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
+        f"Of the mesh, in {unit}, what the sweeps see is in {targets[1].name}: surface_from_mesh =",
+        "  " + pose_text(as_pose(laid.surface_from_mesh)),
+        *proposal.notes,
+    ]
+    with tempfile.TemporaryDirectory() as place:
+        there = Path(place)
+        written(proposal.surface, there / targets[1].name, f"{name}: what the sweeps see, mm, z up")
+        (there / targets[0].name).write_text(job_text(proposal.job, heading), encoding="utf-8")
+        notes = _checked(asker, there / targets[0].name, config, proposal)
+        nominal = NominalSurface.load(there / targets[1].name, "mm")
+        found = _place(asker, proposal, nominal, config)
+        draw_proposal(targets[2], proposal, nominal, config, f"job {name}, as proposed: nothing has moved")
+        asker.tell(f"picture: {targets[2]}; look at it")
+        if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
+            raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
+        for target in targets[:2]:
+            _copied(there / target.name, target).replace(target)
+    return Made(targets[0], targets[1], targets[2], name, proposal.share, found, (*proposal.notes, *notes))
+
+
+def _read(text: str) -> Drawn:
+    return read_drawing(Path(text.strip()).expanduser())
+
+
+def _beside(target: Path, mesh: Path) -> Path:
+    """Never over the mesh that was given."""
+    same = target.exists() and target.samefile(mesh)
+    return target.with_name(f"{target.stem}-surface.stl") if same else target
+
+
+def _require_room(asker: Asker, targets: tuple[Path, ...], overwrite: bool) -> None:
+    if not targets[0].parent.is_dir():
+        raise ConfigError(f"there is no folder {targets[0].parent}; make it first, or name another one with --folder")
+    there = [str(target) for target in targets if target.exists()]
+    if not there or overwrite:
+        return
+    if asker.ask is not None:
+        asker.tell(f"there already: {', '.join(there)}")
+        if asker.get("overwrite", "Overwrite", "no", choice("yes", "no")) == "yes":
+            return
+    raise ConfigError(f"{', '.join(there)}: there already; name the job otherwise with --name, or say --overwrite")
+
+
+def _checked(asker: Asker, path: Path, config: CellConfig, proposal: Proposal) -> list[str]:
+    """What `cell check` and the simulation say of the job as it is written; and what the part in the claw hides."""
+    try:
+        job, mesh = load_job(path)
+        if problems := list(sight_problems(job, config, proposal.seen)):
+            raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
+        require_fit(job, config, mesh)
+    except ConfigError as error:
+        raise ConfigError(f"{error}\nNothing was written. Again, changed: {_again(asker)}") from error
+    try:
+        Described(job, mesh).drawing(config)
+        require_fit(job, config, mesh, calibrates=True)
+    except ConfigError as error:
+        return [f"a real cell does this job, a simulated one does not: {error}"]
+    return []
+
+
+def _place(asker: Asker, proposal: Proposal, nominal: NominalSurface, config: CellConfig) -> PlacePose:
+    job = proposal.job
+    try:
+        known(proposal.seen, nominal, job, config).require()
+        _require_single(rivals(proposal.seen, nominal, job), job)
+        return place_from(proposal.seen, nominal, job, config)
+    except NotObservable as error:
+        angle = 1e3 * job.place.tolerance_angle / 3
+        shift = 1e3 * job.place.tolerance / 3
+        told = NotObservable(
+            f"this surface does not tell where it is, which is known before anything is swept: {error}. Where it is "
+            f'fixed to the board more exactly than stated, say so: --prior "{shift:.2g} mm" or less, --prior-angle '
+            f'"{angle:.2g} mrad" or less, and the board decides; where the part may lie shifted or turned by so much, '
+            f"say that: --tolerance, --tolerance-angle. Nothing was written. Again: {_again(asker)}",
+            *error.numbers,
+        )
+        raise told from error
+    except RefusedError as error:
+        raise RefusedError(
+            f"the proposed scan would be refused: {error}. Nothing was written. Again: {_again(asker)}"
+        ) from error
+
+
+def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
+    """Refuse a surface that looks the same somewhere else, where the board does not tell which place it is."""
+    if not others:
+        return
+    (x, y, z), turned = 1e3 * others[0][0], others[0][1]
+    away = float(np.linalg.norm(others[0][0]))
+    limit = (
+        f'--prior "{1e3 * away / 6:.2g} mm"'
+        if away > job.place.tolerance
+        else f'--prior-angle "{1e3 * turned / 6:.2g} mrad"'
+    )
+    raise RefusedError(
+        f"the surface looks the same elsewhere: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by "
+        f"{1e3 * turned:.0f} mrad, {100 * FITS:.0f} % or more of what the sweeps see fits as well ({len(others)} such "
+        f"places), and the board leaves that open. Take in an end or a feature that comes once; or, where it is fixed "
+        f"to the board as exactly, say {limit} or less"
+    )
+
+
+def _again(asker: Asker) -> str:
+    words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option not in ("write",)]
+    return " ".join(["cell new-job", *words])
+
+
+def _copied(source: Path, target: Path) -> Path:
+    """Beside its target, complete, so that the target is replaced in one step."""
+    near = target.with_name(f".{target.name}.new")
+    near.write_bytes(source.read_bytes())
+    return near

@@ -1,0 +1,233 @@
+"""The scan that is proposed: how high, how long, how many sweeps side by side, and tilted ones where they tell more.
+
+The head is set so that the middle of the surface lies where its camera is sharp and was calibrated. Straight sweeps
+cover the surface; a tilted one is added when straight ones leave a motion of the surface open, or much of it unseen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from cell.check.fit import CALIBRATION_DEPTHS, RAMP_MARGIN
+from cell.config import CellConfig
+from cell.inversion import NominalSurface
+from cell.job import Job, ScanSection, SwathSection
+from cell.new_job.knowledge import verdict
+from cell.new_job.rays import ABOVE, Array, Rays
+from cell.new_job.surface import Laid, open_side
+from cell.new_job.sweeps import FARTHEST, NEAREST, Seen, look
+from drivers.errors import ConfigError
+
+OVERLAP = 0.008
+"""How much neighbouring sweeps see twice, m: what the surface may lie beside its place, and what ties them together."""
+BESIDE = 0.001
+"""Left out at each side of a sweep, m: the surface does not lie exactly where it is drawn."""
+NARROW = 0.93
+"""Share of the surface's width that one sweep has to see for one to be enough."""
+END = 0.002
+"""By how much a sweep is shorter than the surface at each end, m: there it would see the border only."""
+LONGEST_S, PER_SWEEP_S = 90.0, 4.0
+"""Time for all sweeps, and for the arm's way to each: the step has 120 s."""
+MOST_FRAMES_HZ = 60.0
+MOST_SWEEPS = 20
+TILTS = tuple((math.radians(roll), math.radians(pitch)) for roll, pitch in (
+    (25, 0), (-25, 0), (0, 15), (0, -20), (25, 12), (25, -18), (-25, 12), (-25, -18)))  # fmt: skip
+"""Rolls about the sweep's way and pitches about the stripe that are tried, rad."""
+MOST_TILTED = 4
+BETTER, SEES_MORE, ENOUGH = 0.67, 0.05, 0.5
+"""A tilted sweep has to make the worst known motion so many times as large, or to see so much more of the surface;
+enough is known when that motion, at three standard deviations, is within this share of the tolerance."""
+LEAST_POINTS = 100
+SEEN_WITHIN = 0.0025
+"""A place of the surface is seen when a point lies this near, m: as the inversion counts it."""
+UNSEEN = 0.10
+"""Share of the surface that straight sweeps may leave unseen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A job with its scan, what its sweeps see of the surface, and what was decided on the way, in words."""
+
+    job: Job
+    surface: Laid
+    seen: tuple[Seen, ...]
+    notes: tuple[str, ...] = field(default=())
+    open: bool = False
+    """Whether a motion of the surface stays open, as far as the choice between sweeps tells."""
+
+    @property
+    def share(self) -> float:
+        """Share of the surface's area that is seen, 0 … 1."""
+        return seen_share(NominalSurface(self.surface.vertices, self.surface.faces), self.seen)
+
+
+def propose(body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None]) -> Proposal:
+    """A scan of what lies open of `body`, with lines `step` m apart.
+
+    `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does. Raises `ConfigError`
+    when the surface is too deep, too wide or too long for this scan head.
+    """
+    top = open_side(body)
+    scan, notes = _straight(top, job.scan, config, step)
+    search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable)
+    straight = _with(job, scan)
+    seen = look(config, straight, search.rays)
+    job, seen, more, excess = search.tilted(straight, seen)
+    ways = [ABOVE, *(way(swath) for swath in job.scan.swath if swath.roll or swath.pitch)]
+    surface = top if len(ways) == 1 else open_side(body, ways)
+    return Proposal(job, surface, tuple(seen), (*notes, *more), excess > 1.0)
+
+
+def _with(job: Job, scan: ScanSection) -> Job:
+    return job.model_copy(update={"scan": scan})
+
+
+def _straight(surface: Laid, like: ScanSection, config: CellConfig, step: float) -> tuple[ScanSection, list[str]]:
+    low, high = surface.box
+    notes = []
+    stand_off = _stand_off(float(low[2]), float(high[2]))
+    # The light comes aslant: what lies higher is lit earlier on the way.
+    length = float(high[0] - low[0]) - 2 * END + float(high[2] - low[2]) / config.laser.tan_theta
+    width = float(high[1] - low[1])
+    camera = config.scan_camera
+    seen = camera.height * camera.pixel / camera.focal_length * (stand_off - float(high[2])) - 2 * BESIDE
+    count = 1 if seen >= NARROW * width else math.ceil((width - seen) / (seen - OVERLAP)) + 1
+    if count > MOST_SWEEPS:
+        raise ConfigError(
+            f"the surface is {1e3 * width:.0f} mm wide, one sweep {1e3 * seen:.0f} mm: {count} sweeps side by side "
+            f"(allowed: at most {MOST_SWEEPS}); cut the mesh to what the part is placed onto"
+        )
+    edge = 0.5 * (width - seen)
+    across = [0.0] if count == 1 else [-edge + 2 * edge * k / (count - 1) for k in range(count)]
+    speed, rate, time = _pace(length, count, like.frame_rate, step)
+    if time > LONGEST_S:
+        raise ConfigError(
+            f"{count} sweeps of {1e3 * length:.0f} mm with lines {1e3 * step:g} mm apart take {time:.0f} s (allowed: "
+            f"at most {LONGEST_S:g} s); give a larger --step, or cut the mesh to what the part is placed onto"
+        )
+    rail = config.rail
+    longest = rail.travel[1] - rail.travel[0] - speed**2 / rail.acceleration - 2 * RAMP_MARGIN
+    mode = "rail" if length <= longest and speed <= rail.max_speed else "arm"
+    if mode == "arm":
+        notes.append(
+            f"swept by the arm: {1e3 * length:.0f} mm are longer than the rail's {1e3 * longest:.0f} mm"
+            if length > longest
+            else f"swept by the arm: {1e3 * speed:.0f} mm/s are faster than the rail's {1e3 * rail.max_speed:.0f} mm/s"
+        )
+    if count > 1:
+        notes.append(f"{count} sweeps side by side: one sees {1e3 * seen:.0f} mm of {1e3 * width:.0f} mm")
+    swaths = tuple(SwathSection.model_construct(across=round(y, 5), roll=0.0, pitch=0.0) for y in across)
+    made = like.model_copy(
+        update={"stand_off": stand_off, "length": round(length, 4), "speed": round(speed, 5), "frame_rate": rate,
+                "mode": mode, "swath": swaths}
+    )  # fmt: skip
+    return made, notes
+
+
+def _stand_off(low: float, high: float) -> float:
+    """Of the scan camera over the surface's origin: the middle of the surface where the head is best. Whole mm."""
+    best = CALIBRATION_DEPTHS["fine"][1]
+    stand_off = round(best + 0.5 * (low + high), 3)
+    near, far = stand_off - high, stand_off - low
+    if near < NEAREST or far > FARTHEST:
+        deepest = 2 * min(best - NEAREST, FARTHEST - best)
+        raise ConfigError(
+            f"the surface is {1e3 * (high - low):.0f} mm deep as seen from above (allowed: at most {1e3 * deepest:.0f} "
+            "mm: the stripe is sharp and calibrated so far); cut the mesh to what the part is placed onto, or turn it "
+            "with --up"
+        )
+    return stand_off
+
+
+def _pace(length: float, count: int, rate: float, step: float) -> tuple[float, float, float]:
+    """Speed (m/s) and frame rate (Hz) for lines `step` m apart, and the time that all sweeps take, s: no faster than
+    the job that this one is like, as long as there is time."""
+    wanted = count * length / step / max(LONGEST_S - count * PER_SWEEP_S, 1.0)
+    rate = max(rate, min(MOST_FRAMES_HZ, math.ceil(wanted)))
+    speed = step * rate
+    return speed, rate, count * (length / speed + PER_SWEEP_S)
+
+
+@dataclass(eq=False)
+class _Search:
+    """Looks for tilted sweeps of the mesh that `rays` meet; `top` is what straight ones are to see of it."""
+
+    config: CellConfig
+    rays: Rays
+    top: NominalSurface
+    reachable: Callable[[Job], str | None]
+
+    def tilted(self, job: Job, seen: list[Seen]) -> tuple[Job, list[Seen], list[str], float]:
+        """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
+        of the surface; in words what was added and what was not; and the worst known motion, in tolerances."""
+        worst, missed = self._excess(job, seen), self._missed(seen)
+        if worst <= 1.0 and missed <= UNSEEN:
+            return job, seen, [], worst
+        why = (
+            f"straight sweeps leave {100 * missed:.0f} % of the surface unseen"
+            if worst <= 1.0
+            else "straight sweeps leave a motion of the surface open"
+        )
+        left = {tilt: self._one(job, *tilt) for tilt in TILTS}
+        refused: list[str] = []
+        added: list[str] = []
+        while left and len(added) < MOST_TILTED and (worst > ENOUGH or missed > UNSEEN):
+            tried = {tilt: (self._excess(job, [*seen, one]), self._missed([*seen, one])) for tilt, one in left.items()}
+            tilt = min(tried, key=lambda each: tried[each][0] if worst > ENOUGH else tried[each][1])
+            excess, unseen = tried[tilt]
+            if not (excess < BETTER * worst or unseen < missed - SEES_MORE):
+                break
+            with_it = _with(job, _and_tilted(job.scan, *tilt))
+            one = left.pop(tilt)
+            if (problem := self.reachable(with_it)) is not None:
+                refused.append(f"no sweep with {_words(*tilt)}: {problem}")
+                continue
+            job, seen, worst, missed = with_it, [*seen, one], excess, unseen
+            added.append(_words(*tilt))
+        told = f"tilted ones added ({'; '.join(added)})" if added else "tilted ones tell no more"
+        return job, seen, [f"{why}: {told}", *refused[:2]], worst
+
+    def _one(self, job: Job, roll: float, pitch: float) -> Seen:
+        """What the tilted sweep alone sees."""
+        swath = _and_tilted(job.scan, roll, pitch).swath[-1:]
+        return look(self.config, _with(job, job.scan.model_copy(update={"swath": swath})), self.rays)[0]
+
+    def _missed(self, seen: Sequence[Seen]) -> float:
+        """Share of the surface's area, 0 … 1, that no sweep sees."""
+        return 1.0 - seen_share(self.top, seen)
+
+    def _excess(self, job: Job, seen: Sequence[Seen]) -> float:
+        """3σ of the least known motion, in tolerances."""
+        used = [each.solid for each in seen]
+        if (points := sum(int(mask.sum()) for mask in used)) < LEAST_POINTS:
+            return math.inf
+        information = sum((each.information(mask) for each, mask in zip(seen, used, strict=True)), np.zeros((6, 6)))
+        return verdict(information, points, self.top.radius, job, self.config).worst.excess
+
+
+def _and_tilted(scan: ScanSection, roll: float, pitch: float) -> ScanSection:
+    swath = SwathSection.model_construct(across=0.0, roll=roll, pitch=pitch)
+    return scan.model_copy(update={"swath": (*scan.swath, swath)})
+
+
+def _words(roll: float, pitch: float) -> str:
+    """A tilt."""
+    return " and ".join(
+        f"{name} {math.degrees(angle):.0f} deg" for name, angle in (("roll", roll), ("pitch", pitch)) if angle
+    )
+
+
+def way(swath: SwathSection) -> Array:
+    """The unit direction (3,), S, from which a sweep's camera looks."""
+    return np.asarray(pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0) @ ABOVE)
+
+
+def seen_share(surface: NominalSurface, seen: Sequence[Seen]) -> float:
+    """Share of the surface's area that has a point of a sweep near it."""
+    points = np.concatenate([each.points[each.valid] for each in seen])
+    return surface.coverage(points, SEEN_WITHIN) if len(points) else 0.0

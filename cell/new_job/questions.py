@@ -1,0 +1,141 @@
+"""Questions of a new job, each with its default: answered by an option, by a person, or by the default itself.
+
+An answer is checked by the job file's own rule for that value. A wrong one is told with the range that is allowed; a
+person is asked again, an option ends the command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from cell.device_config import Mounting, Pose
+from cell.toml_file import wording
+from cell.units import shown
+from drivers.errors import ConfigError
+
+T = TypeVar("T")
+P = TypeVar("P", bound=Pose)
+
+
+@dataclass(eq=False)
+class Asker:
+    """Asks the questions. `given` are the options by name, None for those that were not given; `ask` puts a question
+    with its default to a person, None where nobody is there; `tell` says something to that person.
+
+    `used` collects what was answered, as options that would answer the same.
+    """
+
+    given: Mapping[str, str | None]
+    ask: Callable[[str, str | None], str] | None
+    tell: Callable[[str], None]
+    used: dict[str, str] = field(default_factory=dict)
+
+    def get(self, option: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
+        """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one.
+
+        Raises `ConfigError` for a wrong option, and for a question without default that nobody answers.
+        """
+        text = self.given.get(option)
+        if text is None and self.ask is None:
+            if default is None:
+                raise ConfigError(f"{question}? Nobody is asked with --yes, and there is no default: give --{option}")
+            text = default
+        if text is not None:
+            try:
+                found = parse(text)
+            except ValueError as error:
+                raise ConfigError(f"--{option}: {error}") from error
+            except ConfigError as error:
+                raise ConfigError(f"--{option}: {error}") from error
+            self._keep(option, text, default)
+            return found
+        assert self.ask is not None
+        while True:
+            text = self.ask(question, default)
+            try:
+                found = parse(text)
+            except (ValueError, ConfigError) as error:
+                self.tell(str(error))
+                continue
+            self._keep(option, text, default)
+            return found
+
+    def _keep(self, option: str, text: str, default: str | None) -> None:
+        if text != default:
+            self.used[option] = text
+
+
+def checked(record: type[BaseModel], key: str) -> Callable[[str], Any]:
+    """Parses a value by the rule of the key of a job's section."""
+    adapter = _rule(record, key)
+
+    def parse(text: str) -> Any:
+        return _by(adapter, text.strip())
+
+    return parse
+
+
+def three(record: type[BaseModel], key: str) -> Callable[[str], Any]:
+    """Parses three values, such as "70 mm, 36 mm, 20 mm", by the rule of the key."""
+    adapter = _rule(record, key)
+
+    def parse(text: str) -> Any:
+        parts = [part.strip() for part in text.split(",")]
+        if len(parts) != 3:
+            raise ValueError(f'{shown(text)} has {len(parts)} values; write three, such as "70 mm, 36 mm, 20 mm"')
+        return _by(adapter, parts)
+
+    return parse
+
+
+def pose(kind: type[P]) -> Callable[[str], P]:
+    """Parses "x, y, z" or "x, y, z; roll, pitch, yaw", each with its unit."""
+
+    def parse(text: str) -> P:
+        halves = [[part.strip() for part in half.split(",")] for half in text.split(";")]
+        if len(halves) > 2 or any(len(half) != 3 for half in halves):
+            raise ValueError(
+                f'{shown(text)} is no pose; write three lengths, and three angles if it is turned, such as "0 mm, '
+                '0 mm, 5 mm; 0 deg, 0 deg, 90 deg"'
+            )
+        turn = halves[1] if len(halves) == 2 else ["0 deg"] * 3
+        made: P = _by(TypeAdapter(kind), {"translation": halves[0], "rotation": turn})
+        return made
+
+    return parse
+
+
+def pose_words(where: Pose | Mounting) -> str:
+    """A pose as `pose` reads it."""
+    from cell.new_job.text import deg, mm
+
+    there, turn = (", ".join(map(write, each)) for write, each in ((mm, where.translation), (deg, where.rotation)))
+    return f"{there}; {turn}".replace('"', "")
+
+
+def choice(*words: str) -> Callable[[str], str]:
+    """Parses one of these words."""
+
+    def parse(text: str) -> str:
+        if text.strip() not in words:
+            raise ValueError(f"{shown(text)} is none of {', '.join(words)}; write one of them")
+        return text.strip()
+
+    return parse
+
+
+def _rule(record: type[BaseModel], key: str) -> TypeAdapter[Any]:
+    rule: Any = record.model_fields[key]
+    kind: Any = Annotated[rule.annotation, *rule.metadata] if rule.metadata else rule.annotation
+    return TypeAdapter(kind)
+
+
+def _by(adapter: TypeAdapter[Any], value: object) -> Any:
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        raise ValueError("; ".join(dict.fromkeys(wording(problem) for problem in error.errors()))) from error

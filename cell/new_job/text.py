@@ -1,0 +1,113 @@
+"""A job as the text of its file: every value with its unit, each section with what it means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from cell.device_config import Pose
+from cell.job import Job, SwathSection
+from cell.obstacles import StationObstacle
+
+
+def job_text(job: Job, heading: Sequence[str]) -> str:
+    """The file of a job. `heading` are the lines of comment at its top: where it comes from, what was decided."""
+    approach, photo, surface, scan = job.approach, job.photo, job.surface, job.scan
+    grasp, place = job.grasp, job.place
+    lines = [f"# {line}" for line in heading]
+    lines += [
+        "",
+        "[job]",
+        f'name = "{job.job.name}"',
+        *([] if job.job.kind == "place" else [f'kind = "{job.job.kind}"']),
+        "",
+        "[board]                             # fixed beside the placement area",
+        f'spec = "{job.board.spec}"',
+        f"place_from_board = {pose_text(job.board.place_from_board)}",
+        "",
+        "[approach]                          # the vehicle in the place frame, driving along its x axis",
+        f"start = {pose_text(approach.start)}",
+        f"staging = {pose_text(approach.staging)}",
+        f"target = {pose_text(approach.target)}",
+        f'speed = "{approach.speed:.6g} m/s"',
+        f"tolerance = {mm(approach.tolerance)}",
+        f"tolerance_angle = {deg(approach.tolerance_angle)}",
+        "",
+        "[photo]",
+        f"stand_off = {mm(photo.stand_off)}                # from the target camera to the board's centre",
+        f"look_down = {deg(photo.look_down)}                # of the optical axis below the horizon while driving",
+        f"max_obliquity = {deg(photo.max_obliquity)}",
+        f"max_residual = {photo.max_residual:.6g}                  # RMS of the dots, px",
+        f"count = {photo.count}                           # photographs that are averaged",
+        "",
+        "[surface]",
+        f'mesh = "{surface.mesh}"        # beside this file: what of the mesh the sweeps see, in its own frame',
+        f'mesh_unit = "{surface.mesh_unit}"',
+        f"place_from_surface = {pose_text(surface.place_from_surface)}",
+        f"prior_sigma = {mm(surface.prior_sigma)}                # how well the board tells where it is, 1 sigma",
+        f"prior_sigma_angle = {deg(surface.prior_sigma_angle)}",
+        "",
+        "[scan]",
+        f"stand_off = {mm(scan.stand_off)}                # from the scan camera to the surface's z = 0",
+        f"length = {mm(scan.length)}",
+        f'speed = "{1e3 * scan.speed:.6g} mm/s"',
+        f'frame_rate = "{scan.frame_rate:.6g} Hz"',
+        f'exposure = "{1e3 * scan.exposure:.6g} ms"',
+        f'mode = "{scan.mode}"                       # "rail", or "arm": the arm moves the scan head',
+        f"largest_hole = {mm(scan.largest_hole)}             # across, that is interpolated",
+        f"swath = [{', '.join(_swath(swath) for swath in scan.swath)}]",
+        "",
+        "[grasp]",
+        f"flange_from_part = {pose_text(grasp.flange_from_part)}",
+        f"size = [{', '.join(map(mm, grasp.size))}]",
+        f"sigma = {mm(grasp.sigma)}                    # how exactly the claw holds it, 1 sigma: nothing sees it",
+        f'sigma_angle = "{1e3 * grasp.sigma_angle:.6g} mrad"',
+        "",
+        "[place]",
+        f"surface_from_part = {pose_text(place.surface_from_part)}",
+        f"approach = {mm(place.approach)}                  # the straight line above the place pose",
+        f'speed = "{1e3 * place.speed:.6g} mm/s"',
+        f'contact_speed = "{1e3 * place.contact_speed:.6g} mm/s"',
+        f'contact_force = "{place.contact_force:.6g} N"',
+        f"contact_travel = {mm(place.contact_travel)}             # before and behind the place pose, for contact",
+        f"tolerance = {mm(place.tolerance)}",
+        f'tolerance_angle = "{1e3 * place.tolerance_angle:.6g} mrad"',
+    ]
+    for obstacle in job.obstacle:
+        lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
+    return "\n".join(lines) + "\n"
+
+
+def mm(metres: float) -> str:
+    """A length, quoted."""
+    return f'"{_plain(1e3 * metres)} mm"'
+
+
+def deg(radians: float) -> str:
+    """An angle, quoted."""
+    return f'"{_plain(math.degrees(radians))} deg"'
+
+
+def pose_text(pose: Pose) -> str:
+    """A pose as an inline table."""
+    there, turn = ", ".join(map(mm, pose.translation)), ", ".join(map(deg, pose.rotation))
+    return f"{{ translation = [{there}], rotation = [{turn}] }}"
+
+
+def _swath(swath: SwathSection) -> str:
+    keys = [f"across = {mm(swath.across)}"]
+    keys += [f"{name} = {deg(angle)}" for name, angle in (("roll", swath.roll), ("pitch", swath.pitch)) if angle]
+    return f"{{ {', '.join(keys)} }}"
+
+
+def _obstacle(obstacle: StationObstacle) -> list[str]:
+    return [
+        f'name = "{obstacle.name}"',
+        f"size = [{', '.join(map(mm, obstacle.size))}]",
+        f"place_from_centre = {pose_text(obstacle.place_from_centre)}",
+    ]
+
+
+def _plain(value: float) -> str:
+    """No more digits than were meant: what arithmetic added in the last place is not."""
+    return f"{round(value, 6):.10g}".replace("-0", "0") if round(value, 6) == 0 else f"{round(value, 6):.10g}"

@@ -1,0 +1,106 @@
+"""AgileX protocol v2 on a CAN bus: messages by their names in the DBC, in its units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.resources import as_file, files
+from typing import Any, cast
+
+import can
+import cantools
+from cantools.database.can import Database, Message
+
+from drivers.interfaces import LinkStatistics
+from drivers.vehicle.can_link import CanLink
+
+
+def load_database() -> Database:
+    """The AgileX v2 messages of `agilex_v2.dbc`."""
+    with as_file(files("drivers.vehicle") / "agilex_v2.dbc") as path:
+        return cast(Database, cantools.database.load_file(path))
+
+
+class AgilexLink:
+    """A `CanLink`; `receive` is called with each known message's name and signal values.
+
+    `wanted` names the messages that are decoded; others are ignored. Raises what `CanLink` does.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        interface: str,
+        channel: str,
+        *,
+        bitrate: int,
+        options: Mapping[str, Any],
+        database: Database,
+        wanted: frozenset[str],
+        receive: Callable[[str, dict[str, float]], None],
+        idle: Callable[[float], None],
+        statistics: LinkStatistics,
+    ) -> None:
+        self._database = database
+        self._wanted: dict[int, Message] = {
+            message.frame_id: message for message in database.messages if message.name in wanted
+        }
+        self._receive = receive
+        self._statistics = statistics
+        self._bus = CanLink(
+            name,
+            interface,
+            channel,
+            bitrate=bitrate,
+            options=options,
+            receive=self._take,
+            idle=idle,
+            statistics=statistics,
+            alone="the vehicle stops by itself 0.5 s after the last command",
+        )
+
+    @property
+    def alive(self) -> bool:
+        """As `CanLink.alive`."""
+        return self._bus.alive
+
+    def check(self) -> None:
+        """As `CanLink.check`."""
+        self._bus.check()
+
+    @contextmanager
+    def listening(self) -> Iterator[list[tuple[float, can.Message]]]:
+        """As `CanLink.listening`."""
+        with self._bus.listening() as heard:
+            yield heard
+
+    def send(self, name: str, **signals: float) -> None:
+        """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
+        self._bus.check()
+        if name == "ControlModeCommand":
+            # Who never commanded it has nothing to end.
+            zero = self._frame("MotionCommand", Speed=0.0, YawRate=0.0, LateralSpeed=0.0, Steering=0.0)
+            self._bus.say_in_the_end((*[zero] * 3, self._frame("BrakeCommand", Locked=1)))
+        self._bus.send(self._frame(name, **signals), name)
+
+    def send_data(self, identifier: int, data: bytes) -> None:
+        """Send a frame that is not in the message table. Raises as `check` does."""
+        frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+        self._bus.send(frame, f"0x{identifier:03X}")
+
+    def close(self) -> None:
+        """As `CanLink.close`."""
+        self._bus.close()
+
+    def _frame(self, name: str, **signals: float) -> can.Message:
+        message = self._database.get_message_by_name(name)
+        return can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
+
+    def _take(self, frame: can.Message) -> None:
+        message = self._wanted.get(frame.arbitration_id)
+        if message is None or frame.is_extended_id or frame.is_remote_frame:
+            return
+        if len(frame.data) != message.length:
+            self._statistics.count("malformed")
+            return
+        self._receive(message.name, cast(dict[str, float], message.decode(bytes(frame.data), decode_choices=False)))

@@ -1,0 +1,321 @@
+"""What both drives tell together: the vehicle's state, and the faults that it shows."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+
+from drivers.clock import Clock
+from drivers.errors import DeadlineError, DeviceFault
+from drivers.interfaces import LinkStatistics, VehicleState
+from drivers.vehicle.cia402.drive import Drive
+from drivers.vehicle.cia402.faults import command_lost, drive_error, wrong_units
+from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
+from drivers.vehicle.cia402.objects import OPERATIONAL, STATUS
+from drivers.vehicle.cia402.states import DriveState, may_turn
+from drivers.vehicle.cia402.units import UnitCheck
+from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback
+from drivers.vehicle.travel import Travel
+
+SILENCE_S = 0.5
+"""Feedback that stays away for this long is a fault."""
+WALL_FLOOR_S = 0.5
+"""No patience with the vehicle is shorter than this on the wall, however fast the clock runs."""
+QUIET_S = 2.0
+"""Of a drive that stands nothing may be heard for this long, on the wall, while this program does listen."""
+UNHEARD = 8
+"""A drive that drives and was asked so many times for its state without an answer is lost."""
+STILL = 0.0035
+"""Speeds up to this, m/s and rad/s, count as standstill."""
+_RELEASED_WALL_S = 0.3
+_FAST_AGE_WALL_S = 0.2
+_PAIR_WALL_S = 0.006
+"""Both drives answer one SYNC within this; the next comes after 10 ms at the earliest."""
+
+
+def patience(clock: Clock, seconds: float) -> float:
+    """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
+    return max(seconds, WALL_FLOOR_S * clock.rate)
+
+
+class Feedback:
+    """Both drives and the way of their wheels; `take` is called by the receive thread."""
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        wheels: WheelDrives,
+        *,
+        max_speed: float,
+        max_yaw_rate: float,
+        statistics: LinkStatistics,
+    ) -> None:
+        self._name = name
+        self._clock = clock
+        self._wheels = wheels
+        self._statistics = statistics
+        self.drives = tuple(Drive(side, node) for side, node in zip(SIDES, wheels.nodes, strict=True))
+        self._by_node = {drive.node: drive for drive in self.drives}
+        self._travel = Travel(
+            clock,
+            statistics,
+            track=wheels.track,
+            max_speed=max_speed,
+            max_yaw_rate=max_yaw_rate,
+            unit=wheels.count_length,
+        )
+        self._news = threading.Condition(threading.RLock())
+        self._single: tuple[int, float] | None = None
+        self._units = [UnitCheck(clock, wheels), UnitCheck(clock, wheels)]
+        self.mismatch = ""
+        """How a wheel's speed and its counts contradict each other."""
+        self.proving = False
+        """The drives' watchdog is being tried: that it stops them is no fault."""
+
+    # --- what comes ---
+
+    def take(self, node: int, service: int, data: bytes, in_pdo: bool = True) -> None:
+        """Take a drive's frame, or what it was asked for one by one. Raises ValueError for one of another length."""
+        now = self._clock.now()
+        with self._news:
+            drive = self._by_node[node]
+            if drive.quiet > QUIET_S:
+                self._travel.interrupt(f"nothing was heard of the {drive.side} drive for {drive.quiet:.1f} s")
+            if drive.take(service, data, now):
+                self._travel.interrupt(f"the {drive.side} drive was restarted")
+            if service == STATUS and in_pdo and self._is_pair(node, now):
+                self._count(now)
+            self._news.notify_all()
+
+    def _is_pair(self, node: int, now: float) -> bool:
+        """Whether both drives have told of the same SYNC: a reading of one side alone would be half a turn."""
+        other, self._single = self._single, (node, now)
+        if other is None or other[0] == node or self._clock.wall(now - other[1]) > _PAIR_WALL_S:
+            return False
+        self._single = None
+        return True
+
+    def _count(self, now: float) -> None:
+        left, right = (
+            -drive.position if back else drive.position
+            for drive, back in zip(self.drives, self._wheels.reversed, strict=True)
+        )
+        self._travel.count(now, left, right)
+        for drive, units in zip(self.drives, self._units, strict=True):
+            if math.isfinite(drive.moved) and (ratio := units.contradiction(now, drive.position, drive.velocity)):
+                self.mismatch = (
+                    f"the {drive.side} wheel's speed is {ratio:.3g} times what its counts say: vehicle.velocity_unit "
+                    f'"{self._wheels.velocity_unit}" and vehicle.counts_per_turn {self._wheels.counts} do not fit its '
+                    "drive"
+                )
+
+    def other(self, what: str) -> None:
+        """Somebody else commands."""
+        with self._news:
+            self._travel.disturb(what)
+            self._statistics.count("other_master")
+            self._news.notify_all()
+
+    def idle(self, seconds: float) -> None:
+        """The receiver has waited for `seconds` on the wall."""
+        with self._news:
+            for drive in self.drives:
+                drive.quiet += seconds
+
+    # --- what was commanded ---
+
+    def asked(self) -> None:
+        """The drives were just asked to tell their state."""
+        with self._news:
+            for drive in self.drives:
+                drive.waited += 1
+
+    def commanded_to_move(self) -> None:
+        """A velocity was just sent."""
+        with self._news:
+            self._travel.commanded_to_move()
+
+    def acknowledge(self) -> None:
+        """Whoever takes command now has heard of what was before."""
+        with self._news:
+            self._travel.acknowledge()
+            self.mismatch = ""
+            for drive, units in zip(self.drives, self._units, strict=True):
+                drive.waited = 0
+                units.forget()
+
+    def interrupt(self, why: str) -> None:
+        """From now on odometry does not tell where the vehicle is relative to where it was before."""
+        with self._news:
+            self._travel.interrupt(why)
+
+    # --- what is told ---
+
+    @property
+    def interruptions(self) -> int:
+        """How often odometry lost its connection to where the vehicle was before."""
+        with self._news:
+            return self._travel.interruptions
+
+    @property
+    def disturbance(self) -> str:
+        """How somebody else commands or moves the vehicle."""
+        with self._news:
+            return self._travel.disturbance
+
+    def wait_for(
+        self,
+        happened: Callable[[], bool],
+        timeout: float,
+        alive: Callable[[], bool],
+        floor: float = WALL_FLOOR_S,
+    ) -> bool:
+        """Wait until news make `happened` true; False when they do not or `alive` turns false.
+
+        At most `timeout` s, or `floor` s on the wall if that is longer.
+        """
+        deadline = self._clock.now() + max(timeout, floor * self._clock.rate)
+        with self._news:
+            while not happened():
+                left = deadline - self._clock.now()
+                if left <= 0.0 or not alive():
+                    return False
+                self._news.wait(min(self._clock.wall(left), 0.1))
+        return True
+
+    def complete(self) -> bool:
+        """True once both drives have told status and motion."""
+        return all(math.isfinite(min(drive.told, drive.moved)) for drive in self.drives)
+
+    def newer(self, time: float) -> bool:
+        """True when both drives have told status and motion after host time `time`."""
+        return all(min(drive.told, drive.moved) > time for drive in self.drives)
+
+    def operational(self) -> bool:
+        """Whether both drives are, as far as they have told."""
+        return all(drive.nmt in (None, OPERATIONAL) for drive in self.drives)
+
+    def all_in(self, *states: DriveState) -> bool:
+        """Whether both drives are in one of these states."""
+        return all(drive.state in states for drive in self.drives)
+
+    def statuswords_other_than(self, seen: tuple[int, ...]) -> bool:
+        """Whether a drive has told another statusword than `seen`."""
+        return tuple(drive.statusword for drive in self.drives) != seen
+
+    def all_but(self, which: Callable[[DriveState], bool]) -> bool:
+        """Whether no drive is in a state of which `which` is true."""
+        return not any(which(drive.state) for drive in self.drives)
+
+    def may_turn(self) -> bool:
+        """Whether a drive may turn its wheel, so that its own brake is open."""
+        return any(may_turn(drive.state) for drive in self.drives)
+
+    def stands(self, since: float) -> bool:
+        """True when both drives have reported standstill after host time `since`."""
+        step = 1.5 * self._wheels.velocity_step
+        slow = max(STILL, step)
+        at_rest = all(abs(drive.velocity) * self._wheels.velocity_step <= slow for drive in self.drives)
+        return at_rest and all(drive.moved > since for drive in self.drives)
+
+    def gave_up(self) -> DeviceFault | None:
+        """Why the vehicle, enabled, must not drive on; None when both drives obey. One wheel alone never drives."""
+        with self._news:
+            if found := self._reported():
+                return found
+            for drive in self.drives:
+                if drive.waited > UNHEARD and self._clock.wall(self._clock.now() - drive.told) > _FAST_AGE_WALL_S:
+                    return no_feedback(self._name, f"the {drive.side} drive does not tell its state any more")
+                if why := drive.left_command():
+                    return command_lost(self._name, why)
+            return self._contradicted()
+
+    def _reported(self) -> DeviceFault | None:
+        """An emergency stop, or a drive's fault."""
+        if self._stopped():
+            return emergency_stop(self._name)
+        trouble = self._trouble()
+        return drive_error(self._name, trouble, driven=self._travel.driven) if trouble else None
+
+    def _trouble(self) -> tuple[str, ...]:
+        return () if self.proving else tuple(word for drive in self.drives for word in drive.trouble())
+
+    def _contradicted(self) -> DeviceFault | None:
+        """What a vehicle that obeys must not show: another master, or units that do not fit."""
+        if self.mismatch:
+            return wrong_units(self._name, self.mismatch)
+        return disturbed(self._name, self._travel.disturbance) if self._travel.disturbance else None
+
+    def require_released(self) -> None:
+        """Raise the `DeviceFault` of an emergency stop that is pressed; one that was just released is waited for."""
+        if not self.wait_for(lambda: not self._stopped(), 0.0, lambda: True, _RELEASED_WALL_S):
+            raise emergency_stop(self._name)
+
+    def _stopped(self) -> bool:
+        """Whether a drive's input says that the emergency stop is pressed."""
+        bit = self._wheels.stop_input
+        if bit is None:
+            return False
+        return any((drive.inputs >> bit & 1 == 1) == self._wheels.stop_active for drive in self.drives)
+
+    def state(self, max_age: float, braked: bool | None, in_command: bool) -> VehicleState:
+        """All as one record; `DeadlineError` when it is older than `max_age` s.
+
+        On a clock that runs faster than the wall, no age below 0.2 s of the wall counts as old.
+        """
+        if self._clock.rate > 1.0:
+            max_age = max(max_age, _FAST_AGE_WALL_S * self._clock.rate)
+        with self._news:
+            told = min(min(drive.told, drive.moved) for drive in self.drives)
+            left, right = self.drives
+            speed, yaw_rate = self._wheels.motion((left.velocity, right.velocity))
+            odometry, travel = self._travel.odometry, self._travel
+            volts = [drive.millivolts for drive in self.drives if drive.millivolts is not None]
+            found = VehicleState(
+                stamp=told,
+                x=odometry.x,
+                y=odometry.y,
+                yaw=odometry.yaw,
+                speed=speed,
+                yaw_rate=yaw_rate,
+                command_mode=in_command and not any(drive.left_command() for drive in self.drives),
+                braked=braked,
+                emergency_stop=self._stopped(),
+                error_bits=max(drive.code for drive in self.drives),
+                battery_volts=round(1e-3 * min(volts), 1) if volts else None,
+                trouble=self._trouble(),
+                warnings=tuple(word for drive in self.drives for word in drive.warnings()),
+                interruptions=travel.interruptions,
+                interruption=travel.interruption,
+            )
+        age = self._clock.now() - told
+        if age > max_age:
+            raise DeadlineError(
+                self._name, f"the newest feedback is {age:.2f} s old, allowed {max_age:.2f} s. Check the CAN bus"
+            )
+        return found
+
+    def check(self, *, in_command: bool, driving: bool, lost: DeviceFault | None = None) -> None:
+        """Raise the `DeviceFault` that the drives show; `lost` is why this program lost command, if it did.
+
+        One who is `driving` must have heard of both lately. For a vehicle that stands it is enough that the receiver
+        does not wait in vain: a program that computes reads late.
+        """
+        with self._news:
+            late = min(self.drives, key=lambda drive: min(drive.told, drive.moved))
+            silent = self._clock.now() - min(late.told, late.moved)
+            quiet = max(self.drives, key=lambda drive: drive.quiet)
+            reported, contradicted = self._reported(), self._contradicted()
+        if quiet.quiet > QUIET_S:
+            raise no_feedback(self._name, f"nothing of the {quiet.side} drive for {quiet.quiet:.2f} s")
+        if driving and silent > patience(self._clock, SILENCE_S):
+            raise no_feedback(self._name, f"no feedback of the {late.side} drive for {silent:.2f} s")
+        if reported is not None:
+            raise reported
+        if in_command and contradicted is not None:
+            raise contradicted
+        if in_command and lost is not None:
+            self.interrupt(lost.message)
+            raise lost

@@ -1,0 +1,185 @@
+"""What a CANopen drive's numbers mean: states, emergencies, units, and readings that belong together."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cell.config import default_toml, load_config
+from cell.devices.makes import make_of
+from cell.devices.vehicle_makes import CanopenVehicleConfig
+from drivers.clock import Clock
+from drivers.errors import ConfigError
+from drivers.interfaces import LinkStatistics
+from drivers.vehicle.cia402.emergencies import meaning
+from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.geometry import WheelDrives
+from drivers.vehicle.cia402.objects import MOTION, STATUS
+from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
+from drivers.vehicle.cia402.units import UnitCheck
+
+WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), 0.58, 0.5, 1.0)
+
+
+class Hand(Clock):
+    """A clock that is moved by hand."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+
+@pytest.mark.parametrize(
+    ("statusword", "state", "turns"),
+    [
+        # As makers' manuals print them, with voltage, remote and their own bits set.
+        (0x0250, DriveState.DISABLED, False),
+        (0x0231, DriveState.READY, False),
+        (0x0233, DriveState.SWITCHED_ON, False),
+        (0x1637, DriveState.ENABLED, True),
+        (0x0217, DriveState.QUICK_STOP, True),
+        (0x021F, DriveState.REACTING, True),
+        (0x0238, DriveState.FAULT, False),
+        (0x0200, DriveState.NOT_READY, False),
+    ],
+)
+def test_a_statusword_tells_the_state(statusword: int, state: DriveState, turns: bool) -> None:
+    assert state_of(statusword) is state
+    assert may_turn(state) is turns
+
+
+def test_the_way_through_the_states() -> None:
+    assert leads_to_enabled(DriveState.FAULT, 0x0F) == 0x00
+    assert leads_to_enabled(DriveState.FAULT, 0x00) == 0x80  # a rising edge, seen apart
+    assert [leads_to_enabled(s, 0) for s in (DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON)] == [
+        6,
+        7,
+        15,
+    ]
+    assert leads_to_switched_on(DriveState.ENABLED, 15) == 0x07
+
+
+def test_an_emergency_has_words_and_a_remedy_and_an_unknown_one_its_range() -> None:
+    assert meaning(0x8130) == (
+        "our heartbeat stayed away, 8130h: see what keeps this computer busy, or raise vehicle.watchdog"
+    )
+    assert meaning(0x2399) == "current, 2399h: see the drive's manual"
+    assert meaning(0xFF07) == "a fault of its maker's own, FF07h: see the drive's manual"
+
+
+def test_metres_a_second_become_numbers_of_the_drives() -> None:
+    """0.3 m/s on a wheel of 100 mm is 28.65 turns a minute, behind a gear of 20 572.96."""
+    assert WHEELS.targets(0.3, 0.0) == (5730, -5730)
+    assert WHEELS.targets(0.0, 1.0) == (-5539, -5539)  # 0.29 m/s of the rims, against each other
+    assert WHEELS.motion((5730, -5730)) == pytest.approx((0.3, 0.0), abs=3e-5)
+    assert WHEELS.count_length == pytest.approx(2 * math.pi * 0.1 / 81920)
+    assert WHEELS.ramp(1.0) == 19099
+
+
+def test_readings_of_two_different_moments_are_not_one_pose() -> None:
+    """One drive's reading is lost: each later pair is of one SYNC again, not left of one and right of the next."""
+    clock = Hand()
+    feedback = Feedback("vehicle", clock, WHEELS, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics())
+
+    def tell(node: int, count: int) -> None:
+        clock.time += 0.001
+        sign = -1 if node == 2 else 1
+        feedback.take(node, MOTION, struct.pack("<i", 0))
+        feedback.take(node, STATUS, struct.pack("<Hib", 0x0237, sign * count, 3))
+
+    feedback.commanded_to_move()
+    for k in range(20):
+        if k != 7:
+            tell(1, 600 * k)
+        tell(2, 600 * k)
+        clock.time += 0.018
+        feedback.commanded_to_move()
+        state = feedback.state(10.0, None, True)
+        assert state.yaw == 0.0
+    assert state.x == pytest.approx(19 * 600 * WHEELS.count_length)
+
+
+def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
+    clock = Hand()
+    step = round(0.3 / WHEELS.count_length * 0.02)
+
+    def ratio(velocity: int, seconds: float = 2.0, period: float = 0.02, moves: bool = True) -> float:
+        check, position = UnitCheck(clock, WHEELS), 0
+        found = 0.0
+        for _ in range(round(seconds / period)):
+            clock.time += period
+            position += round(step * period / 0.02) * moves
+            found = found or check.contradiction(clock.time, position, velocity)
+        return found
+
+    assert ratio(5730) == 0.0
+    assert ratio(57300) == pytest.approx(10.0, rel=0.01)
+    assert ratio(-5730) == pytest.approx(-1.0, rel=0.01)
+    assert ratio(20, 3600.0, 0.05, moves=False) == 0.0
+    assert ratio(57300, period=0.15) == 0.0
+
+
+def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
+    page = (Path(__file__).parent.parent / "docs" / "canopen.md").read_text(encoding="utf-8")
+    printed = page.split("```toml\n")[1].split("```")[0]
+    text = default_toml()
+    path = tmp_path / "cell.toml"
+    path.write_text(text[: text.index("[vehicle]")] + printed + "\n" + text[text.index("[scan_camera]") :])
+    record = load_config(path).vehicle
+    assert isinstance(record, CanopenVehicleConfig)
+    assert record.wheels() == replace(WHEELS, stop_input=3)
+    keys = set(re.findall(r"`(\w+)`", page))
+    assert set(CanopenVehicleConfig.model_fields) - {"lean_sigma"} <= keys | set(re.findall(r"(?m)^(\w+) =", printed))
+
+
+def table(**changed: str) -> str:
+    keys = {
+        "driver": '"canopen"', "interface": '"socketcan"', "channel": '"can0"', "bitrate": '"500 kbit/s"',
+        "left_node": "1", "right_node": "2", "track": '"580 mm"', "wheel_radius": '"100 mm"', "gear": "20",
+        "counts_per_turn": "4096", "velocity_unit": '"0.1 rpm"', "acceleration": '"0.5 m/s^2"',
+        "deceleration": '"1 m/s^2"', "max_speed": '"0.5 m/s"', "max_yaw_rate": '"30 deg/s"',
+    }  # fmt: skip
+    return "[vehicle]\n" + "\n".join(f"{key} = {value}" for key, value in (keys | changed).items()) + "\n\n"
+
+
+def config(tmp_path: Path, **changed: str) -> CanopenVehicleConfig:
+    text = default_toml()
+    begin, end = text.index("[vehicle]"), text.index("[scan_camera]")
+    path = tmp_path / "cell.toml"
+    path.write_text(text[:begin] + table(**changed) + text[end:])
+    record = load_config(path).vehicle
+    assert isinstance(record, CanopenVehicleConfig)
+    return record
+
+
+def test_a_configuration_describes_the_drives(tmp_path: Path) -> None:
+    assert config(tmp_path).wheels() == WHEELS
+    assert config(tmp_path, stop_input="3").wheels().stop_input == 3
+    output = config(tmp_path, brake='"output"', brake_bit="17", brake_locks='"high"').wheels()
+    assert (output.brake_output, output.brake_locks) == (17, True)
+    assert make_of("vehicle", "canopen").missing() == ""
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"right_node": "1"}, "left_node 1, right_node 1 and own_node 127: each node"),
+        ({"left_node": "128"}, "1 to 127"),
+        ({"velocity_unit": '"rpm"', "gear": "1"}, "10.5 mm/s at the wheel .*at most 2 mm/s"),
+        ({"counts_per_turn": "4"}, "per count .*at most 0.5 mm"),
+        ({"gear": "900"}, "turns a minute of a motor"),
+        ({"watchdog": '"5 s"'}, "100 to 1000"),
+        ({"wheel_radius": "100"}, "mm"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_its_range(tmp_path: Path, changed: dict[str, str], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        config(tmp_path, **changed)

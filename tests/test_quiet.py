@@ -1,0 +1,105 @@
+"""A vehicle that rocks is seen in photographs that follow each other, waited for, and stated where it does not rest."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.lab.bench.whole_job import JobRecord
+from cell.steps.board_photo import WAIT_S, WAITS, until_quiet
+from cell.steps.photograph import BoardFix
+from cell.steps.quiet import APART_S, swing
+from cell.vision import BoardView, parse_board
+from drivers.errors import RefusedError
+
+BOARD = parse_board("chessboard:9x7:20mm")
+FOCAL, AWAY, NOISE = 1667.0, 0.9, 0.05
+MATRIX = np.array([[FOCAL, 0.0, 640.0], [0.0, FOCAL, 512.0], [0.0, 0.0, 1.0]])
+BASE_FROM_BOARD = pin.SE3(np.eye(3), np.array([1.0, 0.4, 0.2]))
+VEHICLE = pin.SE3(np.eye(3), np.array([-0.3, 0.0, -0.55]))
+
+
+class Station:
+    """A board at `AWAY` m that goes to and fro by `height` m at `hz`, dying away within `lasts` s (1/e)."""
+
+    def __init__(self, height: float, hz: float = 4.0, lasts: float = np.inf, seed: int = 0) -> None:
+        self.height, self.hz, self.lasts, self.now = height, hz, lasts, 0.0
+        self.rng = np.random.default_rng(seed)
+        self.said: list[str] = []
+
+    def view(self) -> BoardView:
+        corners = BOARD.points()
+        off = self.height * np.exp(-self.now / self.lasts) * np.sin(2 * np.pi * self.hz * self.now + 0.4)
+        place = np.array([-0.08 + 0.8 * off, -0.06 + 0.6 * off, AWAY])
+        pixels = cv2.projectPoints(corners, np.zeros(3), place, MATRIX, np.zeros(5))[0].reshape(-1, 2)
+        pixels += self.rng.normal(0.0, NOISE, pixels.shape)
+        return BoardView(BOARD, (1280, 1024), np.arange(len(corners)), pixels, np.full(len(corners), NOISE))
+
+    def photograph(self) -> BoardFix:
+        views = []
+        for _ in range(4):
+            views.append(self.view())
+            self.now += APART_S
+        return BoardFix(BASE_FROM_BOARD, 1e-10 * np.eye(6), 0.1, 0.0, (), tuple(views), swing(views, AWAY / FOCAL))
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+    def fixed(self) -> BoardFix:
+        return until_quiet(VEHICLE, self.photograph, self.wait, lambda share, text: self.said.append(text))
+
+
+def test_a_board_that_stands_still_is_not_waited_for() -> None:
+    for seed in range(200):
+        station = Station(0.0, seed=seed)
+        fix = station.fixed()
+        assert fix.swung == 0.0
+        assert station.said == []
+        assert fix.covariance == pytest.approx(1e-10 * np.eye(6))
+
+
+@pytest.mark.parametrize("hz", [2.0, 4.0, 7.0])
+def test_what_it_goes_to_and_fro_is_told_within_half_of_it(hz: float) -> None:
+    assert Station(0.1e-3, hz).photograph().swung == pytest.approx(0.1e-3, rel=0.5)
+
+
+def test_a_vehicle_that_comes_to_rest_is_waited_for() -> None:
+    station = Station(0.5e-3, lasts=0.8)
+    fix = station.fixed()
+    assert fix.swung == 0.0
+    assert fix.notes == ()
+    assert 1 < len(station.said) <= WAITS
+    assert "waiting until the vehicle is quiet: the board goes to and fro by ±0." in station.said[0]
+
+
+def test_one_that_does_not_is_stated_and_noted() -> None:
+    station = Station(0.1e-3)
+    fix = station.fixed()
+    assert station.now == pytest.approx(WAITS * WAIT_S + (WAITS + 1) * 4 * APART_S)
+    assert (
+        "the vehicle rocks, or the board swings: after 4 s of waiting it still goes to and fro by ±0." in fix.notes[0]
+    )
+    assert np.sqrt(np.diag(fix.covariance)[:3]) == pytest.approx([0.1e-3 / np.sqrt(2)] * 3, rel=0.5)
+
+
+def test_one_that_rocks_too_much_is_refused_by_name() -> None:
+    with pytest.raises(RefusedError, match=r"the vehicle rocks by ±0\.\d\d mrad, which moves the board by"):
+        Station(1e-3).fixed()
+
+
+def test_views_that_share_no_point_or_are_but_one_tell_nothing() -> None:
+    one = Station(1e-3).view()
+    assert swing([one], AWAY / FOCAL) == 0.0
+    few = [
+        BoardView(BOARD, one.size, one.ids[part], one.pixels[part], one.sigma[part])
+        for part in (slice(9), slice(9, 20))
+    ]
+    assert swing(few, AWAY / FOCAL) == 0.0
+
+
+def test_the_simulated_cell_of_firm_tyres_is_quiet(placed_pot: JobRecord) -> None:
+    fix = placed_pot.results["board_photo"]
+    assert len(fix.views) > 1
+    assert fix.swung == 0.0
