@@ -18,6 +18,7 @@ from cell.cli.options import (
     SeedOption,
     SimOption,
     print_json,
+    wide_console,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def commission(
         **options,
     )
     if show:
-        _list(made, checks, console, json)
+        _list(made, checks, json)
         return
     if again:
         made.progress.forget([check.name for check in checks])
@@ -157,7 +158,7 @@ class _Page:
             self._console.print(f"  {note}", style="dim" if verdict == "good" else "", markup=False)
 
 
-def _list(made: Commissioning, checks: list[Check], console: Console, json: bool) -> None:
+def _list(made: Commissioning, checks: list[Check], json: bool) -> None:
     from cell.config import load_config
 
     config = load_config(made.path)
@@ -177,4 +178,4 @@ def _list(made: Commissioning, checks: list[Check], console: Console, json: bool
         table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(*(str(row[name]) for name in ("name", "standing", "moves", "far", "fast", "limit")))
-    console.print(table)
+    wide_console().print(table)

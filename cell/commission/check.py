@@ -73,7 +73,8 @@ class Result:
         self.readings.append(reading)
         if not reading.ok:
             self.verdict = Verdict.WRONG
-            self.notes.append(f"{what} {value:.4g} {unit} is outside {bounds(reading)} {unit}. {remedy}".strip())
+            shown = f"{what}: {value:.4g} {unit}".strip() + f", allowed {bounds(reading)} {unit}".rstrip()
+            self.notes.append(f"{shown}. {remedy}".strip())
         return reading
 
     def find(self, finding: Finding) -> None:
