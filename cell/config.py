@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
+from collections.abc import Collection
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -64,6 +65,8 @@ class CellSection(Table):
     time_scale: Annotated[float, number(0.01, 100)] = 1.0
     truth: Annotated[str, AfterValidator(lambda text: text and checked_endpoint(text))] = ""
     confirm: Confirm = "person"
+    sim: Annotated[tuple[str, ...], AfterValidator(lambda names: _devices(names))] = ()
+    """The devices that are simulated beside real ones."""
 
     @model_validator(mode="after")
     def _real_time(self) -> Self:
@@ -87,6 +90,12 @@ DEVICES = {
     "claw": "claw",
 }
 """The cell's devices by the name of their table, and what kind each is."""
+
+
+def _devices(names: tuple[str, ...]) -> tuple[str, ...]:
+    if unknown := [name for name in names if name not in DEVICES]:
+        raise ValueError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
+    return names
 
 
 class CellConfig(Table):
@@ -198,9 +207,9 @@ def example_addresses(config: CellConfig) -> list[str]:
     return [f'{name}.{r.ADDRESS} = "{r.place}"' for name, r in records.items() if is_example(r.place)]
 
 
-def require_real_addresses(config: CellConfig) -> None:
-    """Raise `ConfigError` when an address is still the example's: before devices are connected."""
-    if found := example_addresses(config):
+def require_real_addresses(config: CellConfig, simulated: Collection[str] = ()) -> None:
+    """Raise `ConfigError` when an address is still the example's, but for these: before devices are connected."""
+    if found := [text for text in example_addresses(config) if text.partition(".")[0] not in simulated]:
         raise ConfigError(f"{', '.join(found)}: still the example's, where no device is; write your cell's own")
 
 
@@ -224,13 +233,12 @@ def config_to_open(
     """The file (None: the one that ships) and the configuration to connect devices with, or a simulated cell.
 
     `confirm`, if given, stands for `cell.confirm`. Raises `ConfigError` as `find_config`, `load_config`, and, where
-    devices are real, `require_real_addresses` and `require_confirm` do.
+    devices are real, `require_confirm` do; `require_real_addresses` is left to who knows which those are.
     """
     source = find_config(path, simulated=simulated)
     config = load_config(source)
     if confirm is not None:
         config = config.model_copy(update={"cell": config.cell.model_copy(update={"confirm": confirm})})
     if not simulated:
-        require_real_addresses(config)
         require_confirm(config)
     return source, config

@@ -72,7 +72,8 @@ class Opened:
     @property
     def truth(self) -> Callable[[], dict[str, Any]] | None:
         """How the report asks a simulated world for its truth; None where there is none."""
-        if self.simulated is not None:
+        # Beside a real scan camera the simulated world has nothing to do with where the part comes to lie.
+        if self.simulated is not None and "scan_camera" in self.simulated.simulated:
             return self.simulated.truth
         return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 

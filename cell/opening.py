@@ -6,8 +6,16 @@ from collections.abc import Collection
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
-from cell.config import Confirm, beside, config_to_open, load_config
+from cell.config import (
+    DEVICES,
+    Confirm,
+    beside,
+    config_to_open,
+    load_config,
+    require_real_addresses,
+)
 from cell.devices.assembly import connect, connected_for
+from cell.devices.mix import Sim, simulated_of
 from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.opened import Opened
 from cell.run.lock import CellLock
@@ -21,7 +29,7 @@ def open_devices(
     undo: ExitStack,
     config: str | Path | None,
     *,
-    sim: str | None,
+    sim: Sim,
     seed: int,
     level: str,
     speed: float | None,
@@ -32,16 +40,19 @@ def open_devices(
     truth: str | Path | None = None,
 ) -> Opened:
     """Connect as `Cell.open` says, and raise what it says. What is to be undone if the rest fails goes to `undo`."""
-    if sim not in (None, "all"):
-        raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
     if clock not in ("wall", "virtual"):
         raise ConfigError(f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait')
-    if clock == "virtual" and (sim is None or speed is not None):
-        wrong = "speed means nothing on it" if sim else 'only a simulated cell, sim="all", has one'
+    given = None if config is None else Path(config)
+    names = simulated_of(sim, given)
+    whole = set(names) == set(DEVICES)
+    if clock == "virtual" and (not whole or speed is not None):
+        wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'
         raise ConfigError(f'clock="virtual": {wrong}; leave that out')
-    if truth is not None and sim is None:
-        raise ConfigError("truth describes the cell that is simulated; without sim leave it out")
-    path, loaded = config_to_open(None if config is None else Path(config), simulated=sim == "all", confirm=confirm)
+    if truth is not None and not whole:
+        raise ConfigError("truth describes a cell that is all simulated; leave it out where devices are real")
+    path, loaded = config_to_open(given, simulated=whole, confirm=confirm)
+    # So that whatever keeps the configuration keeps what was simulated.
+    loaded = loaded.model_copy(update={"cell": loaded.cell.model_copy(update={"sim": names})})
     folder = beside(path)
     true = loaded if truth is None else load_config(Path(truth))
     # The world takes long to load, and real devices have none; over wires it is in another process.
@@ -51,17 +62,26 @@ def open_devices(
 
         virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
-    simulated = None
-    if sim == "all":
+    needed = connected_for(loaded, only)
+    world: SimulatedCell | None = None
+    if whole:
         from cell.devices.described import Described
 
-        simulated = SimulatedCell(
+        world = SimulatedCell(
             true, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
         )
-        undo.callback(simulated.close)
-        loaded = with_endpoints(loaded, simulated.endpoints)
-    needed = connected_for(loaded, only)
+        undo.callback(world.close)
+        loaded = with_endpoints(loaded, world.endpoints)
+    else:
+        require_real_addresses(loaded, names)
+    if beside_real := tuple(name for name in names if name in needed and not whole):
+        from cell.devices.mixed import MixedCell
+
+        if speed not in (None, loaded.cell.time_scale):
+            raise ConfigError(f"speed={speed:g}: real devices keep the wall's time; leave that out")
+        mixed = MixedCell(undo, loaded, job, seed, level, beside_real, needed)
+        return Opened(mixed.config, folder, mixed.lock, mixed.devices, mixed.world)
     lock = undo.enter_context(CellLock(loaded, needed))
     devices = connect(loaded, needed)
     undo.callback(devices.close)
-    return Opened(loaded, folder, lock, devices, simulated)
+    return Opened(loaded, folder, lock, devices, world)

@@ -24,7 +24,8 @@ from cell.calibration.verify.verdict import Verification
 from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
 from cell.devices.injection import Injector
-from cell.devices.simulated import Simulation
+from cell.devices.mix import Sim
+from cell.devices.simulated import Simulation, is_whole
 from cell.devices.stopping import stop_cell
 from cell.job import Job, load_job
 from cell.opened import Opened
@@ -75,7 +76,7 @@ class Cell:
         self.devices = devices
         self.simulated = simulated
         self._here = Opened(config, folder, lock, devices, simulated)
-        if simulated is not None and "vehicle" in devices:
+        if simulated is not None and "vehicle" in simulated.simulated and "vehicle" in devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
         self._runs = Runs(config.cell.name)
@@ -86,7 +87,7 @@ class Cell:
         cls,
         config: str | Path | None = None,
         *,
-        sim: str | None = None,
+        sim: Sim = None,
         seed: int = 1,
         level: str = "nominal",
         speed: float | None = None,
@@ -97,6 +98,10 @@ class Cell:
         truth: str | Path | None = None,
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+
+        `sim` may also name some devices, in a list or with commas: those are simulated, the others real, in one cell.
+        The simulated world then follows what the real ones measure of themselves. Without `sim` it is `cell.sim` of
+        the configuration; "none" is all real. A mix that physics does not allow is a `ConfigError`.
 
         With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
         may be switched off, and what is asked of them is a `NotConnectedError`.
@@ -303,7 +308,7 @@ class Cell:
         the vehicle sees the board, or when this `Cell` has seen it before.
 
         At a simulated cell the job's station is set up and its part put into the claw, where that is not so already.
-        One that has no calibration is calibrated first; a real one is not: `CalibrationStale`. `inject`
+        One that has no calibration is calibrated first; one with any real device is not: `CalibrationStale`. `inject`
         schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
 
         With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
@@ -352,7 +357,7 @@ class Cell:
         self._runs.require_free()
         self._runs.require_no_late_stop()
         stops = self.stops
-        ready = ReadyJob.read(job, self.config, until, script, calibrates=self.simulated is not None)
+        ready = ReadyJob.read(job, self.config, until, script, calibrates=is_whole(self.simulated))
         if self.simulated is not None:
             from cell.devices.described import Described
 
@@ -361,7 +366,7 @@ class Cell:
         try:
             stored = self.calibration()
         except CalibrationStale:
-            if self.simulated is None:
+            if not is_whole(self.simulated):
                 raise
         info |= {**self._here.world, **ready.info}
         work = JobWork(self._here, job, ready, info, stored, before, inline, at_start)

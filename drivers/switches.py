@@ -10,20 +10,48 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 from drivers.clock import Clock
 from drivers.endings import in_the_end
 from drivers.errors import DeviceFault, InterlockError
-from drivers.interfaces import Arm, Identity, LinkStatistics
+from drivers.interfaces import Identity, LinkStatistics
 
 _POLL_S = 0.01
 _WALL_FLOOR_S = 0.5
 
 
+class Shown(Protocol):
+    """What a connector shows, as far as a switch looks at it."""
+
+    @property
+    def digital_outputs(self) -> int:
+        """The outputs as bits."""
+
+
+class Connector(Protocol):
+    """Outputs and inputs to hang something on: an arm, or what stands in for it."""
+
+    def identity(self) -> Identity:
+        """Whose they are."""
+
+    def ping(self) -> float:
+        """One round trip, wall seconds."""
+
+    def state(self) -> Shown:
+        """What it shows now."""
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """Set an output and return once it is so."""
+
+    def digital_input(self, index: int) -> bool:
+        """Read an input."""
+
+
 class _Switch:
     """What both share: a named output of an arm, with the arm as the wire."""
 
-    def __init__(self, name: str, arm: Arm, output: int) -> None:
+    def __init__(self, name: str, arm: Connector, output: int) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self._arm = arm
@@ -47,7 +75,7 @@ class _Switch:
 class ArmSwitchedLaser(_Switch):
     """A line laser on the digital output `output` of `arm`."""
 
-    def __init__(self, name: str, arm: Arm, output: int) -> None:
+    def __init__(self, name: str, arm: Connector, output: int) -> None:
         super().__init__(name, arm, output)
         self._owner = threading.Lock()
 
@@ -137,7 +165,7 @@ class ConfirmedClaw(ABC):
 class ArmSwitchedClaw(_Switch, ConfirmedClaw):
     """A gripper on the digital output `output` of `arm` (on = closed), confirmed by the digital input `feedback`."""
 
-    def __init__(self, name: str, arm: Arm, output: int, feedback: int, *, clock: Clock | None = None) -> None:
+    def __init__(self, name: str, arm: Connector, output: int, feedback: int, *, clock: Clock | None = None) -> None:
         super().__init__(name, arm, output)
         self._feedback = feedback
         self._shown_by = f"input {feedback}"

@@ -31,6 +31,7 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.models.arm_kinematics import TABLES
+from sim_backends.peers.following import FollowingPeer
 from sim_backends.peers.frames import FramePeer
 from sim_backends.peers.gige import GigePeer
 from sim_backends.peers.rtde import PERIOD, RtdePeer
@@ -38,6 +39,7 @@ from sim_backends.peers.truth import TruthPeer
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.peers.wired_vehicle import vehicle_peer
 from sim_backends.world.drawing import STOCK, read
+from sim_backends.world.following import FOLLOWED, Following
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
 from sim_backends.world.surfaces import SURFACES
@@ -79,22 +81,27 @@ CAMERAS = ("scan", "target")
 class ServedCell:
     """A world and its peers; use it as a context manager, or call `start` and `stop`."""
 
-    def __init__(self, world: World, gige: Collection[str] = ()) -> None:
+    def __init__(self, world: World, gige: Collection[str] = (), follow: Collection[str] = ()) -> None:
         """Bind every endpoint of `world`. Raises OSError when no loopback address is free.
 
-        The cameras in `gige`, "scan" or "target", are on GigE Vision, the others on the frame stream protocol.
+        The cameras in `gige`, "scan" or "target", are on GigE Vision, the others on the frame stream protocol. The
+        devices in `follow` are real ones, which `world` was made to follow: they have no peer here.
         """
         self.world = world
         clock = world.clock
+        self.following = Following(world, [name for name in FOLLOWED if name in follow])
         with contextlib.ExitStack() as bound:
-            self._arm = _bound(bound, RtdePeer(world.arm, clock))
-            self._rail = _bound(bound, rail_peer(world))
-            self._vehicle = _bound(bound, vehicle_peer(world))
+            self._arm = None if "arm" in follow else _bound(bound, RtdePeer(world.arm, clock))
+            self._rail = None if "rail" in follow else _bound(bound, rail_peer(world))
+            self._vehicle = None if "vehicle" in follow else _bound(bound, vehicle_peer(world))
             self._cameras: dict[str, FramePeer | GigePeer] = {
                 name: _bound(
                     bound,
                     (GigePeer if name in gige else FramePeer)(
-                        f"{name}_camera", clock, partial(picture, world, name), camera_spec(world.scene, name)
+                        f"{name}_camera",
+                        clock,
+                        partial(self._picture, name),
+                        camera_spec(world.scene, name),
                     ),
                 )
                 for name in CAMERAS
@@ -103,13 +110,15 @@ class ServedCell:
             self._switches, self._switch_endpoints = switch_peers(world)
             for switch in self._switches:
                 _bound(bound, switch)
-            self._truth = _bound(bound, TruthPeer(partial(truth, world), self.fault, self.reset, self.make_ready))
+            self._told = _bound(bound, FollowingPeer(world, self.following)) if follow else None
+            self._truth = _bound(bound, TruthPeer(self.truth, self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
+        arm, rail, vehicle = self._arm, self._rail, self._vehicle
         self._faults: dict[str, Callable[[], None]] = {
-            **{name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS},
-            **{name: partial(self._arm.fault, name) for name in CONTROLLER_FAULTS},
-            **{name: partial(self._rail.fault, name) for name in RAIL_FAULTS},
-            **{name: partial(self._vehicle.fault, name) for name in VEHICLE_FAULTS},
+            **({name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS} if arm else {}),
+            **({name: partial(arm.fault, name) for name in CONTROLLER_FAULTS} if arm else {}),
+            **({name: partial(rail.fault, name) for name in RAIL_FAULTS} if rail else {}),
+            **({name: partial(vehicle.fault, name) for name in VEHICLE_FAULTS} if vehicle else {}),
             **{name: partial(self._cameras["scan"].fault, name) for name in CAMERA_FAULTS},
             **{
                 name: partial(self._cameras["target"].fault, name.removeprefix("target_"))
@@ -137,10 +146,11 @@ class ServedCell:
     def endpoints(self) -> dict[str, Any]:
         """Where each device is, as it is printed."""
         scene = self.world.scene
+        arm, rail, vehicle = self._arm, self._rail, self._vehicle
         return {
-            "arm": {"address": self._arm.address},
-            "rail": {"url": self._rail.url},
-            "vehicle": self._vehicle.endpoint,
+            **({"arm": {"address": arm.address}} if arm else {}),
+            **({"rail": {"url": rail.url}} if rail else {}),
+            **({"vehicle": vehicle.endpoint} if vehicle else {}),
             **{
                 f"{name}_camera": {
                     "address": camera.address,
@@ -150,6 +160,7 @@ class ServedCell:
             },
             **self._switch_endpoints,
             "truth": {"address": self._truth.address},
+            **({"following": {"address": self._told.address}} if self._told else {}),
             "seed": scene.seed,
             "level": scene.level,
             "speed": self.world.clock.speed,
@@ -160,7 +171,8 @@ class ServedCell:
     def fault(self, name: str) -> None:
         """Cause the fault `name`, of the scan camera where it says only `camera.`; ValueError that lists the names."""
         if name not in self._faults:
-            raise ValueError(f"unknown fault {name!r}; known: {', '.join(FAULT_NAMES)}")
+            known = [known for known in FAULT_NAMES if known in self._faults]
+            raise ValueError(f"unknown fault {name!r}; known: {', '.join(known)}")
         self._faults[name]()
 
     def make_ready(self, text: str) -> None:
@@ -173,14 +185,23 @@ class ServedCell:
     def reset(self) -> None:
         """Take away every fault's cause."""
         self.world.arm.clear()
-        self._arm.clear()
-        self._rail.clear()
-        self._vehicle.clear()
-        for camera in self._cameras.values():
-            camera.clear()
+        for peer in (self._arm, self._rail, self._vehicle, *self._cameras.values()):
+            if peer is not None:
+                peer.clear()
+
+    def truth(self) -> dict[str, Any]:
+        """As `world.truth`, and how real devices were followed where there are any."""
+        told = truth(self.world)
+        return {**told, "following": self.following.figures()} if self.following.devices else told
+
+    def _picture(self, camera: str, t_mid: float, exposure: float) -> NDArray[np.uint8]:
+        """As `picture`; raises `NotFollowed` where real devices do not say where they were."""
+        self.following.require(camera, t_mid)
+        return picture(self.world, camera, t_mid, exposure)
 
     def _all(self) -> tuple[_Peer, ...]:
-        return (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches, self._truth)
+        devices = (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches)
+        return tuple(peer for peer in (*devices, self._told, self._truth) if peer is not None)
 
 
 def _bound(stack: contextlib.ExitStack, peer: P) -> P:
@@ -201,7 +222,8 @@ def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], No
     try:
         drawing = read(options.drawing) if options.drawing else STOCK.with_surface(options.surface)
         drawing = drawing if options.arm is None else drawing.with_arm(options.arm)
-        cell = ServedCell(World(options.seed, options.level, options.speed, drawing), options.gige)
+        world = World(options.seed, options.level, options.speed, drawing, followed=options.follow)
+        cell = ServedCell(world, options.gige, options.follow)
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
@@ -226,6 +248,9 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--arm", choices=sorted(TABLES), help="which arm, instead of the one that is drawn")
     parser.add_argument("--drawing", help="the cell and its station, as JSON, instead of the stock cell")
     parser.add_argument("--gige", choices=CAMERAS, action="append", default=[], help="this camera on GigE Vision")
+    parser.add_argument(
+        "--follow", choices=FOLLOWED, action="append", default=[], help="this device is real, and the world follows it"
+    )
     parser.add_argument("--json", action="store_true", help="print the endpoints as one JSON line")
     parser.add_argument("--exit-with-stdin", action="store_true", help="end when standard input does")
     options = parser.parse_args(argv)

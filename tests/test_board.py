@@ -115,6 +115,21 @@ def test_the_pose_is_right_and_its_covariance_honest(distance):
     assert np.degrees(found.obliquity) == pytest.approx(30, abs=0.1)
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.35])
+def test_dots_with_a_frame_round_them_end_there(turn):
+    """Plates as some vision programs sell them: a black line where the next dots would be."""
+    sheet = np.full((1000, 1000), 225, np.uint8)
+    cv2.rectangle(sheet, (80, 80), (920, 920), 25, 14)
+    for i, j in np.ndindex(7, 7):
+        cv2.circle(sheet, (200 + 100 * i, 200 + 100 * j), 25, 25, -1, cv2.LINE_AA)
+    into = np.array([[0.4 * np.cos(turn), -0.4 * np.sin(turn), 200], [0.4 * np.sin(turn), 0.36, 20], [0, 1e-4, 1.0]])
+    image = cv2.warpPerspective(sheet, into, (640, 480), flags=cv2.INTER_AREA, borderValue=60)
+    view = find_board(cv2.GaussianBlur(image, (0, 0), 0.8), parse_board("dots:7x7:25mm"))
+    assert len(view.ids) == 49
+    with pytest.raises(PictureRefused, match="7×7"):
+        find_board(image, parse_board("dots:7x6:25mm"))
+
+
 def test_two_poses_that_fit_alike_are_refused():
     pose = placed(LARGE, 6.0, 15)
     camera = model(TARGET)

@@ -99,6 +99,8 @@ def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path
     assert np.array_equal(cell.world.world_from_base(0.63), stood)
     assert cell.truth()["vehicle"]["braked"]
     assert _vehicle_state(cell.devices.vehicle) == "braked, errors 0x0000"
+    with pytest.raises(ConfigError, match="no vehicle that could have it"):
+        cell.require_fault("vehicle.emergency_stop")
 
 
 @pytest.mark.campaign

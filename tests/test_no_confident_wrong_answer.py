@@ -11,11 +11,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.calibration.observations import ScanObservation
 from cell.calibration.recorded.folder import RecordedFrame
 from cell.calibration.recorded.result import empty_result
 from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
+from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+from cell.calibration.solve.blocks import HAND
+from cell.calibration.solve.board_shape import moved_by_bend
+from cell.calibration.solve.choice import choose_solution, with_doubt_of_camera
 from cell.calibration.solve.foreign import foreign_view, own_cameras
 from cell.calibration.solve.intrinsics import choose_lens
+from cell.calibration.solve.joint import solve_staged, start_state, view_data
 from cell.geometry.camera import CameraModel
 from tests.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
 
@@ -218,3 +224,59 @@ def test_no_picture_is_foreign_where_nothing_or_the_board_is_wrong(bend):
     found, _ = choose_lens(views)
     assert (own_cameras(found, views).max() < 4.0) == (bend == 0.0)
     assert foreign_view(found, views) is None
+
+
+def test_a_laser_that_was_moved_in_the_middle_gives_no_plane():
+    result = solved(scene(seed=0, count=10, second=(5, 6, 7, 8, 9)))
+    assert result["light_plane"] is None
+    assert "moved in between" in result["refused"]["light_plane"]
+    assert right(result)
+
+
+def test_a_zoom_that_was_changed_in_the_middle_gives_no_hand_eye():
+    """Half of the frames agree with themselves, and so do the others: none of both is called slips."""
+    frames = [*scene(count=9, laser=False)[:4], *scene(count=9, laser=False, focal=1.03)[4:]]
+    result = solved(frames)
+    assert result["hand_eye"] is None
+    assert "zoom" in result["refused"]["hand_eye"]
+    assert any(note.startswith("doubtful: intrinsics: frames whose pose") for note in result["notes"])
+
+
+def test_what_a_bend_does_to_the_chain_is_what_it_moves():
+    """Against the same scene with a flat board: the camera on the flange goes as far as was foretold."""
+    found = []
+    for bend in (0.0, 3e-4):
+        frames = scene(seed=2, bend=bend, laser=False, arm_mm=0.02, arm_mrad=0.02)
+        pictures, _ = choose_lens([frame.view for frame in frames])
+        observations = [ScanObservation(f.view, None, f.base_from_flange, 0.0, f.name) for f in frames]
+        staged = solve_staged(observations, stripe=False, camera=pictures.camera)
+        views = [view_data(o, np.empty(0, dtype=np.intp)) for o in observations]
+        adjustment = Adjustment(views, shared_mask(plane=False, rail=False), Priors(2e-5, 2e-5))
+        found.append((adjustment, adjustment.solve(start_state(staged), 2).state))
+    (_, flat), (adjustment, bent) = found
+    foretold = moved_by_bend(adjustment, bent)
+    turn = bent.flange_from_camera.rotation.T
+    really = turn @ (flat.flange_from_camera.translation - bent.flange_from_camera.translation)
+    assert np.linalg.norm(really) > 5e-4
+    assert np.linalg.norm(foretold[HAND][:3] - really) < 0.15 * np.linalg.norm(really)
+    assert foretold[0] == pytest.approx(flat.camera.fx - bent.camera.fx, rel=0.15)
+
+
+def test_a_camera_that_the_arm_contradicts_is_stated_with_what_parts_them():
+    """The pictures of a lens that was misjudged: 12 px off in focal length, and said to be known to 2 px."""
+    frames = scene(seed=4, laser=False)
+    honest, _ = choose_lens([frame.view for frame in frames])
+    off = np.r_[12.0, 12.0, np.zeros(7)]
+    wrong = replace(
+        honest,
+        camera=honest.camera.with_parameters(honest.camera.parameters + off),
+        sigma=np.full(9, 2.0),
+        covariance=np.diag([4.0, 4.0, 4.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    )
+    observations = [ScanObservation(f.view, None, f.base_from_flange, 0.0, f.name) for f in frames]
+    staged = solve_staged(observations, stripe=False, camera=wrong.camera)
+    choice, doubted = with_doubt_of_camera(choose_solution(observations, staged, wrong), wrong)
+    assert not choice.best.camera_free
+    assert abs(doubted.camera.fx - MATRIX[0, 0]) < 2.5 * doubted.sigma[0] < 25.0
+    hand = choice.best.adjusted.state.flange_from_camera.translation - FLANGE_FROM_CAMERA.translation
+    assert np.all(np.abs(FLANGE_FROM_CAMERA.rotation.T @ hand) < Z * choice.best.sigma[HAND][:3])

@@ -244,6 +244,21 @@ def as_ros_echoes_a_transform(folder: Path) -> None:
     (folder / "tf.txt").write_text("\n".join(blocks))
 
 
+def angles_about_fixed_z_y_x(folder: Path) -> None:
+    rows = [row(np.r_[1e3 * p[:3, 3], angles(p, "zyx")], ",") for p in POSES]
+    (folder / "poses.csv").write_text("\n".join(rows))
+
+
+def program_of_the_arm(folder: Path) -> None:
+    turns = [Rotation.from_matrix(p[:3, :3]).as_rotvec() for p in POSES]
+    moves = [
+        f"  movel(p[{row(np.r_[p[:3, 3], turn], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)"
+        for p, turn in zip(POSES, turns, strict=True)
+    ]
+    start = "def photographs():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movej([0.1, -1.5, 1.5, -1.5, -1.5, 0])\n"
+    (folder / "photographs.script").write_text(start + "\n".join(moves) + "\nend\n")
+
+
 SPELLINGS = {
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
     rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
@@ -257,6 +272,8 @@ SPELLINGS = {
     matrices_one_below_the_other: ("matrix-4x4", "m", "order"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
     as_the_arms_script_has_them: ("xyz+rotvec-rad", "m", "order"),
+    angles_about_fixed_z_y_x: ("xyz+ypr-deg", "mm", "order"),
+    program_of_the_arm: ("xyz+rotvec-rad", "m", "order"),
     titles_above_matrices: ("matrix-4x4", "m", "name"),
     times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
     remarks_in_some_rows: ("xyz+quaternion-xyzw", "m", "number"),

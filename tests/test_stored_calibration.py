@@ -12,6 +12,7 @@ import pytest
 
 from cell.calibration import ScanCalibration, TargetCalibration
 from cell.calibration.finding import find_calibration
+from cell.calibration.sessions import marked
 from cell.calibration.solve.results import KEPT, Quality
 from cell.calibration.store import CellCalibration, nominal_camera, save_calibration
 from cell.config import load_config
@@ -141,3 +142,16 @@ def test_one_from_the_future_is_not_taken(tmp_path: Path) -> None:
     save_calibration(made(-2 * DAY), tmp_path / "future.json")
     with pytest.raises(CalibrationStale, match=r"48\.0 hours in the future"):
         found(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stored", "now"),
+    [(("scan_camera", "laser"), ()), ((), ("scan_camera",)), (("scan_camera",), ("scan_camera", "rail"))],
+)
+def test_one_with_simulated_devices_is_none_of_the_real_ones_nor_the_other_way_round(
+    tmp_path: Path, stored: tuple[str, ...], now: tuple[str, ...]
+) -> None:
+    save_calibration(made(devices=marked(DEVICES, stored)), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match="no calibration of these devices"):
+        find_calibration(tmp_path, marked(DEVICES, now), CONFIGURATION, MAX_AGE)
+    assert find_calibration(tmp_path, marked(DEVICES, stored), CONFIGURATION, MAX_AGE).identities["arm"] == "A1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,18 +29,29 @@ from cell.motion.arm_models import kinematics_name
 from cell.opened import Opened
 from cell.run.recorded_work import Hands
 from cell.run.run import Run
-from drivers.interfaces import why_untold
+from drivers.interfaces import Device, why_untold
 from statemachine.step import Event
 
 
 def serial_numbers(devices: Devices) -> dict[str, str]:
-    """Of the devices that a calibration belongs to, by name; asked from the devices themselves."""
-    return {
-        "arm": devices.arm.identity().serial,
-        "rail": devices.rail.identity().serial,
-        "scan_camera": devices.scan_camera.identity().serial,
-        "target_camera": devices.target_camera.identity().serial,
+    """Of the devices that a calibration belongs to, by name; asked from the devices themselves.
+
+    One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
+    other way round.
+    """
+    owners: dict[str, Device] = {
+        "arm": devices.arm,
+        "rail": devices.rail,
+        "scan_camera": devices.scan_camera,
+        "target_camera": devices.target_camera,
     }
+    simulated = () if devices.following is None else devices.following.simulated
+    return marked({name: device.identity().serial for name, device in owners.items()}, simulated)
+
+
+def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
+    """Serial numbers by device name, with those of the `simulated` ones marked as such."""
+    return {name: f"simulated-{serial}" if name in simulated else serial for name, serial in serials.items()}
 
 
 def arm_table(config: CellConfig, devices: Devices) -> str:

@@ -186,6 +186,7 @@ def _print_table(rows: list[Diagnosis]) -> None:
         table.add_column(name, overflow="fold", justify="right" if name.startswith("ms") else "left")
     for row in rows:
         mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
+        mark += "\n[yellow]simulated[/]" if row.simulated else ""
         identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
         table.add_row(
             f"{row.device}\n{mark}",

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from cell.cli.end_screen import duration, end_screen
+from cell.config import DEVICES
 from statemachine.runner import Event
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
@@ -109,7 +110,7 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
     console = Console(highlight=False)
     if not rows:
         console.print("no run yet")
-    whats = [" ".join(str(word) for word in (row["kind"], row["job"]) if word) for row in rows]
+    whats = [" ".join(str(word) for word in (row["kind"], row["job"], _simulated(row)) if word) for row in rows]
     wide = max(map(len, whats), default=0)
     for row, what in zip(rows, whats, strict=True):
         begun = str(row["started"] or "")[:16].replace("T", " ")
@@ -121,6 +122,14 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
         console.print(before, end="", markup=False)
         console.print(ended, end="", style=COLOURS.get(str(row["outcome"])), markup=False)
         console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
+
+
+def _simulated(row: Mapping[str, Any]) -> str:
+    which = row.get("simulated")
+    if not isinstance(which, list):
+        return "(sim)" if which else ""
+    real = [name for name in DEVICES if name not in which]
+    return f"(sim all but {','.join(real)})" if len(real) < len(which) else f"(sim {','.join(which)})"
 
 
 def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:

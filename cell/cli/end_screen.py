@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.job import job_path, shipped_jobs
-from cell.report.figures import shown_limit, shown_value
+from cell.report.figures import following_words, shown_limit, shown_value, simulated_words
 from cell.run.reading import wall_seconds
 
 WIDTH, HEIGHT = 80, 23
@@ -26,7 +26,9 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     head = _cut_lines(f"{outcome}  {report.get('reason', '')}", width, REASON_LINES)
     head.append(_cut(_facts(report), width))
     steps = _steps(report)
-    tail = [*_trouble(report, width), *_labelled("report", _shown_path(folder), width)]
+    followed = report.get("following")
+    late = _labelled("followed", following_words(followed), width) if followed else []
+    tail = [*_trouble(report, width), *late, *_labelled("report", _shown_path(folder), width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
     blanks = 2 if report.get("measured") else 1
@@ -38,7 +40,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
 def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
-    again = "cell dry-run" if report.get("simulated") else "cell run"
+    again = "cell dry-run" if report.get("simulated") is True else "cell run"
     if kind != "job":
         if outcome == "done":
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
@@ -58,7 +60,7 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
         case "refused":
             return f"picture.png shows why; put that right, then {again} -j {_job(report)}"
         case "faulted":
-            see = "" if report.get("simulated") else "cell diag: the state of every device; "
+            see = "" if report.get("simulated") is True else "cell diag: the state of every device; "
             return f"{see}cell resume {name}: go on with the job"
         case "aborted":
             return f"cell resume {name}: go on with the job"
@@ -86,8 +88,8 @@ def duration(seconds: float | None) -> str:
 def _facts(report: Mapping[str, Any]) -> str:
     kind = str(report.get("kind", "job"))
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
-    if report.get("simulated"):
-        facts.append(f"simulated, seed {report.get('seed')}, level {report.get('level')}")
+    if words := simulated_words(report.get("simulated")):
+        facts.append(f"{words}, seed {report.get('seed')}, level {report.get('level')}")
     if report.get("cell_s") is None and (wall := wall_seconds(report)) is not None:
         facts.append(f"{duration(wall)} on the wall")
     if report.get("started"):

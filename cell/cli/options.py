@@ -53,7 +53,12 @@ SeedOption = Annotated[int, typer.Option("--seed", min=0, max=999_999, help="Whi
 LevelOption = Annotated[Level, typer.Option("--level", help="How far that world deviates from the drawing.")]
 SpeedOption = Annotated[float, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")]
 SimOption = Annotated[
-    str | None, typer.Option("--sim", help='"all": start a simulated cell for this command and use it.')
+    str | None,
+    typer.Option(
+        "--sim",
+        help='"all": start a simulated cell for this command and use it. Or some devices, as in scan_camera,laser: '
+        'those are simulated beside the real ones. "none": all real, whatever cell.sim names.',
+    ),
 ]
 
 

@@ -17,6 +17,7 @@ from cell.cli.options import (
     Level,
     LevelOption,
     SeedOption,
+    SimOption,
     print_json,
 )  # fmt: skip
 from cell.cli.runs import NoiseOption, RunArgument, folder_of_runs
@@ -43,6 +44,9 @@ def run(
     config: ConfigOption = None,
     at_start: AtStartOption = False,
     until: UntilOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -55,7 +59,8 @@ def run(
     def perform(cell: Cell, display: Observer) -> RunOutcome:
         return cell.run(job, display, at_start=at_start, until=until)
 
-    _perform(lambda: Cell.open(config), perform, json, noise)
+    opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
+    _perform(opened, perform, json, noise)
 
 
 def dry_run(
@@ -125,13 +130,14 @@ def resume(
 
     before = UnfinishedRun.find(find_run(folder_of_runs(config), name, "job"))
     simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
+    whole = simulated is True
     opened = partial(
         Cell.open,
         config,
-        sim="all" if simulated else None,
+        sim="all" if whole else simulated or "none",
         seed=before.info["seed"] if simulated else 1,
         level=before.info["level"] if simulated else "nominal",
-        speed=before.info["speed"] if simulated and clock == "wall" else None,
+        speed=before.info["speed"] if whole and clock == "wall" else None,
         job=before.job if simulated else "pot",
         clock=clock,
     )

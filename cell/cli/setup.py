@@ -52,7 +52,9 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     """Read the configuration and the job and say what is wrong with them; touches no device."""
     from cell.check.fit import require_fit
     from cell.config import DEVICES, example_addresses, find_config, load_config, require_confirm
+    from cell.devices.mix import require_possible
     from cell.job import job_path, load_job
+    from cell.report.figures import simulated_words
     from drivers.errors import ConfigError
 
     source = find_config(config, simulated=True)
@@ -68,14 +70,17 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
             print_json({**told, "problems": [line.strip() for line in str(error).splitlines()]})
             raise typer.Exit(EXIT_USAGE) from error
         raise
-    notes = [f"{key} is the example's, where no device is: write your own" for key in example_addresses(loaded)]
+    if loaded.cell.sim:
+        require_possible(loaded, loaded.cell.sim, DEVICES)
+    examples = [key for key in example_addresses(loaded) if key.partition(".")[0] not in loaded.cell.sim]
+    notes = [f"{key} is the example's, where no device is: write your own" for key in examples]
     records = {name: loaded.device(name) for name in DEVICES}
     notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {
         "ok": True,
         "cell": loaded.cell.name,
         "configuration_hash": loaded.calibration_hash(),
-        "simulated": bool(loaded.cell.truth),
+        "simulated": bool(loaded.cell.truth) or list(loaded.cell.sim),
         "confirm": loaded.cell.confirm,
         "job": checked.job.name,
         "mesh": str(mesh),
@@ -87,5 +92,7 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         return
     typer.echo(f"cell {loaded.cell.name}: configuration is valid ({told['configuration']})")
     typer.echo(f"job {checked.job.name}: valid and in reach ({told['job_file']}), mesh {mesh}")
+    if words := simulated_words(list(loaded.cell.sim)):
+        typer.echo(f"note: {words} (cell.sim)")
     for note in notes:
         typer.echo(f"note: {note}")

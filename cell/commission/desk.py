@@ -22,9 +22,10 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.truth_link import cause_fault, make_ready
 from cell.job import Job, load_job
+from cell.motion.kinematics import Joints
 from cell.run.recorded_work import Hands
 from cell.steps.moves import HOME, Mover
-from drivers.errors import CellError
+from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Frame, Image
 
 if TYPE_CHECKING:
@@ -36,6 +37,28 @@ SLOW_JOINT = math.radians(15.0)
 SLOW_TOOL = 0.15
 """Of any point of tool and part in free moves, m/s."""
 WIDEST_PICTURE = 640
+
+
+class SlowMover(Mover):
+    """Moves that are planned anew, once, after a fault that a program may clear by itself, such as a lost program."""
+
+    def to(self, base_from_flange: pin.SE3, what: str) -> None:
+        """See `Mover.to`."""
+        self._again(lambda: Mover.to(self, base_from_flange, what))
+
+    def to_joints(self, joints: Joints) -> None:
+        """See `Mover.to_joints`."""
+        self._again(lambda: Mover.to_joints(self, joints))
+
+    def _again(self, move: Callable[[], None]) -> None:
+        try:
+            move()
+        except DeviceFault as fault:
+            if fault.device != self._arm.name or not fault.recoverable:
+                raise
+            # A protective stop is refused here: a person has to look first.
+            self._arm.recover()
+            move()
 
 
 class Declined(Exception):
@@ -152,7 +175,7 @@ class Desk:
             }
         )
         config = config.model_copy(update={"arm": slow})
-        return Mover(devices.arm, devices.clock, config, self.job, self.look_around, devices.interlocks)
+        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, devices.interlocks)
 
     def fold(self) -> None:
         """The arm to its folded posture above the deck, unless it is there."""

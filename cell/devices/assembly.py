@@ -35,15 +35,22 @@ INTERFACES: dict[str, type] = {
 """What each kind of device has to offer, whatever its make."""
 
 
-def connect(config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> Devices:
-    """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on."""
+def connect(
+    config: CellConfig,
+    only: Collection[str] = tuple(DEVICES),
+    otherwise: Callable[[str, Clock], Any | None] = lambda name, clock: None,
+) -> Devices:
+    """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on.
+
+    What `otherwise` gives for a device's name is taken instead, unless it is None.
+    """
     clock = Clock(config.cell.time_scale)
     made: dict[str, Any] = {}
     needed = connected_for(config, only)
     refuse_replays(config, needed)
     with ExitStack() as opened:
         for name in needed:
-            made[name] = connect_one(config, name, clock, arm=made.get("arm"))
+            made[name] = otherwise(name, clock) or connect_one(config, name, clock, arm=made.get("arm"))
             if not config.make(name).on_arm:
                 opened.callback(made[name].close)
         opened.pop_all()

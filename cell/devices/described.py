@@ -6,7 +6,7 @@ What cannot be simulated as it is described is refused here, before anything is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig, of_make
+from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
@@ -56,12 +56,13 @@ class Described:
         """The job of that file or name. Raises `ConfigError`."""
         return cls(*load_job(job))
 
-    def drawing(self, config: CellConfig) -> Drawing:
+    def drawing(self, config: CellConfig, simulated: Collection[str] = tuple(DEVICES)) -> Drawing:
         """The cell of the configuration with this job's station; the stock cell, to the last bit, where it is that.
 
-        Raises `ConfigError`, with a line for each value, for what nothing simulates.
+        Raises `ConfigError`, with a line for each value, for what nothing simulates; real devices beside the
+        `simulated` ones may be of any make.
         """
-        problems = [*_makes(config), *_boards(config, self.job)]
+        problems = [*_makes(config, simulated), *_boards(config, self.job)]
         if not problems:
             problems = [*_cameras(config, self.job), *_outputs(config), *_table(self.job, self.mesh)]
         if problems:
@@ -109,7 +110,8 @@ def _steps(rail: RailConfig) -> int:
     """Steps of a turn that a drive counts at its coarsest."""
     if isinstance(rail, ModbusRailConfig):
         return rail.counts_per_turn
-    return of_make(rail, TmclRailConfig).steps_per_turn
+    # A real rail of another make is followed: how it is driven does not show.
+    return rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
 
 
 def _wire(record: DeviceConfig) -> dict[str, Any]:
@@ -201,8 +203,8 @@ def _matrix(pose: pin.SE3) -> NDArray[np.float64]:
 # --- what nothing simulates ---
 
 
-def _makes(config: CellConfig) -> Iterator[str]:
-    for name in DEVICES:
+def _makes(config: CellConfig, simulated: Collection[str]) -> Iterator[str]:
+    for name in simulated:
         make = config.make(name)
         if make.simulated is None:
             yield (

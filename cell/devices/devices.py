@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.gate import Gate
+from cell.devices.gated import GatedRail
 from cell.devices.gated_laser import GatedLaser
 from cell.devices.interlocks import Interlocks
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
-from drivers.interfaces import Arm, Camera, Claw, Device, Rail, Vehicle
+from drivers.interfaces import Arm, Camera, Claw, Device, Vehicle
 from statemachine.waiting import waiting_on
+
+if TYPE_CHECKING:
+    from cell.devices.following import Following
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
@@ -19,8 +23,11 @@ SAFE_STOP_TIMEOUT_S = 5.0
 class Devices:
     """The devices of one cell, behind their gate (see `behind_gate`), and the clock that they share.
 
-    A command connects only those that it needs: asking for another one is a `NotConnectedError`.
+    A command connects only those that it needs: asking for another one is a `NotConnectedError`. `following` tells a
+    simulated world what the real ones do; None where all are real, or all simulated.
     """
+
+    following: Following | None = None
 
     def __init__(
         self,
@@ -28,7 +35,7 @@ class Devices:
         gate: Gate,
         *,
         arm: Arm | None = None,
-        rail: Rail | None = None,
+        rail: GatedRail | None = None,
         vehicle: Vehicle | None = None,
         scan_camera: Camera | None = None,
         target_camera: Camera | None = None,
@@ -56,7 +63,7 @@ class Devices:
         return _there("arm", self._arm)
 
     @property
-    def rail(self) -> Rail:
+    def rail(self) -> GatedRail:
         """The rail."""
         return _there("rail", self._rail)
 
@@ -122,6 +129,8 @@ class Devices:
     def close(self) -> list[str]:
         """Close every device, the arm last because laser and claw hang on its outputs."""
         problems = []
+        if self.following is not None:
+            self.following.close()
         for device in self:
             try:
                 device.close()

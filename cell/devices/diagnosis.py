@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import DEVICES, CellConfig, config_to_open
+from cell.config import DEVICES, CellConfig, config_to_open, require_real_addresses
 from cell.devices import assembly
 from cell.devices.examination import examine
+from cell.devices.mix import Sim, simulated_of
 from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.run.lock import CellLock
 from drivers.clock import Clock
@@ -38,6 +39,7 @@ class Diagnosis:
     p99_ms: float | None = None
     errors: dict[str, int] = field(default_factory=dict)
     state: str = ""
+    simulated: bool = False
     readings: list[Reading] = field(default_factory=list)
 
     @property
@@ -65,7 +67,7 @@ class Diagnosis:
 
 
 def diagnose(
-    path: Path | None, only: Collection[str] = (), *, sim: str | None, seed: int, level: str, speed: float
+    path: Path | None, only: Collection[str] = (), *, sim: Sim, seed: int, level: str, speed: float
 ) -> list[Diagnosis]:
     """Look at each device in turn, or at `only` those: nothing on them is set, started or ended.
 
@@ -73,18 +75,38 @@ def diagnose(
     """
     if unknown := [name for name in only if name not in DEVICES]:
         raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
-    if sim not in (None, "all"):
-        raise ConfigError(f'sim="{sim}" is not offered: "all" simulates the whole cell, leave it out for real devices')
-    _, config = config_to_open(path, simulated=sim is not None)
-    if sim is None:
+    names = simulated_of(sim, path)
+    whole = set(names) == set(DEVICES)
+    _, config = config_to_open(path, simulated=whole)
+    if not whole:
+        require_real_addresses(config, names)
+    wanted = [name for name in DEVICES if not only or name in only]
+    # What hangs on the arm is looked at where the arm is.
+    on_arm = [name for name in names if config.make(name).on_arm and "arm" not in names]
+    needed = assembly.connected_for(config, [name for name in wanted if name not in on_arm])
+    if not (served := [name for name in names if name in needed]):
         return _diagnose(config, only)
     from cell.devices.described import Described
 
-    simulated = SimulatedCell(config, Described.of("pot"), seed=seed, level=level, speed=speed, gige=on_gige(config))
+    # Looked at only, so it follows nothing: its pictures are of where its own devices stand.
+    world = SimulatedCell(
+        config,
+        Described.of("pot"),
+        seed=seed,
+        level=level,
+        speed=speed if whole else config.cell.time_scale,
+        gige=[name for name in on_gige(config) if name in names],
+        simulated=names,
+    )
     try:
-        return _diagnose(with_endpoints(config, simulated.endpoints), only)
+        rows = _diagnose(with_endpoints(config, world.endpoints, names if whole else served), only)
     finally:
-        simulated.close()
+        world.close()
+    for row in rows:
+        row.simulated = row.device in names
+        if row.device in on_arm:
+            row.state = f"{row.state}; what is shown is the real arm's output, the {row.device} is to be simulated"
+    return rows
 
 
 def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:

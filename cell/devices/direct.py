@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import CellConfig
+from cell.config import DEVICES, CellConfig
 from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
@@ -64,6 +64,7 @@ class VirtualCell(DirectCell):
             raise ConfigError(str(error)) from error
         # The arm's installation is right; a configuration may tell it otherwise.
         self.arm.set_payload(config.arm.payload, np.array(config.arm.payload_centre))
+        self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
@@ -78,7 +79,9 @@ class VirtualCell(DirectCell):
         return direct(name, self.world, self.clock)
 
     def require_fault(self, name: str) -> None:
-        """Raise `ConfigError` for a fault that only a wire can have."""
+        """Raise `ConfigError` for a fault that only a wire can have, or a vehicle where there is none."""
+        if name.startswith("vehicle.") and not self._config.vehicle.DRIVES:
+            raise ConfigError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
         try:
             faults.require(name)
         except ValueError as error:

@@ -5,8 +5,9 @@ Reading, stopping and closing always pass. What a make offers beyond its interfa
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.arguments import checked_joints, checked_pose, checked_way
 from cell.devices.contact import GuardedMotion
@@ -31,12 +32,22 @@ from drivers.interfaces import (
 )
 from drivers.link_table import LinkTable
 
+if TYPE_CHECKING:
+    from cell.devices.simulated_touch import SimulatedTouch
+
+Begun = TypeVar("Begun", bound=Motion)
+
 PATIENCE_S = 1.0
 """How old the arm's state may be that a speed rests on: the arm stands."""
 
 
 class GatedArm(Gated[Arm]):
-    """The arm, its motions and its recovery begun through a gate."""
+    """The arm, its motions and its recovery begun through a gate.
+
+    `touch` adds what it would feel of a simulated station; None where the station is as real as the arm.
+    """
+
+    touch: SimulatedTouch | None = None
 
     def link_table(self) -> LinkTable | None:
         """See `Arm.link_table`."""
@@ -49,11 +60,16 @@ class GatedArm(Gated[Arm]):
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""
-        return self.bare.state(max_age)
+        state = self.bare.state(max_age)
+        return state if self.touch is None else self.touch.felt(state)
 
-    def record(self) -> AbstractContextManager[list[ArmState]]:
+    @contextmanager
+    def record(self) -> Iterator[list[ArmState]]:
         """See `Arm.record`."""
-        return self.bare.record()
+        with self.bare.record() as states:
+            yield states
+        if self.touch is not None:
+            self.touch.recorded(states)
 
     def latch_clock(self) -> Latch:
         """See `Arm.latch_clock`."""
@@ -81,7 +97,14 @@ class GatedArm(Gated[Arm]):
         command = Command("arm", "follow", {"joints": way, "force_limit": force_limit})
         if force_limit is None:
             return self._move(command, lambda: self.bare.follow(times, joints))
-        return self._move(command, lambda: GuardedMotion(self.bare.follow(times, joints, force_limit), self.bare))
+
+        def start() -> ArmMotion:
+            motion = self.bare.follow(times, joints, force_limit)
+            if self.touch is not None:
+                motion = self.touch.guard(motion, force_limit, self.bare.stop)
+            return GuardedMotion(motion, self.bare)
+
+        return self._move(command, start)
 
     def _move(self, command: Command, start: Callable[[], ArmMotion]) -> ArmMotion:
         situation = self.gate.interlocks.situation
@@ -98,6 +121,8 @@ class GatedArm(Gated[Arm]):
         """See `Arm.zero_force`."""
         self.gate.require(Command("arm", "zero_force"))
         self.bare.zero_force()
+        if self.touch is not None:
+            self.touch.zero()
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """See `Arm.set_payload`."""
@@ -131,6 +156,8 @@ class GatedRail(Gated[Rail]):
     def __init__(self, bare: Rail, gate: Gate) -> None:
         super().__init__(bare, gate)
         self.travel = bare.travel
+        self.motion: Motion | None = None
+        """The newest motion that was begun, also one that has ended."""
 
     def state(self) -> RailState:
         """See `Rail.state`."""
@@ -138,12 +165,12 @@ class GatedRail(Gated[Rail]):
 
     def home(self) -> Motion:
         """See `Rail.home`."""
-        return self.gate.begin(Command("rail", "home"), self.bare.home, self.bare.stop)
+        return self._begin(Command("rail", "home"), self.bare.home)
 
     def move_to(self, position: float, speed: float | None = None) -> Motion:
         """See `Rail.move_to`."""
         command = Command("rail", "move_to", {"position": position})
-        return self.gate.begin(command, lambda: self.bare.move_to(position, speed), self.bare.stop)
+        return self._begin(command, lambda: self.bare.move_to(position, speed))
 
     def nudge(self, distance: float, speed: float) -> Motion:
         """See `Nudged.nudge`; `InterlockError` for a rail that does not offer it."""
@@ -156,11 +183,16 @@ class GatedRail(Gated[Rail]):
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """See `Rail.sweep`."""
         command = Command("rail", "sweep", {"start": start, "stop": stop})
-        return self.gate.begin(command, lambda: self.bare.sweep(start, stop, speed), self.bare.stop)
+        return self._begin(command, lambda: self.bare.sweep(start, stop, speed))
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """See `Rail.sweep_start`."""
         return self.bare.sweep_start(start, stop, speed)
+
+    def _begin(self, command: Command, start: Callable[[], Begun]) -> Begun:
+        motion = self.gate.begin(command, start, self.bare.stop)
+        self.motion = motion
+        return motion
 
 
 class GatedVehicle(Gated[Vehicle]):

@@ -14,10 +14,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 from cell.config import DEVICES, CellConfig
 from cell.devices.truth_link import ask_truth, cause_fault, make_ready
+from cell.devices.world_link import WorldLink
 from drivers.errors import ConfigError, DeviceFault
 
 if TYPE_CHECKING:
@@ -30,9 +32,13 @@ START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 class Simulation(Protocol):
     """A simulated cell, through whichever door its devices are reached."""
 
+    simulated: tuple[str, ...]
+    """The devices that it has; all of the cell's unless some are real beside it."""
+
     @property
     def facts(self) -> dict[str, Any]:
-        """For journal and report: `simulated`, `seed`, `level` and `clock`, "wall" or "virtual"."""
+        """For journal and report: `simulated` (true, or which devices beside real ones), `seed`, `level` and `clock`,
+        "wall" or "virtual"."""
 
     def truth(self) -> dict[str, Any]:
         """Everything true about the world now."""
@@ -54,7 +60,11 @@ class Simulation(Protocol):
 
 
 class SimulatedCell:
-    """A served simulated cell, the cameras in `gige` on GigE Vision; `endpoints` is the JSON object that it printed."""
+    """A served simulated cell, the cameras in `gige` on GigE Vision; `endpoints` is the JSON object that it printed.
+
+    `simulated` are the devices that it is used for, beside real ones where these are not all; it follows the real ones
+    in `follow`.
+    """
 
     def __init__(
         self,
@@ -65,12 +75,15 @@ class SimulatedCell:
         level: str,
         speed: float,
         gige: Collection[str] = (),
+        simulated: tuple[str, ...] = tuple(DEVICES),
+        follow: Collection[str] = (),
     ) -> None:
         """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so."""
-        self._config = config
+        self._config, self.simulated = config, simulated
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
         command += ["--seed", str(seed), "--level", level, "--speed", repr(speed)]
-        command += ["--drawing", described.drawing(config).as_json()]
+        command += ["--drawing", described.drawing(config, simulated).as_json()]
+        command += [word for name in follow for word in ("--follow", name)]
         command += [word for name in gige for word in ("--gige", name.removesuffix("_camera"))]
         # A file, because a pipe that nobody reads would block the writer; closed with the process.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
@@ -90,14 +103,18 @@ class SimulatedCell:
     @property
     def facts(self) -> dict[str, Any]:
         """Which world it is, for journal and report."""
-        return {"simulated": True, **{key: self.endpoints[key] for key in ("seed", "level")}, "clock": "wall"}
+        which: bool | list[str] = True if is_whole(self) else list(self.simulated)
+        return {"simulated": which, **{key: self.endpoints[key] for key in ("seed", "level")}, "clock": "wall"}
 
     def truth(self) -> dict[str, Any]:
         """Everything true about the world now; `CellError` when it does not answer."""
         return ask_truth(self.endpoints["truth"]["address"])
 
     def require_fault(self, name: str) -> None:
-        """Over its wires it can have every fault."""
+        """Over its wires it can have every fault of the devices that it has; `ConfigError` for those of a real one."""
+        of = next((device for start, device in FAULTS_OF.items() if name.startswith(start)), "")
+        if of not in self.simulated:
+            raise ConfigError(f'"{name}": the {of or "device"} is real here, nobody causes its faults')
 
     def fault(self, name: str) -> None:
         """Cause a fault by its name; `CellError` when that was not taken."""
@@ -105,7 +122,13 @@ class SimulatedCell:
 
     def make_ready(self, described: Described) -> None:
         """See `Simulation`; `CellError` when that was not taken."""
-        make_ready(self.endpoints["truth"]["address"], described.drawing(self._config).as_json())
+        make_ready(self.endpoints["truth"]["address"], described.drawing(self._config, self.simulated).as_json())
+
+    @cached_property
+    def link(self) -> WorldLink | None:
+        """The line at which its world is told of real devices; None where it follows none."""
+        told: dict[str, Any] | None = self.endpoints.get("following")
+        return None if told is None else WorldLink(told["address"])
 
     @property
     def pid(self) -> int:
@@ -145,6 +168,8 @@ class SimulatedCell:
 
     def close(self) -> None:
         """End the process: first by closing its input, then by force."""
+        if (link := self.__dict__.get("link")) is not None:
+            link.close()
         if self._process.stdin is not None and not self._process.stdin.closed:
             self._process.stdin.close()
         try:
@@ -157,19 +182,35 @@ class SimulatedCell:
         self._messages.close()
 
 
+FAULTS_OF = {
+    "arm.": "arm", "rail.": "rail", "vehicle.": "vehicle", "can.": "vehicle", "camera.": "scan_camera",
+    "target_camera.": "target_camera",
+}  # fmt: skip
+"""Whose fault it is, by how its name begins."""
+
+
+def is_whole(simulation: Simulation | None) -> bool:
+    """Whether every device of the cell is simulated: nothing real moves, shines or is looked at."""
+    return simulation is not None and set(simulation.simulated) == set(DEVICES)
+
+
 def on_gige(config: CellConfig) -> list[str]:
     """The cameras that the configuration wants on GigE Vision: so their peers are served."""
     return [name for name in DEVICES if DEVICES[name] == "camera" and config.make(name).name == "gige"]
 
 
-def with_endpoints(config: CellConfig, endpoints: dict[str, Any]) -> CellConfig:
-    """The configuration with every device's address replaced by that of its simulated peer.
+def with_endpoints(
+    config: CellConfig, endpoints: dict[str, Any], simulated: Collection[str] = tuple(DEVICES)
+) -> CellConfig:
+    """The configuration with the addresses of these devices replaced by those of their simulated peers.
 
-    Raises `ConfigError` when a device is of a make that has none.
+    Raises `ConfigError` when one of them is of a make that has none.
     """
-    section = {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
-    changed: dict[str, Any] = {"cell": config.cell.model_copy(update=section)}
-    for name in DEVICES:
+    changed: dict[str, Any] = {}
+    if set(simulated) == set(DEVICES):
+        section = {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
+        changed["cell"] = config.cell.model_copy(update=section)
+    for name in simulated:
         make = config.make(name)
         if make.simulated is None:
             raise ConfigError(

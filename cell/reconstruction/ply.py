@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,8 +62,10 @@ def write_ply(
     return len(records)
 
 
-def write_cloud(path: Path, cloud: Cloud) -> int:
+def write_cloud(path: Path, cloud: Cloud, simulated: Sequence[str] = ()) -> int:
     """Write a cloud with all that a later export needs of it, interpolated points at its end; the number of points.
+
+    The header names the devices that were `simulated` when it was measured.
 
     Properties beside x, y, z: `sigma` (one standard deviation, m, in the direction in which the point is least
     certain), `line`, `row` and `sweep` (where it lies in the organised cloud), `interpolated` (1 for a point that was
@@ -80,6 +82,7 @@ def write_cloud(path: Path, cloud: Cloud) -> int:
     sweeps = cloud.sweeps if len(cloud.sweeps) else np.zeros(cloud.shape[0], dtype=np.intp)
     flag = np.zeros(len(line), dtype=np.uint8)
     flag[len(lines) :] = 1
+    said = f"\nsimulated: {', '.join(simulated)}" if simulated else ""
     return write_ply(
         path,
         np.concatenate([cloud.points[lines, rows], filled.points]),
@@ -90,7 +93,7 @@ def write_cloud(path: Path, cloud: Cloud) -> int:
             "sweep": sweeps[line].astype(np.uint8),
             "interpolated": flag,
         },
-        comment="frame: arm base\nsigma in metres; interpolated: 1 where the point was not measured",
+        comment="frame: arm base\nsigma in metres; interpolated: 1 where the point was not measured" + said,
     )
 
 

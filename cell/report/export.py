@@ -14,6 +14,7 @@ from cell.job import load_job
 from cell.reconstruction.e57 import write_e57
 from cell.reconstruction.mesh import triangles, write_mesh
 from cell.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
+from cell.report.figures import simulated_words
 from cell.run.reading import read_report
 from drivers.errors import ConfigError
 
@@ -29,7 +30,8 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     the run has no cloud or the job is not found.
     """
     cloud = read_cloud(folder / "cloud.ply")
-    deviations = _deviations(cloud, read_report(folder), job)
+    report = read_report(folder)
+    deviations = _deviations(cloud, report, job)
     colours = None if deviations is None else deviation_colours(deviations, limit)
     written: dict[str, Any] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
     if kind == "e57":
@@ -39,7 +41,14 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
             "sigma": cloud.sigma.astype(np.float32),
             "interpolated": cloud.interpolated.astype(np.uint8),
         }
-        write_ply(out, cloud.points, quality=deviations, colours=colours, scalars=scalars, comment=_comment(deviations))
+        write_ply(
+            out,
+            cloud.points,
+            quality=deviations,
+            colours=colours,
+            scalars=scalars,
+            comment=_comment(deviations, report),
+        )
     else:
         try:
             faces = triangles(cloud.points, cloud.line, cloud.row, cloud.sweep)
@@ -58,8 +67,10 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     return written
 
 
-def _comment(deviations: NDArray[np.float64] | None) -> str:
-    return "frame: arm base" + ("" if deviations is None else "\nquality: distance from the nominal surface in metres")
+def _comment(deviations: NDArray[np.float64] | None, report: dict[str, Any]) -> str:
+    lines = ["frame: arm base", simulated_words(report.get("simulated"))]
+    lines += [] if deviations is None else ["quality: distance from the nominal surface in metres"]
+    return "\n".join(line for line in lines if line)
 
 
 def _deviations(cloud: StoredCloud, report: dict[str, Any], name: str | None) -> NDArray[np.float64] | None:

@@ -29,3 +29,20 @@ def _digits(value: float | None) -> str:
     if value == int(value) and abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def following_words(following: Mapping[str, Any]) -> str:
+    """How late real devices' readings reached a simulated world, as `following` in a report has it, for people."""
+    if "devices" not in following:
+        return f"not told: {following.get('missing')}"
+    late = [(name, row["latency_ms"]) for name, row in following["devices"].items() if row["latency_ms"] is not None]
+    told = ", ".join(f"{name} {row['p50']:.0f} ms (99 %: {row['p99']:.0f})" for name, row in late)
+    lost = following["not_made"]
+    return f"{told}; {lost} picture{'s' * (lost != 1)} not made" if lost else told
+
+
+def simulated_words(simulated: object) -> str:
+    """What a report says of simulated devices, for people: "" where all are real."""
+    if not simulated:
+        return ""
+    return f"{', '.join(map(str, simulated))} simulated, all else real" if isinstance(simulated, list) else "simulated"

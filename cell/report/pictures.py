@@ -19,6 +19,7 @@ from cell.inversion import NominalSurface, PlacePose
 from cell.job import Job
 from cell.reconstruction import Cloud
 from cell.report.evidence import Evidence, ended_in
+from cell.report.figures import simulated_words
 from cell.report.panels import (
     BoardPanel,
     StripePanel,
@@ -57,8 +58,8 @@ def draw_run(
     evidence = Evidence.of(result)
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=110)
     title = f"{report['outcome'].upper()}: run {report['run']}, job {job.job.name}"
-    if report["simulated"]:
-        title += f" (simulated, seed {report['seed']}, level {report['level']})"
+    if words := simulated_words(report["simulated"]):
+        title += f" ({words}, seed {report['seed']}, level {report['level']})"
     figure.suptitle(title)
     board, stripe = _board(result, evidence, frames), _stripe(result, frames)
     surface = _surface(job, nominal, result, evidence)

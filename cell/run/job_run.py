@@ -13,6 +13,7 @@ from typing import Any
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
 from cell.devices.devices import Devices
+from cell.devices.following import Following
 from cell.devices.injection import Injector
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
@@ -158,7 +159,7 @@ class JobRun:
                 policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"),
                 journal=journal,
                 clock=self.devices.clock,
-                classify=classify,
+                classify=self._classify,
                 safe_stop=lambda reason: stop_cell(self.devices),
                 observer=each_of(observers),
                 recover=self._recover,
@@ -182,6 +183,8 @@ class JobRun:
             name: why for each in self.inline if isinstance(each, Injector) for name, why in each.missed.items()
         }:
             facts["not_injected"] = [{"fault": name, "why": why} for name, why in missed.items()]
+        if self.devices.following is not None:
+            facts["following"] = self._following(self.devices.following)
         report = make_report(
             folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
         )  # fmt: skip
@@ -194,6 +197,20 @@ class JobRun:
             self.run.control,
             time.time() - started,
         )
+
+    def _following(self, following: Following) -> dict[str, Any]:
+        try:
+            return following.figures()
+        except CellError as error:
+            return {"missing": str(error)}
+
+    def _classify(self, error: BaseException) -> Failure:
+        """As `classify`; what a person is asked says what is simulated beside real devices."""
+        failure = classify(error)
+        if not failure.needs_person or self.devices.following is None:
+            return failure
+        names = ", ".join(self.devices.following.simulated)
+        return replace(failure, reason=f"{failure.reason} (simulated here: {names}; all else is real)")
 
     def _facts(self) -> dict[str, Any]:
         return {

@@ -9,7 +9,11 @@ from typing import Any
 
 from cell.calibration import sessions
 from cell.calibration.store import CellCalibration
+from cell.config import DEVICES
+from cell.devices.mix import beware
+from cell.devices.simulated import is_whole
 from cell.opened import Opened
+from cell.report.figures import following_words
 from cell.run.job_run import JobRun, Observer, RunOutcome
 from cell.run.ready_job import ReadyJob
 from cell.run.resumption import UnfinishedRun
@@ -41,6 +45,11 @@ class JobWork:
         def note(text: str) -> None:
             run.tell(Event("note", None, {"text": text}))
 
+        if (simulated := cell.simulated) is not None and not is_whole(simulated):
+            for sentence in beware(simulated.simulated, DEVICES):
+                note(sentence)
+            if (following := cell.devices.following) is not None:
+                note(f"readings reach the simulated world after: {following_words(following.figures())}")
         if self.at_start:
             cell.whereabouts.say_at_start()
         calibration = self.stored

@@ -82,7 +82,7 @@ def run_row(folder: Path) -> dict[str, Any]:
         report = read_report(folder)
     except (CellError, OSError) as error:
         report = {"outcome": "unreadable", "reason": str(error)}
-    keys = ("outcome", "job", "seed", "level", "reason", "started")
+    keys = ("outcome", "job", "simulated", "seed", "level", "reason", "started")
     kind = report.get("kind", "job") if report["outcome"] != "unreadable" else None
     return {
         "run": folder.name,

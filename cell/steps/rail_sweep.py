@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cell.devices.devices import Devices
+from cell.devices.following import MOST_SCATTER
 from cell.geometry.poses import from_ur
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
@@ -72,6 +73,8 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
     deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
     residual = float(np.median(deviations)) if deviations else 0.0
+    if devices.following is not None and deviations:
+        devices.following.require_paired(float(np.percentile(deviations, 95)), MOST_SCATTER * errors.rail)
     along = collector.builder.sweep_direction(base_from_flange)
     spread = errors.rail * along
     shared = np.zeros((6, 6))

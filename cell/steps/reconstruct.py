@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,18 +58,20 @@ def reconstruct(
     path: Path,
     base_from_vehicle: pin.SE3,
     lean_sigma: float,
+    simulated: Sequence[str] = (),
 ) -> Reconstruction:
     """Place every profile, remove outliers, interpolate holes up to `largest_hole` m and write the cloud to `path`.
 
     The vehicle, which carries the arm at `base_from_vehicle`, leans by `lean_sigma` rad, one standard deviation, per
-    metre that the arm reaches out: an arm that moves during the sweeps moves its base, too. Raises `RefusedError` when
+    metre that the arm reaches out: an arm that moves during the sweeps moves its base, too. The file says which devices
+    were `simulated`. Raises `RefusedError` when
     too few points are left; what there is of a cloud is written all the same.
     """
     built = build_cloud(sweep)
     try:
         cloud = fill_holes(built.require(), largest_hole)
     except RefusedError as refused:
-        write_cloud(path, built)
+        write_cloud(path, built, simulated)
         refused.showing(seen={"cloud": built})
         raise
     # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
@@ -86,7 +89,7 @@ def reconstruct(
         return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
 
     seams = tuple(find_seams(cloud, by_both))
-    write_cloud(path, cloud)
+    write_cloud(path, cloud, simulated)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
 
 
@@ -103,6 +106,7 @@ def _at(here: Workplace, context: StepContext) -> Reconstruction:
         path,
         here.config.arm.vehicle_from_base.se3().inverse(),
         here.config.vehicle.lean_sigma,
+        here.config.cell.sim,
     )
 
 

@@ -117,7 +117,7 @@ class Workplace:
         # Numbered, since a camera may count its frames anew: a later photograph must not take an earlier one's place.
         self._photographs += 1
         what = f"board-{self._photographs:02d}"
-        return photograph(
+        fix = photograph(
             self.devices.arm,
             self.devices.target_camera,
             self.calibration.target,
@@ -128,3 +128,6 @@ class Workplace:
             lambda frame: self.frames.keep(what, frame),
             lambda: self.devices.clock.sleep(APART_S),
         )
+        if self.devices.following is not None:
+            self.devices.following.board_seen(fix.base_from_board)
+        return fix

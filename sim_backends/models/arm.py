@@ -118,10 +118,7 @@ class ArmModel:
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
-        true = Kinematics(params.dh + params.dh_error)
-        bends = params.harmonics.any() or params.compliance > 0.0
-        joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
-        self._truth = TruePose(true, params.repeatability, params.blend_time, rng, joints, params.memory)
+        self._truth = self._true_pose(params.dh)
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     # --- the world's side ---
@@ -331,6 +328,14 @@ class ArmModel:
         down = np.array([0.0, 0.0, -GRAVITY])
         arm = self.reported_flange()[:3, :3] @ moment
         return np.concatenate([(params.carried - mass) * down, np.cross(arm, down)])
+
+    def _true_pose(self, table: Matrix) -> TruePose:
+        """Where the flange of an arm truly is whose controller computes with `table` (6, 4)."""
+        params = self.params
+        true = Kinematics(table + params.dh_error)
+        bends = params.harmonics.any() or params.compliance > 0.0
+        joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
+        return TruePose(true, params.repeatability, params.blend_time, self._rng, joints, params.memory)
 
     def _replace(self, motion: Motion) -> None:
         self._queue = deque([Stop(_BRAKE), motion] if motion.from_rest and self.moving else [motion])

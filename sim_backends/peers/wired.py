@@ -77,7 +77,7 @@ def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, Any]]]:
 
 
 def _hanging(world: World, name: str) -> tuple[Callable[[bool], None], Callable[[], bool]]:
-    return partial(world.switches.__setitem__, name), partial(world.switches.__getitem__, name)
+    return partial(world.switch, name), partial(world.switches.__getitem__, name)
 
 
 def _grip(world: World, active_high: bool) -> bool:

@@ -23,7 +23,7 @@ CAMERA_RATE = {"scan": 120.0, "target": 30.0}
 """Most pictures a second."""
 
 
-def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
+def make_arm(scene: Scene, clock: WorldClock, made: type[ArmModel] = ArmModel) -> ArmModel:
     """The arm at rest, with its claw closed."""
     sigma, drawn = scene.deviations, scene.drawing.cell
     model = drawn.arm
@@ -40,14 +40,14 @@ def make_arm(scene: Scene, clock: WorldClock) -> ArmModel:
         carried_centre=drawn.payload_centre,
         serial=f"2023{scene.serial}",
     )
-    arm = ArmModel(params, stream(scene.seed, "arm"), clock)
+    arm = made(params, stream(scene.seed, "arm"), clock)
     if drawn.claw_output is not None:
         closed = 1 << drawn.claw_output
         arm.write_digital_outputs(closed, closed)
     return arm
 
 
-def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
+def make_rail(scene: Scene, made: type[RailModel] = RailModel) -> RailModel:
     """The rail, switched on anywhere on its travel and not yet homed."""
     drawn = scene.drawing.cell.rail
     screw = Screw(
@@ -65,10 +65,10 @@ def make_rail(scene: Scene, clock: WorldClock) -> RailModel:
         serial=int(scene.serial),
         reversed=drawn.reversed,
     ).around(drawn.travel)
-    return RailModel(params, stream(scene.seed, "rail"))
+    return made(params, stream(scene.seed, "rail"))
 
 
-def make_vehicle(scene: Scene) -> VehicleModel:
+def make_vehicle(scene: Scene, made: type[VehicleModel] = VehicleModel) -> VehicleModel:
     """The vehicle standing at its start, braked for good where it is a fixed frame.
 
     Its drift sideways and in yaw follow the odometry's errors.
@@ -83,7 +83,7 @@ def make_vehicle(scene: Scene) -> VehicleModel:
         lateral_walk=0.1 * scene.deviations.odometry_scale,
         yaw_walk=0.1 * scene.deviations.odometry_yaw,
     )
-    model = VehicleModel(params, stream(scene.seed, "vehicle"))
+    model = made(params, stream(scene.seed, "vehicle"))
     if scene.drawing.cell.fixed:
         model.set_brake(0.0, True)
     return model

@@ -6,6 +6,7 @@ the vehicle's lean under the arm, and the chain of poses from the floor to the c
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,10 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.history import SwitchHistory
-from sim_backends.models.arm import Safety
+from sim_backends.models.arm import ArmModel, Safety
+from sim_backends.models.followed import FollowedArm, FollowedRail, FollowedVehicle
+from sim_backends.models.rail import RailModel
+from sim_backends.models.vehicle import VehicleModel
 from sim_backends.world import hardware
 from sim_backends.world.arm_points import ArmPoints
 from sim_backends.world.cameras import Cameras
@@ -43,17 +47,19 @@ class World:
         speed: float = 1.0,
         drawing: Drawing = STOCK,
         clock: WorldClock | None = None,
+        followed: Collection[str] = (),
     ) -> None:
         """Draw the world around `drawing` and let its clock run, at `speed` unless it is given one.
 
+        Of arm, rail and vehicle those in `followed` are where real ones are measured: see `world.following`.
         Raises ValueError for an unknown level or surface, a surface that is no mesh, or a bad number.
         """
         self.scene = draw(seed, level, drawing)
         self.station = Station.of(drawing.station)
         self.clock = WorldClock(speed) if clock is None else clock
-        self.arm = hardware.make_arm(self.scene, self.clock)
-        self.rail = hardware.make_rail(self.scene, self.clock)
-        self.vehicle = hardware.make_vehicle(self.scene)
+        self.arm = hardware.make_arm(self.scene, self.clock, FollowedArm if "arm" in followed else ArmModel)
+        self.rail = hardware.make_rail(self.scene, FollowedRail if "rail" in followed else RailModel)
+        self.vehicle = hardware.make_vehicle(self.scene, FollowedVehicle if "vehicle" in followed else VehicleModel)
         self.laser = SwitchHistory()
         self.switches = {"laser": False, "claw": True}
         """What switches laser and claw where no output of the arm does: set by their peers."""
@@ -181,6 +187,15 @@ class World:
         drawn = self.scene.drawing.cell
         output = drawn.laser_output if name == "laser" else drawn.claw_output
         return self.switches[name] if output is None else bool(self.arm.digital_outputs >> output & 1)
+
+    def switch(self, name: str, on: bool, since: float | None = None) -> None:
+        """The own switch of "laser" or "claw" is on or off: since now, or since a world time.
+
+        An arm that a real one moves is told of late: its tick would note the laser late as well.
+        """
+        self.switches[name] = on
+        if name == "laser":
+            self.laser.record(self.clock.now() if since is None else since, on)
 
     def _report_grip(self) -> None:
         if (grip := self.scene.drawing.cell.grip_input) is not None:

@@ -240,13 +240,11 @@ def test_who_only_looks_writes_nothing(drive: Drive) -> None:
 
 OWNER = """
 import sys
-from tests.wire.test_modbus_rail import Drive, config, PATHS, Clock
+from drivers.clock import Clock
 from drivers.rail.modbus import ModbusRail
-from cell.devices.rail_makes import register_map
-record = config(PATHS)
-rail = ModbusRail("rail", sys.argv[1], register_map(record.registers), lead=record.lead,
-    counts_per_turn=record.counts_per_turn, travel=record.travel, max_speed=record.max_speed,
-    acceleration=record.acceleration, clock=Clock(5.0), unit=7)
+from drivers.rail.registers import *
+rail = ModbusRail("rail", sys.argv[1], eval(sys.argv[2]), lead=0.002, counts_per_turn=10_000, travel=(0.0, 0.1),
+    max_speed=0.04, acceleration=0.2, clock=Clock(5.0), unit=7)
 rail.home().wait(60)
 motion = rail.move_to(0.09, 0.002)
 print("moves", flush=True)
@@ -256,7 +254,8 @@ motion.wait(600)
 
 def test_the_rail_stands_when_its_owner_is_killed() -> None:
     drive = Drive.of(config(PATHS), pty=True)
-    with subprocess.Popen([sys.executable, "-c", OWNER, str(drive.peer.pty)], stdout=subprocess.PIPE) as owner:
+    command = [sys.executable, "-c", OWNER, str(drive.peer.pty), repr(register_map(drive.record.registers))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as owner:
         assert owner.stdout is not None
         assert owner.stdout.readline() == b"moves\n"
         Clock().sleep(0.1)

@@ -22,13 +22,16 @@ from cell.calibration.recorded.result import (
     finite_mm,
     flatness_dict,
     hand_eye_dict,
+    intrinsics_dict,
     plane_dict,
     seen_depths,
     setup_note,
 )
-from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, SHARED, stripe_block
+from cell.calibration.solve.adjustment import Adjustment
+from cell.calibration.solve.blocks import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
+from cell.calibration.solve.board_shape import moved_by_bend
 from cell.calibration.solve.checks import Check
-from cell.calibration.solve.choice import Choice, choose_solution
+from cell.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
 from cell.calibration.solve.closed_form import points_on_boards
 from cell.calibration.solve.flatness import Flatness, flatness, leave_one_out
 from cell.calibration.solve.hand_eye_checks import hand_eye_checks
@@ -37,7 +40,7 @@ from cell.calibration.solve.joint import Staged, solve_staged, start_state
 from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_of_cameras
 from cell.calibration.solve.scale import Scale, metric_scale
 from cell.calibration.solve.starts import stripe_means
-from cell.geometry.camera import PARAMETER_NAMES
+from cell.geometry.camera import PARAMETER_NAMES, Array
 from cell.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
@@ -49,11 +52,15 @@ LEAST_FRAMES = 4
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What frames with poses give. `stripes` says why a frame's stripe is not used, by the frame's place."""
+    """What frames with poses give. `stripes` says why a frame's stripe is not used, by the frame's place.
+
+    `pictures` is the camera of the pictures, its deviation with what the arm says of it.
+    """
 
     setup: str
     observations: list[ScanObservation]
     staged: Staged
+    pictures: Intrinsics
     choice: Choice
     stripes: dict[int, str]
     no_plane: str
@@ -81,19 +88,19 @@ def solve_chain(
     _refuse_strangers(staged, scale)
     staged, stripes, no_plane = _with_plane(observations, staged, pictures)
     choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
-    known_plane = _plane_known(choice, staged, observations, pictures)
-    if scale is not None and scale.believed:
-        unsure = np.zeros(SHARED)
-        unsure[HAND.start : HAND.start + 3] = np.abs(scale.shift)
-        best, closed = (replace(s, unsure=unsure) for s in (choice.best, choice.closed))
-        choice = replace(choice, best=best, closed=closed)
-        if known_plane is not None:
-            reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
-            known_plane = replace(known_plane, place=math.hypot(known_plane.place, (scale.value - 1) * reach))
+    choice, pictures = with_doubt_of_camera(choice, pictures)
+    unsure = _unsure(choice, pictures, scale)
+    known_plane = _plane_known(choice, staged, observations, pictures, unsure)
+    best, closed = (replace(s, unsure=np.abs(unsure)) for s in (choice.best, choice.closed))
+    choice = replace(choice, best=best, closed=closed)
+    if scale is not None and scale.believed and known_plane is not None:
+        reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
+        known_plane = replace(known_plane, place=math.hypot(known_plane.place, (scale.value - 1) * reach))
     return Chain(
         setup,
         observations,
         staged,
+        pictures,
         choice,
         stripes,
         no_plane,
@@ -124,8 +131,25 @@ def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
     )
 
 
+def _unsure(choice: Choice, pictures: Intrinsics, scale: Scale | None) -> Array:
+    """What the shared parameters (27,) would move with a bent board or the arm's scale, where these are believed."""
+    unsure = np.zeros(SHARED)
+    best = choice.best
+    if pictures.bend is not None and pictures.bend.believed:
+        adjustment = Adjustment(best.views, best.free, best.adjusted.priors)
+        unsure = moved_by_bend(adjustment, best.adjusted.state)
+    if scale is not None and scale.believed:
+        place = slice(HAND.start, HAND.start + 3)
+        unsure[place] = np.hypot(unsure[place], scale.shift)
+    return unsure
+
+
 def _plane_known(
-    choice: Choice, staged: Staged, observations: Sequence[ScanObservation], pictures: Intrinsics
+    choice: Choice,
+    staged: Staged,
+    observations: Sequence[ScanObservation],
+    pictures: Intrinsics,
+    unsure: Array,
 ) -> PlaneKnown | None:
     """How well the light plane is known, None without one."""
     plane = choice.best.adjusted.state.plane
@@ -134,9 +158,13 @@ def _plane_known(
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
     others = [p for k in lit if (p := choice.best.left.states[k].plane) is not None]
     cloud = np.concatenate(points_on_boards(staged, observations))
+    if choice.best.camera_free:
+        other = choice.best.adjusted.state.moved(np.concatenate([unsure, np.zeros(OWN * len(observations))])).plane
+        assert other is not None
+        return PlaneKnown.of(plane, others, cloud, (plane, other))
     views = [o.view for o in observations if o.view is not None]
     moved = planes_of_cameras(pictures, views, [o.profile for o in observations], staged.plane.rows)
-    return PlaneKnown.of(plane, others, cloud, () if choice.best.camera_free else moved)
+    return PlaneKnown.of(plane, others, cloud, moved)
 
 
 def _placed(
@@ -197,7 +225,7 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
     rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
-    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known)
+    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known, len(chain.stripes))
     apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
     tilt = math.degrees(known.tilt)
     made.append(
@@ -242,6 +270,8 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
             "lens": pictures.model.name,
             "method": best.name,
         }
+    else:
+        result["intrinsics"] = intrinsics_dict(chain.pictures)
     figures = {key: finite(value) for key, value in best.left.figures.items()}
     result["hand_eye"] = {
         "method": best.name,

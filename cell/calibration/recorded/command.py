@@ -20,7 +20,7 @@ from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, match_series, read_series
-from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
+from cell.calibration.recorded.solution import agreeing, camera_of, note_perhaps_no_laser, solve_frames
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
@@ -126,3 +126,4 @@ def _from_frames(
         agreeing(frames, found[0].camera)
         return
     solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)
+    note_perhaps_no_laser(frames, result)

@@ -81,6 +81,8 @@ def _readings() -> dict[str, Reading]:
             ("XYZ", "euler-xyz", "Euler angles about x, then the new y, then the new z"),
             ("ZYX", "abc", "angles A, B, C about z, then the new y, then the new x"),
             ("ZYZ", "euler-zyz", "Euler angles about z, then the new y, then the new z"),
+            ("ZXZ", "euler-zxz", "Euler angles about z, then the new x, then the new z"),
+            ("zyx", "ypr", "yaw, pitch, roll about fixed z, y, x"),
         ):
             for unit in ("rad", "deg"):
                 pose = partial(_angles, first=first, kind=kind, degrees=unit == "deg")

@@ -13,7 +13,7 @@ from pathlib import Path
 from drivers.errors import ConfigError
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-TEXTS = (".txt", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".npy", ".npz")
+TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".npy", ".npz")
 ARCHIVES = (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz")
 BAGS = (".bag", ".db3", ".mcap")
 LARGEST_TEXT = 50_000_000

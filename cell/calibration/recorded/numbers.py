@@ -20,6 +20,9 @@ from cell.calibration.recorded.tables import read_table
 from cell.calibration.recorded.yaml_subset import read_yaml
 from cell.geometry.camera import Array
 
+# A pose that a program of a UR arm moves to: position and rotation vector.
+MOVE = re.compile(r"\bmove[a-z]+\s*\(\s*p\s*\[([^\]]*)\]")
+
 
 def read_content(path: Path) -> Content:
     """Records and links of a file. Raises ValueError that says what is wrong with it."""
@@ -38,7 +41,7 @@ def read_content(path: Path) -> Content:
     data = _structured(path, text)
     if data is not None:
         _walk(path, data, [], None, content)
-    else:
+    elif not _program(path, text, content):
         read_table(path, text, content)
     return content
 
@@ -70,6 +73,16 @@ def _structured(path: Path, text: str) -> Any:
             except (ValueError, SyntaxError):
                 continue
     return None
+
+
+def _program(path: Path, text: str, content: Content) -> bool:
+    """Add the poses that an arm's own program moves to, one after the other; False for a text that is none."""
+    for found in MOVE.findall(text):
+        with suppress(ValueError):
+            numbers = np.array([float(value) for value in found.split(",")])
+            if len(numbers) == 6:
+                content.records.append(Record(path, "row", f"[{len(content.records)}]", numbers, "rotation"))
+    return bool(content.records)
 
 
 def _walk(path: Path, data: Any, place: list[str], label: str | None, content: Content) -> None:

@@ -15,7 +15,7 @@ from cell.calibration.recorded.folder import RecordedFrame, used
 from cell.calibration.recorded.result import intrinsics_dict, plane_dict, seen_depths
 from cell.calibration.recorded.stops import by_stop, counted, merged
 from cell.calibration.solve.camera_checks import camera_checks
-from cell.calibration.solve.checks import Check, refused_parts
+from cell.calibration.solve.checks import Check, Part, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.calibration.solve.foreign import FOREIGN, foreign_view
 from cell.calibration.solve.given_camera import against_pictures
@@ -39,6 +39,8 @@ from drivers.errors import RefusedError
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
 OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
+LIKELY_LASER = 0.5
+"""Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
 
 
@@ -119,7 +121,9 @@ def solve_frames(
     """
     chosen, plain = found
     notes: list[str] = result["notes"]
+    told = sum(f.base_from_flange is not None for f in used(frames))
     posed = agreeing(frames, chosen.camera)
+    disagree = _disagreeing(told - len(posed), told) if posed else []
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = camera_of(frames, given)
@@ -141,7 +145,7 @@ def solve_frames(
         plain = chosen
     result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
     result["intrinsics_without_distortion"] = intrinsics_dict(plain)
-    checks = beside + camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
+    checks = beside + disagree + camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
     if posed:
         if len(rest) > len(posed):
             notes.append(
@@ -160,6 +164,35 @@ def solve_frames(
     if result["light_plane"] is None and result["hand_eye"] is None:
         checks += _report_plane(stops, chosen, result)
     apply_checks(checks, result)
+
+
+def _disagreeing(left_out: int, count: int) -> list[Check]:
+    """How many of the frames with a pose are left out because it disagrees with the others: a few are slips."""
+    if left_out == 0:
+        return []
+    parts: tuple[tuple[Part, float], ...] = (("hand_eye", 40.0), ("intrinsics", math.inf))
+    return [
+        Check(
+            part, "frames whose pose disagrees with the others", 100 * left_out / count, 25.0, refused, "%",
+            f"{left_out} of {count} are left out for it, too many for slips: was the camera's zoom, focus or mount, or "
+            "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself",
+        )
+        for part, refused in parts
+    ]  # fmt: skip
+
+
+def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
+    """Where few pictures show a line, and these are of no plane, there may be no laser: that is noted, not refused."""
+    frames = used(frames)
+    why, lit = result["refused"].get("light_plane"), [f for f in frames if f.profile is not None]
+    asked = result["laser"]["asked"] != "auto" or any(f.stripe_from for f in lit)
+    if why is None or asked or "intrinsics" in result["refused"] or len(lit) >= LIKELY_LASER * len(frames):
+        return
+    del result["refused"]["light_plane"]
+    result["notes"].append(
+        f"no light plane: {len(lit)} of {len(frames)} pictures show a line that might be a laser's, and these lines "
+        f"are of no light plane: {why}. Where there was a laser, name its colour with --laser"
+    )
 
 
 def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
@@ -191,6 +224,7 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
     camera = pictures.camera
     views = _views(frames)
     profiles = [f.profile for f in frames]
+    left_out = 0
     notes: list[str] = result["notes"]
     if sum(p is not None for p in profiles) < 2:
         notes.append("no light plane: fewer than two frames show a laser stripe")
@@ -219,6 +253,7 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
             break
         notes += [f"{frames[k].name}: {text} Its stripe is not used." for k, text in wrong.items()]
         profiles = [None if k in wrong else p for k, p in enumerate(profiles)]
+        left_out += len(wrong)
     seen = [stripe_pixels(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None]
     cloud: Array = np.concatenate(clouds)
     lit = sum(len(c) > 0 for c in clouds)
@@ -236,4 +271,4 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
         "method": "fit on the board's poses",
     }
     result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-    return plane_checks(plane.rms, own, cloud, lit, known)
+    return plane_checks(plane.rms, own, cloud, lit, known, left_out)

@@ -142,9 +142,14 @@ def _on_board(
         return ReadStripe(points=smooth)
     mix = _mix(profile)
     plane = picture.plane(mix)[0] if off is None else picture.plane(mix)[0] - off.plane(mix)[0]
-    level = float(np.median(plane[at[lit, 1], at[lit, 0]]))
+    levels = plane[at[lit, 1], at[lit, 0]]
+    level = float(np.median(levels))
     white = _white(plane, view)
     needed = min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, 250.0)
+    among = _among(view, profile.pixels()[lit])
+    if level > needed and among.sum() >= LEAST_SMOOTH_ROWS:
+        # Edges of the squares are no brighter there than the white, whatever shines outside.
+        level = min(level, float(np.percentile(levels[among], 75)))
     if level <= needed:
         text = (
             f"a line of {smooth} points lies on the board, but at {level:.0f} DN it is not clearly brighter than the "
@@ -181,6 +186,12 @@ def _white(plane: NDArray[np.float32], view: BoardView) -> float:
     """What the board's white is in a plane, in DN."""
     low, high = np.clip(view.pixels.min(axis=0), 0, None).astype(int), view.pixels.max(axis=0).astype(int) + 1
     return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
+
+
+def _among(view: BoardView, pixels: Array) -> NDArray[np.bool_]:
+    """Which of the points (n, 2) lie among the board's own points."""
+    hull = cv2.convexHull(view.pixels.astype(np.float32))
+    return np.array([cv2.pointPolygonTest(hull, (float(x), float(y)), False) > 0 for x, y in pixels], dtype=np.bool_)
 
 
 def calmest(path: Path, offs: Sequence[Path], view: BoardView) -> Path:

@@ -38,9 +38,7 @@ class Bend:
 
 def bend_of(adjustment: Adjustment, state: State) -> Bend:
     """The bend that the dots speak of, at the solution of an adjustment to pictures alone, lens and poses free."""
-    whole = max((v.points for v in adjustment.views), key=len)
-    middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
-    half = 0.5 * float(np.linalg.norm(np.ptp(whole, axis=0)))
+    whole, middle, half = _whole(adjustment)
     lens = np.flatnonzero(adjustment.free[CAMERA])
     lens_rows, lens_right = adjustment.lens_prior(state)
     size = len(lens) + SHAPES
@@ -86,6 +84,49 @@ def bend_of(adjustment: Adjustment, state: State) -> Bend:
     size_m = float(heights[high] - heights[low])
     certain = float(gain.sum() / max(np.sqrt(count) * gain.std(ddof=1), 1e-9))
     return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera)
+
+
+def moved_by_bend(adjustment: Adjustment, state: State) -> Array:
+    """What the shared parameters (27,) would move if the board might be bent, at a solution with the arm's poses.
+
+    One step from there, with what is free in the adjustment and the three shapes; what is held does not move.
+    """
+    _, middle, half = _whole(adjustment)
+    free = np.flatnonzero(adjustment.free)
+    lens_rows, lens_right = adjustment.lens_prior(state)
+    size = len(free) + SHAPES
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    information[: len(free), : len(free)] = (lens_rows.T @ lens_rows)[np.ix_(free, free)]
+    gradient[: len(free)] = (lens_rows.T @ lens_right)[free]
+    for k, view in enumerate(adjustment.views):
+        own_rows, own_right = adjustment.arm_prior(k, state)
+        parts = [
+            ("arm", own_rows, own_right),
+            *((n, rows, right) for n, rows, right, _ in adjustment.rows_of(k, state)),
+        ]
+        stacked = []
+        for name, rows, right in parts:
+            bent = np.zeros((len(rows), SHAPES))
+            if name == "dots":
+                height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
+                bent = height[:, None] * np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
+            stacked.append(np.column_stack([rows[:, free], bent, right, rows[:, FLANGE]]))
+        every = np.vstack(stacked)
+        pose = np.linalg.qr(every[:, -6:])[0]
+        wanted = every[:, :-6] - pose @ (pose.T @ every[:, :-6])
+        information += wanted[:, :-1].T @ wanted[:, :-1]
+        gradient += wanted[:, :-1].T @ wanted[:, -1]
+    unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    found = unit * np.linalg.lstsq(information * unit[:, None] * unit, unit * gradient, rcond=1e-12)[0]
+    moved = np.zeros(len(adjustment.free))
+    moved[free] = found[: len(free)]
+    return moved
+
+
+def _whole(adjustment: Adjustment) -> tuple[Array, Array, float]:
+    """The points (n, 3) of the view that shows most of the board, their middle, and half their diagonal."""
+    whole = max((v.points for v in adjustment.views), key=len)
+    return whole, 0.5 * (whole.min(axis=0) + whole.max(axis=0)), 0.5 * float(np.linalg.norm(np.ptp(whole, axis=0)))
 
 
 def surface_shapes(at: Array) -> Array:

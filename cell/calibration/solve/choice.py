@@ -92,6 +92,12 @@ class Choice:
     tried: list[Solution]
     arm: tuple[float, float]
 
+    @property
+    def with_arm(self) -> Solution | None:
+        """The best of those whose camera was adjusted with the arm; None where none was tried."""
+        adjusted = [s for s in self.tried if s.camera_free]
+        return self.best if self.best.camera_free else min(adjusted, key=lambda s: s.figure(), default=None)
+
 
 def choose_solution(
     observations: Sequence[ScanObservation], staged: Staged, pictures: Intrinsics, camera_may_move: bool = True
@@ -132,6 +138,25 @@ def choose_solution(
     )
     sound = [closed, *(s for s in tried if not _bent(s, pictures))]
     return Choice(min(sound, key=_handicapped), closed, [closed, *tried], arm)
+
+
+def with_doubt_of_camera(choice: Choice, pictures: Intrinsics) -> tuple[Choice, Intrinsics]:
+    """The same where the pictures' camera is kept and the arm clearly says another one: with a deviation for that.
+
+    Which of both is right is not known; half of what parts them is added to the camera's deviation, and everything
+    else follows.
+    """
+    other = choice.with_arm
+    if other is None or choice.best.camera_free:
+        return choice, pictures
+    apart = other.adjusted.state.camera.parameters - pictures.camera.parameters
+    # Both follow the same pictures: the larger deviation is what they may differ by.
+    if not np.any(np.abs(apart[:4]) > BENT_SIGMAS * np.maximum(pictures.sigma[:4], other.sigma[CAMERA][:4])):
+        return choice, pictures
+    covariance = pictures.covariance + 0.25 * np.outer(apart, apart)
+    doubted = replace(pictures, covariance=covariance, sigma=np.hypot(pictures.sigma, 0.5 * apart))
+    best, closed = (replace(s, pictures=covariance) for s in (choice.best, choice.closed))
+    return replace(choice, best=best, closed=closed), doubted
 
 
 def _or_last(solution: Solution) -> float:

@@ -81,10 +81,9 @@ def _closed_against(choice: Choice, reach: float) -> Check:
 
 def _camera_against(choice: Choice, pictures: Intrinsics) -> list[Check]:
     """The camera that the arm would have, against that of the pictures."""
-    adjusted = [s for s in choice.tried if s.camera_free]
-    if not adjusted or not pictures.sigma[:4].all():
+    nearest = choice.with_arm
+    if nearest is None or not pictures.sigma[:4].all():
         return []
-    nearest = choice.best if choice.best.camera_free else min(adjusted, key=lambda s: s.figure())
     camera = nearest.adjusted.state.camera.parameters[:4]
     apart = np.abs(camera - pictures.camera.parameters[:4]) / pictures.sigma[:4]
     worst = int(np.argmax(apart))

@@ -168,15 +168,28 @@ def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
     return Check(
         "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
         f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
-        "points are not those of one plane; are there two lines, something else that shines, or a stripe that is of "
-        "another frame?",
+        "points are not those of one plane; are there two lines, something else that shines, a stripe that is of "
+        "another frame, or a laser that came on while the rows of a rolling shutter were exposed?",
     )  # fmt: skip
 
 
-def plane_checks(rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown) -> list[Check]:
-    """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters."""
+def plane_checks(
+    rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown, left_out: int = 0
+) -> list[Check]:
+    """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters.
+
+    `left_out` stripes, beside those of the `frames`, are of no line in it.
+    """
     reach = float(np.median(cloud[:, 2]))
     made = [plane_fit_check(rms, own, cloud)]
+    if left_out:
+        made.append(
+            Check(
+                "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, 40.0, "%",
+                f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the laser "
+                "or the camera moved in between, or are there several lines? Calibrate each part by itself",
+            )
+        )  # fmt: skip
     if frames < LEAST_CHECKED:
         made.append(
             Check(

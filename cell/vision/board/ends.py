@@ -54,8 +54,12 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
                 continue
             seen += 1
             darker = rim - middle > 0.4 * step
+            beside = np.argsort(np.abs(around @ outward))[:2]
             if darker.all():
                 further += 1
+            elif not darker[beside].any() and np.isfinite(rim[beside]).all():
+                # A line round the board goes on to both sides, which no dot does.
+                ends += 1
             elif near_side - dark > 0.6 * step or (np.isfinite(rim).all() and darker.sum() < 6):
                 ends += 1
         if further >= MOST_BEYOND:

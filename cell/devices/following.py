@@ -1,0 +1,231 @@
+"""Tells a simulated world what the real devices of the same cell do, as they measure themselves.
+
+One thread a device, each reading only. Readings go with the host time at which they held; the world waits with a
+picture until it has them. So the way of a reading to the world delays pictures and does not spoil them.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Collection
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config import CellConfig
+from cell.devices.built_in import OnArm
+from cell.devices.devices import Devices
+from cell.devices.feeds import AT_REST_S, PERIOD_S, ArmFeed, Feed, RailFeed, SwitchFeed, VehicleFeed
+from cell.devices.world_link import WorldLink
+from drivers.errors import CellError, DeviceFault
+from drivers.interfaces import ArmState, Vector
+
+LATEST_S = 0.25
+"""Wall seconds after which, at the 99th percentile, a reading is in the world: pictures wait that long."""
+TRIAL_S = 1.0
+LOOK_S = 0.5
+"""Wall seconds between two looks whether the world made all its pictures."""
+MOST_SCATTER = 3.0
+"""Times a rail position's stated deviation that the readings of a sweep, which its pictures follow, may scatter."""
+_KEPT = 30_000
+
+log = logging.getLogger(__name__)
+
+
+class Following:
+    """The real devices `followed` of a cell, told to the world that has the devices `simulated`."""
+
+    def __init__(
+        self,
+        link: WorldLink,
+        devices: Devices,
+        config: CellConfig,
+        followed: Collection[str],
+        simulated: tuple[str, ...],
+    ) -> None:
+        """Begin. Raises `DeviceFault` when the world does not answer, or when readings reach it too late."""
+        self.simulated = simulated
+        self._link, self._devices, self._clock = link, devices, devices.clock
+        self._closed = threading.Event()
+        self._ahead = self._compare_clocks()
+        self._wrenches: deque[tuple[float, Vector]] = deque(maxlen=_KEPT)
+        self._felt = threading.Condition()
+        feeds: dict[str, Callable[[], Feed]] = {
+            "arm": lambda: self._arm,
+            "rail": lambda: RailFeed(devices),
+            "vehicle": lambda: VehicleFeed(devices),
+            "laser": lambda: SwitchFeed(devices, lambda: devices.laser.is_on),
+            "claw": lambda: SwitchFeed(devices, lambda: devices.claw.holding),
+        }
+        if "arm" in followed:
+            self._arm = ArmFeed(devices)
+            table = devices.arm.link_table()
+            rows = (
+                None
+                if table is None
+                else [list(row) for row in zip(table.a, table.d, table.alpha, table.theta, strict=True)]
+            )
+            switched = (config.laser, "laser"), (config.claw, "claw")
+            bits = sum(
+                1 << record.output for record, name in switched if isinstance(record, OnArm) and name not in simulated
+            )
+            self._link.ask(op="begin", table=rows, outputs=bits)
+        self._threads = [
+            threading.Thread(target=self._feed, args=(name, feeds[name]()), name=f"following {name}", daemon=True)
+            for name in followed
+        ]
+        self._threads.append(threading.Thread(target=self._say_why_not, name="following pictures", daemon=True))
+        for thread in self._threads:
+            thread.start()
+        try:
+            self._require_in_time()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Tell no more; idempotent. Before the devices are closed."""
+        self._closed.set()
+        for thread in self._threads:
+            thread.join(2.0)
+
+    def figures(self) -> dict[str, Any]:
+        """How late readings reach the world, for report and screen: see docs/report.md."""
+        told: dict[str, Any] = self._link.ask(op="figures")["figures"]
+        return {**told, "clocks_known_ms": round(1e3 * self._clocks_known, 4)}
+
+    def board_seen(self, base_from_board: pin.SE3) -> None:
+        """A real target camera has measured the station's board: the world's station is put there.
+
+        Nothing is done while the target camera, or the vehicle, is simulated: it sees that world's board already.
+        """
+        if "target_camera" not in self.simulated and "vehicle" not in self.simulated:
+            self._link.ask(op="board", base_from_board=base_from_board.homogeneous.tolist())
+
+    def require_paired(self, scatter: float, allowed: float) -> None:
+        """The pictures of a sweep were made at the rail's readings, each of which is off by `scatter` m (95 %).
+
+        Raises `DeviceFault` (sim.scattered) when that is more than `allowed`. Where rail and scan camera are both real,
+        or both simulated, nothing is followed.
+        """
+        if "rail" not in self.simulated and "scan_camera" in self.simulated and scatter > allowed:
+            raise DeviceFault(
+                "rail",
+                "sim.scattered",
+                f"the pictures of the simulated scan camera follow the rail's readings, which lie {1e3 * scatter:.3f} "
+                f"mm off its motion (95 %; allowed {1e3 * allowed:.3f} mm): the pictures would show another surface",
+                recoverable=True,
+                hint="Sweep more slowly, use a faster line to the rail, or end programs that keep this computer busy.",
+            )
+
+    # --- what the simulated part would touch ---
+
+    def wrench(self) -> Vector:
+        """The newest wrench (6,) on the flange, base axes, of the simulated part on the simulated surface."""
+        with self._felt:
+            return self._wrenches[-1][1] if self._wrenches else np.zeros(6)
+
+    def wrenches_at(self, states: list[ArmState]) -> list[Vector]:
+        """The same at each of these states, once it is known; DeviceFault (sim.late) when it does not come."""
+        if not states:
+            return []
+        times = [self._arm.time(state) for state in states]
+        with self._felt:
+            if not self._felt.wait_for(lambda: self._wrenches and self._wrenches[-1][0] >= times[-1] - 1e-3, 2.0):
+                raise self._late("what the simulated part touches is not told any more")
+            rows = list(self._wrenches)
+        known = np.array([row[0] for row in rows])
+        columns = np.array([row[1] for row in rows]).T
+        return list(np.column_stack([np.interp(times, known, column) for column in columns]))
+
+    def next_wrench(self) -> Vector:
+        """Wait a little for the next one."""
+        with self._felt:
+            self._felt.wait(0.05)
+        return self.wrench()
+
+    # --- inside ---
+
+    def _compare_clocks(self) -> float:
+        """World time less host time, s: both run on this computer's clock, so once is enough."""
+        best: tuple[float, float] | None = None
+        for _ in range(30):
+            before = self._clock.now()
+            world = float(self._link.ask(op="time")["time"])
+            after = self._clock.now()
+            if best is None or after - before < best[0]:
+                best = after - before, world - 0.5 * (before + after)
+        assert best is not None
+        self._clocks_known = self._clock.wall(0.5 * best[0])
+        return best[1]
+
+    def _require_in_time(self) -> None:
+        """Watch for a moment; `DeviceFault` (sim.late) when a device is not told of, or too late."""
+        self._closed.wait(TRIAL_S)
+        for name, row in self.figures()["devices"].items():
+            if row["latency_ms"] is None:
+                raise self._late(f"nothing is told of the {name} for {TRIAL_S:g} s")
+            if row["latency_ms"]["p99"] > 1e3 * LATEST_S:
+                raise self._late(
+                    f"what the {name} does reaches the simulated world after {row['latency_ms']['p99']:.0f} ms (99 %; "
+                    f"allowed {1e3 * LATEST_S:.0f} ms)"
+                )
+
+    def _late(self, text: str) -> DeviceFault:
+        return DeviceFault(
+            "simulated world", "sim.late", text, recoverable=True,
+            hint="End programs that keep this computer busy, then open the cell again.",
+        )  # fmt: skip
+
+    def _feed(self, name: str, feed: Feed) -> None:
+        """Until closed; a device that does not answer for a while leaves a gap, in which there are no pictures."""
+        said = ""
+        try:
+            link = WorldLink(self._link.address)
+        except CellError as error:
+            log.warning("%s", error)
+            return
+        try:
+            while not self._closed.wait(0.05):
+                try:
+                    self._tell_all(link, name, feed)
+                except CellError as error:
+                    if getattr(error, "code", "") == "sim.lost":
+                        log.warning("%s", error)
+                        return
+                    if str(error) != said:
+                        log.info("following waits: %s", error)
+                    said = str(error)
+        finally:
+            link.close()
+
+    def _tell_all(self, link: WorldLink, name: str, feed: Feed) -> None:
+        period = AT_REST_S if name == "vehicle" else PERIOD_S
+        with feed.open() as newest:
+            while not self._closed.wait(period):
+                if not (rows := newest()):
+                    continue
+                told = [[row[0] + self._ahead, *row[1:]] for row in rows]
+                wrenches = link.ask(op="tell", device=name, rows=told)["wrenches"]
+                if name == "arm":
+                    with self._felt:
+                        self._wrenches.extend((row[0], np.array(w)) for row, w in zip(rows, wrenches, strict=True))
+                        self._felt.notify_all()
+                if name == "rail" and len(rows) == 1:
+                    # It rests.
+                    self._closed.wait(AT_REST_S - PERIOD_S)
+
+    def _say_why_not(self) -> None:
+        """A picture that was not made is a frame that does not come: the log says why."""
+        told = 0
+        while not self._closed.wait(LOOK_S):
+            try:
+                figures = self._link.ask(op="figures")["figures"]
+            except CellError:
+                return
+            if figures["not_made"] > told:
+                log.warning("the simulated world made no picture: %s", figures["why_not"])
+            told = figures["not_made"]
