@@ -11,6 +11,7 @@ from cell.config import (
     Confirm,
     beside,
     config_to_open,
+    load_config,
     require_real_addresses,
 )
 from cell.devices.assembly import connect, connected_for
@@ -36,6 +37,7 @@ def open_devices(
     confirm: Confirm | None,
     only: Collection[str],
     clock: str,
+    truth: str | Path | None = None,
 ) -> Opened:
     """Connect as `Cell.open` says, and raise what it says. What is to be undone if the rest fails goes to `undo`."""
     if clock not in ("wall", "virtual"):
@@ -46,16 +48,19 @@ def open_devices(
     if clock == "virtual" and (not whole or speed is not None):
         wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'
         raise ConfigError(f'clock="virtual": {wrong}; leave that out')
+    if truth is not None and not whole:
+        raise ConfigError("truth describes a cell that is all simulated; leave it out where devices are real")
     path, loaded = config_to_open(given, simulated=whole, confirm=confirm)
     # So that whatever keeps the configuration keeps what was simulated.
     loaded = loaded.model_copy(update={"cell": loaded.cell.model_copy(update={"sim": names})})
     folder = beside(path)
+    true = loaded if truth is None else load_config(Path(truth))
     # The world takes long to load, and real devices have none; over wires it is in another process.
     if clock == "virtual":
         from cell.devices.described import Described
         from cell.devices.direct import VirtualCell
 
-        virtual = VirtualCell(loaded, seed, level, Described.of(job))
+        virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
     needed = connected_for(loaded, only)
     world: SimulatedCell | None = None
@@ -63,7 +68,7 @@ def open_devices(
         from cell.devices.described import Described
 
         world = SimulatedCell(
-            loaded, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
+            true, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
         )
         undo.callback(world.close)
         loaded = with_endpoints(loaded, world.endpoints)

@@ -95,6 +95,7 @@ class Cell:
         confirm: Confirm | None = None,
         only: Collection[str] = tuple(DEVICES),
         clock: str = "wall",
+        truth: str | Path | None = None,
     ) -> Cell:
         """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
 
@@ -110,6 +111,9 @@ class Cell:
         over the devices' real protocols, and runs `speed` times as fast as the wall (three times unless told
         otherwise). With `clock="virtual"` its models are in this process behind the devices' interfaces, without wires
         and without waiting: the same seed then takes the same course, to the byte.
+
+        `truth` is another configuration, by which the simulated cell is built while the product works with `config`: a
+        cell that is not as it was written down.
 
         Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
         with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
@@ -129,6 +133,7 @@ class Cell:
                 confirm=confirm,
                 only=only,
                 clock=clock,
+                truth=truth,
             )
             cell = cls(made.config, made.folder, made.lock, made.devices, made.simulated)
             undo.pop_all()

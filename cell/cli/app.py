@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import calibrate, devices, export, new_job, run, runs, setup, sim
+from cell.cli import calibrate, commission, devices, export, new_job, run, runs, setup, sim
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
@@ -46,16 +46,8 @@ def _cell(
     console_log(verbose)
 
 
-for register in (
-    run.register,
-    runs.register,
-    export.register,
-    calibrate.register,
-    devices.register,
-    setup.register,
-    new_job.register,
-):
-    register(app)
+for group in (run, runs, export, calibrate, devices, commission, setup, new_job):
+    group.register(app)
 app.add_typer(sim.app, name="sim")
 
 

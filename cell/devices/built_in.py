@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import model_validator
+from pydantic import StrictBool, model_validator
 
 from cell.addresses import Endpoint, Host, Port
 from cell.device_config import (
@@ -65,6 +65,7 @@ class TmclRailConfig(RailConfig):
     microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
     baud: Annotated[int, whole(9600, 1_000_000, *BAUDS)] = 9600
     reference_mode: Annotated[int, whole(1, 255, *REFERENCE_MODES, meaning=MODES_TOLD)] = 5
+    reversed: StrictBool = False
 
     @model_validator(mode="after")
     def _countable(self) -> Self:
@@ -162,6 +163,7 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
         motor=config.motor,
         baud=config.baud,
         reference_mode=config.reference_mode,
+        reversed=config.reversed,
         control=not around.look,
         clock=around.clock,
     )
@@ -244,7 +246,7 @@ def _with(*keys: str) -> Callable[[Record, Mapping[str, Any]], Record]:
 BUILT_IN: tuple[AnyMake, ...] = (
     Make(
         "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
-        calibrated_since=frozenset(("reference_mode",)), simulated=_with("url"),
+        calibrated_since=frozenset(("reference_mode", "reversed")), simulated=_with("url"),
     ),
     Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),

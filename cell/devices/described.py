@@ -80,9 +80,10 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
     return drawn.CellDrawing(
         arm=arm.model,
         payload=arm.payload,
+        payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=_turning_track(config.vehicle),
-        rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin)),
+        rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin), reverses(rail)),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,
@@ -98,6 +99,11 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         wires=_vehicle(config.vehicle)
         | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
     )
+
+
+def reverses(rail: RailConfig) -> bool:
+    """Whether the configuration has the drive turn its motor the other way round."""
+    return isinstance(rail, TmclRailConfig) and rail.reversed
 
 
 def _steps(rail: RailConfig) -> int:

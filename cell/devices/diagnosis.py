@@ -137,10 +137,11 @@ def _open_and_ask(name: str, address: str, build: Callable[[], Any], clock: Cloc
         device = build()
     except CellError as error:
         return Diagnosis(name, False, address, state=str(error)), None
-    return _ask(name, address, device, clock), device
+    return ask(name, address, device, clock), device
 
 
-def _ask(name: str, address: str, device: Device, clock: Clock) -> Diagnosis:
+def ask(name: str, address: str, device: Device, clock: Clock) -> Diagnosis:
+    """The row of a device that is connected; not behind a gate."""
     row = Diagnosis(name, False, address)
     try:
         identity = device.identity()

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from cell.config import DEVICES, CellConfig
 from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.built_in import TmclRailConfig
-from cell.devices.described import Described
+from cell.devices.described import Described, reverses
 from cell.devices.devices import Devices
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.vehicle_makes import CanopenVehicleConfig
@@ -40,18 +42,28 @@ class VirtualCell(DirectCell):
     """The cell of one seed and level, and its devices behind the gate as the product takes them."""
 
     def __init__(
-        self, config: CellConfig, seed: int, level: str = "nominal", described: Described | None = None
+        self,
+        config: CellConfig,
+        seed: int,
+        level: str = "nominal",
+        described: Described | None = None,
+        truth: CellConfig | None = None,
     ) -> None:
         """As configuration and job describe it; without one the job is `pot`.
+
+        With `truth` the world is the cell of that configuration, and the product works on it with `config`.
 
         Raises `ConfigError` for an unknown level, and for what cannot be simulated as it is described.
         """
         self._config = config
-        drawing = (described or Described.of("pot")).drawing(config)
+        self._truth = truth or config
+        drawing = (described or Described.of("pot")).drawing(self._truth)
         try:
             super().__init__(setup_of(config), seed, level, drawing)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        # The arm's installation is right; a configuration may tell it otherwise.
+        self.arm.set_payload(config.arm.payload, np.array(config.arm.payload_centre))
         self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
@@ -77,7 +89,7 @@ class VirtualCell(DirectCell):
 
     def make_ready(self, described: Described) -> None:
         """See `cell.devices.simulated.Simulation`."""
-        station = described.drawing(self._config).station
+        station = described.drawing(self._truth).station
         try:
             self.world.make_ready(station)
         except ValueError as error:
@@ -109,6 +121,7 @@ def setup_of(config: CellConfig) -> Setup:
             rail.travel,
             rail.max_speed,
             rail.acceleration,
+            reverses(rail),
             EvenMotion.of,
             _serial(rail),
         ),

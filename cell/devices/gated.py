@@ -14,13 +14,14 @@ from cell.devices.contact import GuardedMotion
 from cell.devices.gate import Gate, Gated
 from cell.devices.interlocks import Command
 from drivers.clock_map import Latch
-from drivers.errors import CellError
+from drivers.errors import CellError, InterlockError
 from drivers.interfaces import (
     Arm,
     ArmMotion,
     ArmState,
     Claw,
     Motion,
+    Nudged,
     Rail,
     RailState,
     Sweep,
@@ -170,6 +171,14 @@ class GatedRail(Gated[Rail]):
         """See `Rail.move_to`."""
         command = Command("rail", "move_to", {"position": position})
         return self._begin(command, lambda: self.bare.move_to(position, speed))
+
+    def nudge(self, distance: float, speed: float) -> Motion:
+        """See `Nudged.nudge`; `InterlockError` for a rail that does not offer it."""
+        bare = self.bare
+        if not isinstance(bare, Nudged):
+            raise InterlockError(self.name, "this make of rail moves only when it is homed; home it first")
+        command = Command("rail", "nudge", {"distance": distance})
+        return self.gate.begin(command, lambda: bare.nudge(distance, speed), self.bare.stop)
 
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """See `Rail.sweep`."""

@@ -264,8 +264,8 @@ RULES = (
     Rule(
         "after_a_stop",
         (*MOVES, "arm.recover", "arm.zero_force", "arm.set_payload", "arm.set_digital_output", "rail.home",
-         "rail.move_to", "rail.sweep", "vehicle.enable", "vehicle.recover", "vehicle.drive", "laser.lit", "claw.grip",
-         "claw.release"),
+         "rail.move_to", "rail.nudge", "rail.sweep", "vehicle.enable", "vehicle.recover", "vehicle.drive", "laser.lit",
+         "claw.grip", "claw.release"),
         "it belongs to a run that began later, or a person has said `Cell.clear_stop(by)`; work that was going on "
         "begins nothing more; the laser's output may be switched off",
         None,

@@ -151,6 +151,7 @@ class JobRun:
                 folder,
                 whereabouts,
                 self.earlier,
+                needs_part=self.kind.places,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),

@@ -193,7 +193,7 @@ def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, re
 def _at(here: Workplace, context: StepContext) -> Arrival:
     """The arm to its looking pose first, with the vehicle braked."""
     context.progress(0.0, "arm to the looking pose")
-    if not here.devices.claw.holding:
+    if here.needs_part and not here.devices.claw.holding:
         raise RefusedError(
             f"the claw holds no part: put the part of job {here.job.job.name} into it, or see whether it was "
             "placed already"

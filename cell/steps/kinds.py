@@ -42,10 +42,14 @@ class Kind:
         """The names of its steps, in their order."""
         return tuple(step.name for step in self.steps)
 
+    @property
+    def places(self) -> bool:
+        """Whether one of its steps places a part."""
+        return any(issubclass(step.makes, place.PlaceResult) for step in self.steps)
+
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
-        places = any(issubclass(step.makes, place.PlaceResult) for step in self.steps)
-        return Sequence(self.names, State.PLACED if places else State.DONE)
+        return Sequence(self.names, State.PLACED if self.places else State.DONE)
 
     def policy(self, *, simulated_person: bool = False) -> Policy:
         """How each step is watched."""

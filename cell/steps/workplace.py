@@ -36,7 +36,8 @@ PHOTO_RATE_HZ = 10.0
 class Workplace:
     """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
 
-    `whereabouts` is kept over retries and runs: the vehicle may stand anywhere when a step is done again.
+    `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `whereabouts` is
+    kept over retries and runs: the vehicle may stand anywhere when a step is done again.
     """
 
     config: CellConfig
@@ -48,6 +49,7 @@ class Workplace:
     folder: Path
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
+    needs_part: bool = True
     part: PartProgress = field(default_factory=PartProgress)
     _photographs: int = field(default=0, init=False)
 

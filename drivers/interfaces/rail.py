@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from drivers.interfaces.device import Device, Motion, Vector
 
@@ -51,6 +51,21 @@ class Sweep(Motion, Protocol):
     @property
     def unevenness(self) -> float:
         """Median distance in m of the readings from an even motion, beyond what their round trips explain."""
+
+
+LONGEST_NUDGE_M = 0.010
+"""How far a rail is moved at most whose zero nobody knows."""
+
+
+@runtime_checkable
+class Nudged(Protocol):
+    """What a rail may offer besides `Rail`: a small motion before its zero is known."""
+
+    def nudge(self, distance: float, speed: float) -> Motion:
+        """Move by `distance` m, at most `LONGEST_NUDGE_M` either way, at `speed` m/s, homed or not.
+
+        No travel bounds it, only the limit switches: it is for finding out which way and how far the rail really goes.
+        """
 
 
 class Rail(Device, Protocol):

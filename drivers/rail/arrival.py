@@ -21,8 +21,8 @@ class Arrival:
     """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
 
     `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
-    it does not. Called again and again: True at the target; raises `Aborted` after a stop and `DeviceFault` for
-    rail.reset, rail.limit_switch, rail.missed_target and rail.stalled.
+    it does not; None for a motion that needs none. Called again and again: True at the target; raises
+    `Aborted` after a stop and `DeviceFault` for rail.reset, rail.limit_switch, rail.missed_target and rail.stalled.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Arrival:
         counts: float,
         issued: int,
         samples: Samples,
-        zero: ZeroMark,
+        zero: ZeroMark | None,
     ) -> None:
         self._link = link
         self._target = target
@@ -54,7 +54,7 @@ class Arrival:
             raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
         if position == self._target and self._link.get(Axis.POSITION_REACHED):
             # A module that was reset stands at its target, too, if that is 0.
-            self._zero.require_still()
+            self._require_zero()
             return True
         if position != self._last:
             self._last, self._moved = position, stamp
@@ -64,13 +64,13 @@ class Arrival:
 
     def _failure(self, position: int) -> DeviceFault:
         link = self._link
-        self._zero.require_still()
+        self._require_zero()
         short = (
             f"stands at {shown(position / self._counts, 'm')}, its target is {shown(self._target / self._counts, 'm')}"
         )
         side, switch = ("right", Axis.RIGHT_SWITCH) if self._target > position else ("left", Axis.LEFT_SWITCH)
         if link.get(switch):
-            self._zero.forget()
+            self._forget_zero()
             return DeviceFault(
                 link.name,
                 "rail.limit_switch",
@@ -86,7 +86,7 @@ class Arrival:
                 recoverable=True,
                 hint="See what else commands this module.",
             )
-        self._zero.forget()
+        self._forget_zero()
         flags = link.get(Axis.DRIVER_ERRORS)
         reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]
         if link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG:
@@ -98,3 +98,11 @@ class Arrival:
             recoverable=True,
             hint="See whether the carriage is blocked and the motor has current, then home again.",
         )
+
+    def _require_zero(self) -> None:
+        if self._zero is not None:
+            self._zero.require_still()
+
+    def _forget_zero(self) -> None:
+        if self._zero is not None:
+            self._zero.forget()

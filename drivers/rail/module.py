@@ -96,6 +96,20 @@ def set_ramp(link: TmclLink, acceleration: int) -> None:
     _if_there(link, Axis.STOP_VELOCITY, STOP_SPEED, SPEED)
 
 
+def set_direction(link: TmclLink, reverse: bool) -> None:
+    """Which way the motor turns for a growing position. `ConfigError` for a module that cannot turn it round."""
+    try:
+        set_checked(link, Axis.REVERSE_SHAFT, int(reverse), EXACT)
+    except CommandRefused as refused:
+        if refused.status not in (NO_SUCH_TYPE, WRONG_VALUE):
+            raise
+        if reverse:
+            raise ConfigError(
+                f"{link.name}: this module cannot reverse its motor (axis parameter {int(Axis.REVERSE_SHAFT)}): swap "
+                "the two wires of one of the motor's coils, and write reversed = false"
+            ) from refused
+
+
 def _if_there(link: TmclLink, axis: Axis, value: int, rounding: Rounding) -> None:
     try:
         set_checked(link, axis, value, rounding)

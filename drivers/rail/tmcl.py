@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError
-from drivers.interfaces import Identity, RailState, Reading
+from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Reading
+from drivers.quantities import check_range
 from drivers.rail import health
 from drivers.rail.arrival import Arrival
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_ramp
+from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
+from drivers.rail.motion import RailMotion, move_duration
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import ZeroMark
@@ -23,7 +25,8 @@ class TmclRail(RailAxis):
 
     `lead` in m per turn, `travel` (low, high) in m, `max_speed` in m/s, `acceleration` in m/s²; `microsteps` per full
     step, a power of two up to 256. `reference_mode` is the module's axis parameter 193 (5: home switch in negative
-    direction, turning round at the left limit switch). The module's serial number, if any, is its user variable 0.
+    direction, turning round at the left limit switch). `reversed` turns the motor the other way round for a growing
+    position (axis parameter 251). The module's serial number, if any, is its user variable 0.
     Every setting is read back; `DeviceFault` (rail.setting) when the module keeps another.
     A module that was homed under the same settings, and not reset since, stays homed.
 
@@ -50,6 +53,7 @@ class TmclRail(RailAxis):
         clock: Clock,
         baud: int = 9600,
         reference_mode: int = 5,
+        reversed: bool = False,
         control: bool = True,
     ) -> None:
         for what, value in {"lead": lead, "steps per turn": steps_per_turn}.items():
@@ -68,10 +72,11 @@ class TmclRail(RailAxis):
         )
         self._microsteps = microsteps
         self._reference_mode = reference_mode
+        self._reversed = reversed
         self._link: TmclLink = TmclLink(
             name, url, address=address, motor=motor, baud=baud, clock=clock, statistics=self.statistics
         )
-        self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode))
+        self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode, reversed))
         try:
             require_supported(name, self._link.firmware())
             self._zero.meet(microsteps.bit_length() - 1, reference_mode, mark=control)
@@ -124,6 +129,27 @@ class TmclRail(RailAxis):
     def _require_zero(self) -> None:
         self._zero.require()
 
+    def nudge(self, distance: float, speed: float) -> RailMotion:
+        """Move by `distance` m, whether homed or not; see `drivers.interfaces.Nudged`."""
+        check_range(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
+        speed = self._checked_speed("speed", speed)
+        with self._starting:
+            issued = self._free()
+            here = self._link.get(Axis.POSITION)
+            target = here + round(distance * self._counts)
+            set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
+            self._link.move_to(target, issued=issued)
+            self._motion = RailMotion(
+                self.name,
+                self._clock,
+                arrived=Arrival(
+                    self._link, self._clock, target=target, counts=self._counts, issued=issued, samples=[], zero=None
+                ),
+                halt=self._halt(issued),
+                duration=move_duration(distance, speed, self._acceleration),
+            )
+            return self._motion
+
     def _begin_homing(self, issued: int) -> None:
         self._zero.searching(issued=issued)
         self._set_up()
@@ -155,6 +181,7 @@ class TmclRail(RailAxis):
 
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""
+        set_direction(self._link, self._reversed)
         set_checked(self._link, Axis.MICROSTEP_RESOLUTION, self._microsteps.bit_length() - 1, EXACT)
         set_ramp(self._link, self._pulses(self._acceleration))
         set_checked(self._link, Axis.REFERENCE_MODE, self._reference_mode, EXACT)

@@ -95,7 +95,8 @@ class ArmSetup:
 
 @dataclass(frozen=True)
 class RailSetup:
-    """How the rail is driven: m, m/s, m/s²; `even` fits a sweep from times, positions and round trips (n,) each.
+    """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round; `even` fits a sweep from times,
+    positions and round trips (n,) each.
 
     `serial` is the number by which the cell knows it; None where it tells its own.
     """
@@ -106,6 +107,7 @@ class RailSetup:
     travel: tuple[float, float]
     max_speed: float
     acceleration: float
+    reversed: bool
     even: Callable[[Vector, Vector, Vector], EvenMotion]
     serial: str | None = None
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from drivers.errors import DeviceFault, InterlockError
-from drivers.interfaces import Identity, LinkStatistics, RailState
+from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import RailSetup, within
 from sim_backends.direct.rail_motion import POLL_S, DirectSweep, RailMove
@@ -103,6 +103,16 @@ class DirectRail:
         self._motion = RailMove(self, self._start(position, speed))
         return self._motion
 
+    def nudge(self, distance: float, speed: float) -> RailMove:
+        """Move by `distance` m, whether homed or not."""
+        within(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
+        self._require_free()
+        now = self.clock.now()
+        target = self.model.position(now) + round(distance * self._counts)
+        self._send(target, self._checked(speed))
+        self._motion = RailMove(self, target)
+        return self._motion
+
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """Where the rail has to stand before `sweep`."""
         return self._ends(start, stop, speed)[0]
@@ -172,6 +182,7 @@ class DirectRail:
             dataclasses.replace(
                 self.model.settings,
                 microsteps=setup.microsteps.bit_length() - 1,
+                reverse_shaft=setup.reversed,
                 max_acceleration=self._pulses(setup.acceleration),
                 search_mode=_HOME_SWITCH_MODE,
                 search_speed=self._pulses(0.5 * setup.max_speed),
@@ -198,10 +209,14 @@ class DirectRail:
             raise self.reset_fault("since its last motion")
         if not self._homed:
             raise InterlockError(self.name, "is not homed, so positions mean nothing yet. Call home() first")
-        now, target = self.clock.now(), round(position * self._counts)
+        target = round(position * self._counts)
+        self._send(target, speed)
+        return target
+
+    def _send(self, target: int, speed: float) -> None:
+        now = self.clock.now()
         self.model.configure(now, dataclasses.replace(self.model.settings, max_velocity=self._pulses(speed)))
         self.model.move_to(now, target)
-        return target
 
     def _require_free(self) -> None:
         if self._motion is not None and not self._motion.done:

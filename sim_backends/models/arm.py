@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.arm_joints import JointErrors
+from sim_backends.models.arm_joints import GRAVITY, JointErrors
 from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
 from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
 from sim_backends.models.arm_truth import TruePose
@@ -58,7 +58,7 @@ class ArmParams:
     per axis in m and rad; `force_noise` in N and N·m; `force_limit` in N is where a protective stop comes;
     `unlock_delay` in s is how long it cannot be unlocked. `memory` in rad is the joints' way over which the
     error of repeatability lasts (0: drawn at each rest); for `harmonics` and `compliance` see `JointErrors`; `carried`
-    in kg.
+    in kg, its centre of gravity in m in the flange frame.
     """
 
     dh: Matrix = field(default_factory=lambda: UR10E_DH.copy())
@@ -68,6 +68,7 @@ class ArmParams:
     harmonics: Matrix = field(default_factory=lambda: np.zeros((6, 4)))
     compliance: float = 0.0
     carried: float = 2.1
+    carried_centre: tuple[float, float, float] = (0.0, 0.0, 0.06)
     blend_time: float = 0.3
     joint_limit: float = 2 * math.pi
     speed_limits: Vector = field(default_factory=lambda: np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]))
@@ -104,7 +105,8 @@ class ArmModel:
         self.contact: Contact | None = None
         self.digital_outputs = 0
         self.digital_inputs = 0
-        self.payload = (0.0, np.zeros(3))
+        self.payload = (params.carried, np.array(params.carried_centre))
+        """What the controller was told that it carries; at power-on its installation's, which is right."""
         self.wrench = np.zeros(6)
         self.time = clock.now()
         self._speed_limits = (1.02 * params.speed_limits).tolist()
@@ -240,8 +242,11 @@ class ArmModel:
 
     @property
     def felt(self) -> Vector:
-        """Wrench (6,) as reported: at the flange in base axes, with noise, less the wrench taken as zero."""
-        return self.wrench - self._force_zero
+        """Wrench (6,) as reported: at the flange in base axes, with noise, less the wrench taken as zero.
+
+        The controller takes the weight away that it was told of; what it carries beyond that is felt.
+        """
+        return self.wrench + self._untold_weight() - self._force_zero
 
     def start(self, motion: Motion) -> None:
         """Begin `motion` in place of any other; one that begins from rest is preceded by a stop if need be."""
@@ -272,7 +277,7 @@ class ArmModel:
     def zero_force(self) -> None:
         """Take the present wrench as zero."""
         with self._lock:
-            self._force_zero = self.drive.wrench.copy()
+            self._force_zero = self.drive.wrench + self._untold_weight()
 
     def write_digital_outputs(self, mask: int, values: int) -> None:
         """Set the outputs named by the bits of `mask` to those of `values` (bits 0-7, 8-15 and 16-17)."""
@@ -312,6 +317,17 @@ class ArmModel:
             return True
 
     # --- physics ---
+
+    def _untold_weight(self) -> Vector:
+        """Wrench (6,) at the flange in base axes of the weight that the controller was not told of."""
+        mass, centre = self.payload
+        params = self.params
+        if mass == params.carried and tuple(centre) == params.carried_centre:
+            return np.zeros(6)
+        moment = params.carried * np.array(params.carried_centre) - mass * np.asarray(centre)
+        down = np.array([0.0, 0.0, -GRAVITY])
+        arm = self.reported_flange()[:3, :3] @ moment
+        return np.concatenate([(params.carried - mass) * down, np.cross(arm, down)])
 
     def _true_pose(self, table: Matrix) -> TruePose:
         """Where the flange of an arm truly is whose controller computes with `table` (6, 4)."""

@@ -64,13 +64,13 @@ class RailModel:
         """Step counter in microsteps."""
         with self._lock:
             leg = self._leg(t)
-            return round((leg.piece.at(max(t, leg.piece.t))[0] - leg.zero) * self._steps())
+            return round((leg.piece.at(max(t, leg.piece.t))[0] - leg.zero) * self._signed_steps())
 
     def velocity(self, t: float) -> int:
         """Present velocity in microsteps per second."""
         with self._lock:
             leg = self._leg(t)
-            return round(leg.piece.at(max(t, leg.piece.t))[1] * self._steps())
+            return round(leg.piece.at(max(t, leg.piece.t))[1] * self._signed_steps())
 
     def target(self) -> int:
         """Target of the last positioning in microsteps."""
@@ -127,7 +127,7 @@ class RailModel:
             x, v = self._begin(t)
             self._target, self._target_velocity, self._positioning = position, 0, True
             speed = self.settings.max_velocity / self._steps()
-            goal = self._zero + position / self._steps()
+            goal = self._zero + position / self._signed_steps()
             if speed == 0.0:
                 self._follow(ramp.to_velocity(t, x, v, 0.0, self._acceleration()))
             else:
@@ -138,13 +138,13 @@ class RailModel:
         with self._lock:
             x, v = self._begin(t)
             self._target_velocity, self._positioning = velocity, False
-            self._follow(ramp.to_velocity(t, x, v, velocity / self._steps(), self._acceleration()))
+            self._follow(ramp.to_velocity(t, x, v, velocity / self._signed_steps(), self._acceleration()))
 
     def set_position(self, t: float, position: int) -> None:
         """Call the present place `position` (microsteps) and stop there."""
         with self._lock:
             x, _ = self._begin(t)
-            self._zero = x - position / self._steps()
+            self._zero = x - position / self._signed_steps()
             self._target, self._target_velocity, self._positioning = position, 0, False
             self._follow(ramp.rest(t, x))
 
@@ -159,7 +159,7 @@ class RailModel:
         """Take new settings; a running positioning goes on under them, and the counter keeps its value."""
         with self._lock:
             old = self.settings
-            if settings.microsteps != old.microsteps:
+            if (settings.microsteps, settings.reverse_shaft) != (old.microsteps, old.reverse_shaft):
                 position = self.position(t)
                 self.settings = settings
                 self.set_position(t, position)
@@ -175,6 +175,9 @@ class RailModel:
             self._edge = float(self._rng.normal(0.0, self.params.repeatability)) if self.params.repeatability else 0.0
             self._target, self._target_velocity, self._positioning = 0, 0, False
             legs = ramp.to_velocity(t, x, v, 0.0, self._acceleration())
+            if self.backwards:
+                self._search_in_vain(legs)
+                return
             mode = self.settings.search_mode
             right = self._motor(self.params.switches[1], +1)
             if mode in (2, 3, 6):
@@ -197,8 +200,24 @@ class RailModel:
 
     # --- inside ---
 
+    @property
+    def backwards(self) -> bool:
+        """Whether the motor turns against what the controller counts."""
+        return self.params.reversed != self.settings.reverse_shaft
+
     def _steps(self) -> int:
         return self.params.steps_per_turn << self.settings.microsteps
+
+    def _signed_steps(self) -> int:
+        return -self._steps() if self.backwards else self._steps()
+
+    def _search_in_vain(self, legs: list[ramp.Piece]) -> None:
+        """Away from the switch that it looks for, up to the mechanical end, where it goes on searching."""
+        end = self.params.screw.motor(self.params.ends[1], +1)
+        start = legs[-1]
+        way = ramp.to_velocity(start.t, start.x, 0.0, self.settings.search_speed / self._steps(), self._acceleration())
+        pieces, self._stalled_at = ramp.clip(legs[:-1] + way, end, +1)
+        self._append(pieces, searching=True)
 
     def _acceleration(self) -> float:
         return max(1, self.settings.max_acceleration) / self._steps()
@@ -239,7 +258,8 @@ class RailModel:
         """Append a ramp, cut at the switches that are enabled and at the mechanical ends."""
         for direction, enabled in ((-1, self.settings.left_stop), (+1, self.settings.right_stop)):
             side = (direction + 1) // 2
-            if enabled:
+            # A limit switch stops the direction that the controller believes to lead to it.
+            if enabled and not self.backwards:
                 pieces = self._stop_at(pieces, self._motor(self.params.switches[side], direction), direction)
             end = self.params.screw.motor(self.params.ends[side], direction)
             pieces, stalled = ramp.clip(pieces, end, direction)

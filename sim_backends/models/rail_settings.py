@@ -19,6 +19,8 @@ class RailParams:
     ends: tuple[float, float] = (-0.004, 0.104)
     repeatability: float = 0.0
     start: float = 0.037
+    reversed: bool = False
+    """A coil of the motor is connected the other way round: it turns backwards."""
     serial: int = 1
     firmware: tuple[int, int] = (1, 12)
 
@@ -50,3 +52,4 @@ class RailSettings:
     left_stop: bool = True
     right_stop: bool = True
     soft_stop: bool = False
+    reverse_shaft: bool = False

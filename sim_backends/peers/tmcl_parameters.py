@@ -19,6 +19,7 @@ SETTINGS: dict[int, tuple[str, int, int]] = {
     193: ("search_mode", 1, 8),
     194: ("search_speed", 1, 7_999_774),
     195: ("switch_speed", 1, 7_999_774),
+    251: ("reverse_shaft", 0, 1),
 }
 """Axis parameters that set the motion: number → (setting, smallest, largest value)."""
 
@@ -41,7 +42,6 @@ PLAIN: dict[int, tuple[int, int, int]] = {
     181: (0, 0, 7_999_774),
     204: (0, 0, 65535),
     214: (200, 0, 65535),
-    251: (0, 0, 0),
     254: (0, 0, 0),
     255: (1, 1, 1),
 }

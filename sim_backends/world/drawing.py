@@ -36,12 +36,13 @@ class CameraDrawing:
 @dataclass(frozen=True, eq=False)
 class RailDrawing:
     """The rail: `lead` in m per turn, full `steps_per_turn`, usable `travel` in m, and where in it the carriage may
-    stand when the rail is switched on."""
+    stand when the rail is switched on. One that is `reversed` has a coil of its motor connected the other way round."""
 
     lead: float
     steps_per_turn: int
     travel: tuple[float, float]
     start: tuple[float, float]
+    reversed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +50,16 @@ class CellDrawing:
     """What a cell's configuration describes.
 
     `baseline` (m) and `tan_theta` are the laser's in the scan camera's frame; `witness` is flange_from_witness of the
-    plate on the claw, or None without one. `payload` in kg, `track` in m as the vehicle turns. Boards are named as in
-    `sim_backends.optics.scene.Board.parse`. Outputs and `grip_input` are numbers of the arm's connectors, None where
-    laser or claw hang on something else; `wires` says by device ("rail", "laser", "claw") what that is, as its peer
-    takes it, or what else than TMCL the rail speaks; "vehicle": what else than AgileX v2 it speaks, or that there is
-    none.
+    plate on the claw, or None without one. `payload` in kg with its centre of gravity in m on the flange, `track` in m
+    as the vehicle turns. Boards are named as in `sim_backends.optics.scene.Board.parse`. Outputs and `grip_input` are
+    numbers of the arm's connectors, None where laser or claw hang on something else; `wires` says by device ("rail",
+    "laser", "claw") what that is, as its peer takes it, or what else than TMCL the rail speaks; "vehicle": what else
+    than AgileX v2 it speaks, or that there is none.
     """
 
     arm: str
     payload: float
+    payload_centre: tuple[float, float, float]
     vehicle_from_base: Pose
     track: float
     rail: RailDrawing
@@ -126,6 +128,7 @@ STOCK = Drawing(
     CellDrawing(
         arm="UR10e",
         payload=2.1,
+        payload_centre=(0.0, 0.0, 0.06),
         vehicle_from_base=nominal.VEHICLE_FROM_BASE,
         track=0.583,
         rail=RailDrawing(0.002, 200, (0.0, 0.100), (0.01, 0.09)),

@@ -37,6 +37,7 @@ def make_arm(scene: Scene, clock: WorldClock, made: type[ArmModel] = ArmModel) -
         harmonics=scene.workshop.harmonics,
         compliance=scene.effects.sag,
         carried=drawn.payload,
+        carried_centre=drawn.payload_centre,
         serial=f"2023{scene.serial}",
     )
     arm = made(params, stream(scene.seed, "arm"), clock)
@@ -62,6 +63,7 @@ def make_rail(scene: Scene, made: type[RailModel] = RailModel) -> RailModel:
         repeatability=scene.deviations.rail_homing,
         start=float(stream(scene.seed, "rail.start").uniform(*drawn.start)),
         serial=int(scene.serial),
+        reversed=drawn.reversed,
     ).around(drawn.travel)
     return made(params, stream(scene.seed, "rail"))
 

@@ -52,7 +52,12 @@ class Bench:
 
 
 def connect(
-    url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1, control: bool = True
+    url: str,
+    clock: Clock,
+    travel: tuple[float, float] = (0.0, 0.1),
+    address: int = 1,
+    control: bool = True,
+    reversed: bool = False,
 ) -> TmclRail:
     return TmclRail(
         "rail",
@@ -65,6 +70,7 @@ def connect(
         acceleration=ACCELERATION,
         address=address,
         motor=0,
+        reversed=reversed,
         control=control,
         clock=clock,
     )
@@ -665,3 +671,28 @@ def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(ho
     assert not looking.state().homed
     looking.close()
     assert homed.model.settings.microsteps == 7
+
+
+def test_a_rail_is_nudged_before_it_is_homed_and_a_motor_that_turns_backwards_is_turned_round() -> None:
+    world, clock = WorldClock(SPEED), Clock(SPEED)
+    model = RailModel(RailParams(reversed=True), np.random.default_rng(3))
+    peer = TmclPeer(model, world)
+    peer.start()
+    try:
+        rail = connect(peer.url, clock)
+        before = model.carriage(world.now())
+        rail.nudge(0.004, 0.02).wait(10.0)
+        assert model.carriage(world.now()) - before == pytest.approx(-0.004, abs=1e-5)
+        with pytest.raises(LimitError, match="distance of a nudge"):
+            rail.nudge(0.02, 0.02)
+        with pytest.raises(InterlockError, match="not homed"):
+            rail.move_to(0.01)
+        rail.close()
+        rail = connect(peer.url, clock, reversed=True)
+        rail.nudge(0.004, 0.02).wait(10.0)
+        assert model.carriage(world.now()) == pytest.approx(before, abs=1e-5)
+        rail.home().wait(20.0)
+        assert model.carriage(world.now()) == pytest.approx(0.0, abs=1e-4)
+        rail.close()
+    finally:
+        peer.stop()

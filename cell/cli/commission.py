@@ -1,0 +1,181 @@
+"""`cell commission`: from the crate to the first part, one check after the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cell.cli.options import (
+    CellClock,
+    ConfigOption,
+    Confirm,
+    JobOption,
+    JsonOption,
+    Level,
+    LevelOption,
+    SeedOption,
+    SimOption,
+    print_json,
+    wide_console,
+)  # fmt: skip
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cell.commission.check import Check, Result
+    from cell.commission.sequence import Commissioning
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(commission)
+
+
+def commission(
+    only: Annotated[list[str] | None, typer.Argument(help="Only these checks; without any, all of them.")] = None,
+    config: ConfigOption = None,
+    job: JobOption = "pot",
+    until: Annotated[str | None, typer.Option(help="Stop after the check of this name.")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Do these checks again, also those that are good.")] = False,
+    show: Annotated[bool, typer.Option("--list", help="Only say how the checks stand; nothing is connected.")] = False,
+    sim: SimOption = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="With --sim: the simulated cell is the one of this configuration, not of --config."),
+    ] = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    clock: Annotated[
+        CellClock, typer.Option(help='With --sim: "virtual" is without wires and without waiting.')
+    ] = CellClock.wall,
+    confirm: Annotated[
+        Confirm | None, typer.Option(help="Who confirms: with --sim a simulated person unless told otherwise.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Take a cell into service: checks in a safe order, each confirmed before its axis first moves.
+
+    What is found wrong is named, and written into cell.toml if you agree; the old file is kept. The command goes on
+    where it stood. Exit code 0: every check that was asked for is good; 1: one is not.
+    """
+    from rich.console import Console
+
+    from cell.commission.begin import begin, confirms_itself
+    from cell.commission.protocol import write_protocol
+    from cell.commission.sequence import CHECKS, chosen
+    from drivers.errors import ConfigError
+
+    if sim != "all" and (truth is not None or confirm is Confirm.simulated):
+        raise ConfigError("--truth and --confirm simulated are for a cell that is all simulated; give --sim all")
+    checks = chosen(only or (), until)
+    console = Console(stderr=json, highlight=False)
+    options: dict[str, Any] = {
+        "job": job,
+        "sim": sim,
+        "seed": seed,
+        "level": level.value,
+        "clock": clock.value,
+        "truth": truth,
+    }
+    by_itself = confirm is not Confirm.person and (sim == "all" or (sim is None and confirms_itself(config)))
+    made = begin(
+        config,
+        _person(by_itself, console),
+        _Page(console, CHECKS),
+        **options,
+    )
+    if show:
+        _list(made, checks, json)
+        return
+    if again:
+        made.progress.forget([check.name for check in checks])
+    try:
+        good = made.go(checks)
+        protocol = write_protocol(made.progress, CHECKS, made.desk.config)
+        now = made.desk.config
+    finally:
+        made.desk.close()
+    if json:
+        rows = {
+            check.name: {"standing": made.progress.standing(check, now), **(made.progress.result(check.name) or {})}
+            for check in checks
+        }
+        print_json({"good": good, "mended": made.progress.mended, "checks": rows, "protocol": str(protocol)})
+    else:
+        for entry in made.progress.mended:
+            console.print(
+                f"found and mended: {entry['name']}: {entry['what']}; configured {entry['told']}, "
+                f"measured {entry['found']}",
+                style="yellow",
+                markup=False,
+            )
+        console.print(f"protocol: {protocol}", markup=False)
+    if not good:
+        raise typer.Exit(1)
+
+
+def _person(simulated: bool, console: Console) -> Any:
+    from cell.commission.person import PersonAtTheConsole, SimulatedPerson
+
+    if simulated:
+        return SimulatedPerson(lambda text: console.print(text, style="dim", markup=False))
+    return PersonAtTheConsole(lambda text: typer.confirm(text, err=True))
+
+
+class _Page:
+    """Shows a check on the console once it has ended."""
+
+    def __init__(self, console: Console, checks: tuple[Check, ...]) -> None:
+        self._console = console
+        self._numbers = {check.name: k for k, check in enumerate(checks, 1)}
+
+    def __call__(self, check: Check, verdict: str, result: Result | None) -> None:
+        from rich.table import Table
+        from rich.text import Text
+
+        from cell.commission.check import bounds
+
+        style = "green" if verdict.startswith("good") else "yellow" if verdict.startswith("waits") else "red"
+        self._console.print(
+            Text(f"{self._numbers[check.name]:2d}  {check.name}: {check.title}: ").append(verdict, style)
+        )
+        if result is None:
+            return
+        if result.readings:
+            table = Table(show_header=True, header_style="dim", box=None, pad_edge=False)
+            for name in ("measured", "value", "unit", "allowed", ""):
+                table.add_column(name, justify="right" if name in ("value", "allowed") else "left")
+            for row in result.readings:
+                allowed = bounds(row)
+                mark = Text("") if not allowed else Text("ok", "green") if row.ok else Text("outside", "red")
+                table.add_row(Text(row.what), f"{row.value:.4g}", Text(row.unit), allowed, mark)
+            self._console.print(table)
+        for finding in result.findings:
+            self._console.print(f"FOUND {finding}", style="bold red", markup=False)
+        for note in result.notes:
+            self._console.print(f"  {note}", style="dim" if verdict == "good" else "", markup=False)
+
+
+def _list(made: Commissioning, checks: list[Check], json: bool) -> None:
+    from cell.config import load_config
+
+    config = load_config(made.path)
+    rows = [
+        {"name": check.name, "title": check.title, "standing": made.progress.standing(check, config),
+         "moves": check.moves,
+         "far": check.far, "fast": check.fast, "limit": check.limit, "needs": list(check.needs)}
+        for check in checks
+    ]  # fmt: skip
+    if json:
+        print_json(rows)
+        return
+    from rich.table import Table
+
+    table = Table(show_lines=True)
+    for name in ("name", "standing", "moves", "far", "fast", "limit"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*(str(row[name]) for name in ("name", "standing", "moves", "far", "fast", "limit")))
+    wide_console().print(table)

@@ -1,0 +1,92 @@
+"""The last four: calibration, its verification, the first job without a part up to the place, and the first part."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+from cell.commission.check import Check, Result
+from cell.commission.desk import Desk
+from drivers.errors import CalibrationStale, RefusedError
+
+BEFORE_PLACING = "invert_pose"
+ALL = ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw", "calibration")
+
+
+def _calibrate(desk: Desk, result: Result) -> None:
+    desk.mover()
+    desk.confirm("rail", "the carriage", "its whole travel", "its configured speed")
+    desk.confirm("laser", "laser goggles on", "at each view", "on and off")
+    try:
+        calibration = desk.cell.calibration()
+        result.notes.append("a calibration of this cell as it is configured was stored already")
+    except CalibrationStale:
+        calibration = desk.cell.calibrate(job=desk.job_file)
+    summary = calibration.summary()
+    result.notes.append(f"stored as {calibration.name} in {desk.cell.calibrations_folder.name}/")
+    scan, target = desk.config.scan_camera.flange_from_camera.se3(), desk.config.target_camera.flange_from_camera.se3()
+    for name, found, drawn in (
+        ("scan_camera", calibration.scan.flange_from_camera_at(0.0), scan),
+        ("target_camera", calibration.target.flange_from_camera, target),
+    ):
+        off = drawn.inverse() * found
+        result.measure(f"{name}, mounting off its drawing", 1e3 * math.hypot(*off.translation), "mm", most=30.0)
+    result.notes.append(
+        "; ".join(f"{key} {value}" for key, value in summary.items() if isinstance(value, int | float | str))[:600]
+    )
+
+
+def _verify(desk: Desk, result: Result) -> None:
+    verification = desk.cell.verify(job=desk.job_file)
+    summary = verification.summary()
+    for row in summary["figures"]:
+        result.measure(f"{row['name']} (1 sigma {row['sigma']:.4f})", row["value"], row["unit"])
+    result.notes.append(summary["reason"])
+    result.measure("calibration is good today", float(verification.good), "", least=1.0, remedy=str(summary["reason"]))
+
+
+def _job(part: bool, desk: Desk, result: Result) -> None:
+    cell, name = desk.cell, desk.job.job.name
+    desk.confirm("vehicle", "its wheels, to the station", "the job's whole way", "its configured speed")
+    if not part:
+        where = "The vehicle stands at the job's start pose, and the way to the station is clear; the claw is empty."
+        if not desk.person.does(where):
+            raise RefusedError("the vehicle was not brought to the job's start")
+    elif not desk.person.does(f"The part of job {name} is in the claw; the place is free.", desk.fill_claw):
+        raise RefusedError("no part was put into the claw")
+    if not desk.person.go_ahead(
+        f"The first job: {name}, {'whole' if part else 'up to the place pose, without placing'}."
+    ):
+        raise RefusedError("the job was not begun")
+    known = cell.whereabouts.anchored
+    outcome = cell.run(desk.job_file, at_start=not known, until=None if part else BEFORE_PLACING)
+    result.notes.append(f"run {outcome.folder.name}: {outcome.outcome}, {outcome.reason}")
+    for row in outcome.report.get("measured") or ():
+        if isinstance(row.get("value"), int | float):
+            result.measure(str(row["name"]), row["value"], str(row.get("unit", "")))
+    good = outcome.outcome == ("placed" if part else "done")
+    result.measure("placed" if part else "done up to the place pose", float(good), "", least=1.0, remedy=outcome.reason)
+
+
+CHECKS = [
+    Check(
+        "calibration", "Calibration", "arm, rail and laser, over the two boards on the deck", "their whole reach there",
+        "as configured", "solved, and its own checks good",
+        ALL, ("station",), _calibrate, recorded=False,
+    ),
+    Check(
+        "verification", "Verification of the calibration", "arm, rail and laser, one view of each board",
+        "their whole reach there", "as configured", "no part suspected at the job's tolerance",
+        ALL, ("calibration",), _verify, recorded=False,
+    ),
+    Check(
+        "job_empty", "First job, empty claw, up to the place pose", "everything: vehicle, arm, rail, laser",
+        "the whole job but placing", "as configured", "done",
+        (*ALL, "job"), ("verification",), partial(_job, False), recorded=False,
+    ),
+    Check(
+        "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", "the whole job",
+        "as configured", "placed",
+        (*ALL, "job"), ("job_empty",), partial(_job, True), recorded=False,
+    ),
+]  # fmt: skip

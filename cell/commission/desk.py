@@ -1,0 +1,218 @@
+"""What a check works at: the open cell, the person beside it, slow moves, and where pictures go.
+
+The cell is opened anew when its configuration was changed. Nothing of one check is needed by the next but what stands
+in the configuration, and where a camera was seen to see its board last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pinocchio as pin
+
+from cell.commission.check import Result
+from cell.commission.person import Person
+from cell.config import load_config
+from cell.devices.devices import Devices
+from cell.devices.truth_link import cause_fault, make_ready
+from cell.job import Job, load_job
+from cell.motion.kinematics import Joints
+from cell.run.recorded_work import Hands
+from cell.steps.moves import HOME, Mover
+from drivers.errors import CellError, DeviceFault
+from drivers.interfaces import Frame, Image
+
+if TYPE_CHECKING:
+    from cell.config import CellConfig
+    from cell.supervisor import Cell
+
+SLOW_JOINT = math.radians(15.0)
+"""Of the leading joint in free moves, rad/s."""
+SLOW_TOOL = 0.15
+"""Of any point of tool and part in free moves, m/s."""
+WIDEST_PICTURE = 640
+
+
+class SlowMover(Mover):
+    """Moves that are planned anew, once, after a fault that a program may clear by itself, such as a lost program."""
+
+    def to(self, base_from_flange: pin.SE3, what: str) -> None:
+        """See `Mover.to`."""
+        self._again(lambda: Mover.to(self, base_from_flange, what))
+
+    def to_joints(self, joints: Joints) -> None:
+        """See `Mover.to_joints`."""
+        self._again(lambda: Mover.to_joints(self, joints))
+
+    def _again(self, move: Callable[[], None]) -> None:
+        try:
+            move()
+        except DeviceFault as fault:
+            if fault.device != self._arm.name or not fault.recoverable:
+                raise
+            # A protective stop is refused here: a person has to look first.
+            self._arm.recover()
+            move()
+
+
+class Declined(Exception):
+    """A person did not want this check to go on."""
+
+
+@dataclass
+class Desk:
+    """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures.
+
+    `simulated`: all of its devices are, and their world can be told what to do.
+    """
+
+    path: Path
+    open_cell: Callable[[], Cell]
+    person: Person
+    folder: Path
+    job_file: str
+    simulated: bool
+    hands: Hands | None = None
+    last_views: dict[str, pin.SE3] = field(default_factory=dict)
+    """base_from_flange at which each camera saw its board last."""
+    _cell: Cell | None = None
+    _config: CellConfig | None = None
+    _confirmed: set[str] = field(default_factory=set)
+
+    # --- the cell ---
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, opened if need be."""
+        if self._cell is None:
+            self._cell = self.open_cell()
+        return self._cell
+
+    @property
+    def config(self) -> CellConfig:
+        """Its configuration as the file has it, read anew after `close`."""
+        if self._config is None:
+            self._config = load_config(self.path)
+        return self._config
+
+    @property
+    def devices(self) -> Devices:
+        """Its devices."""
+        return self.cell.devices
+
+    @property
+    def job(self) -> Job:
+        """The first job."""
+        return load_job(self.job_file)[0]
+
+    def close(self) -> None:
+        """Let go of the cell; `cell` opens it again."""
+        self._config = None
+        if self._cell is not None:
+            cell, self._cell = self._cell, None
+            cell.close()
+
+    def fill_claw(self) -> None:
+        """At a simulated cell: what a person's hands do, who puts the job's part into the claw."""
+        from cell.devices.described import Described
+
+        described = Described.of(self.job_file)
+        if self.cell.simulated is not None:
+            self.cell.simulated.make_ready(described)
+        elif self.cell.config.cell.truth:
+            make_ready(self.cell.config.cell.truth, described.drawing(self.config).as_json())
+
+    def cause(self, fault: str) -> None:
+        """At a simulated cell: cause a fault by its name."""
+        if self.cell.simulated is not None:
+            self.cell.simulated.fault(fault)
+        else:
+            cause_fault(self.cell.config.cell.truth, fault)
+
+    # --- the person ---
+
+    def confirm(self, axis: str, moves: str, far: str, fast: str) -> None:
+        """A person's word before the first motion of an axis in this session; raises `Declined`."""
+        if axis in self._confirmed:
+            return
+        if not self.person.go_ahead(f"{axis} moves for the first time: {moves}, {far}, {fast}."):
+            raise Declined(f"{axis} was not to move")
+        self._confirmed.add(axis)
+
+    # --- motion ---
+
+    def look_around(self) -> None:
+        """Raise when the work is to end; wait while it is paused."""
+        if self.hands is not None:
+            self.hands.safe_point()
+
+    def mover(self) -> Mover:
+        """Planned moves of the arm at the speed of somebody who stands beside it; the vehicle is braked first.
+
+        The claw may hold the job's part: ways keep clear of it either way.
+        """
+        self.confirm(
+            "the arm as a whole", "planned ways above the deck", "up to its whole reach",
+            f"at most {math.degrees(SLOW_JOINT):.0f} deg/s and {1e3 * SLOW_TOOL:.0f} mm/s",
+        )  # fmt: skip
+        return self._mover()
+
+    def _mover(self) -> Mover:
+        config, devices = self.config, self.devices
+        if not devices.vehicle.state().braked:
+            devices.vehicle.recover()
+        arm = config.arm
+        slow = arm.model_copy(
+            update={
+                "max_joint_speed": min(arm.max_joint_speed, SLOW_JOINT),
+                "max_tool_speed": min(arm.max_tool_speed, SLOW_TOOL),
+            }
+        )
+        config = config.model_copy(update={"arm": slow})
+        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, devices.interlocks)
+
+    def fold(self) -> None:
+        """The arm to its folded posture above the deck, unless it is there."""
+        if np.abs(self.devices.arm.state().joints - HOME).max() > math.radians(1.0):
+            self.mover().to_joints(HOME)
+
+    def home_rail(self) -> None:
+        """The rail's zero, if this program has not found it."""
+        rail = self.devices.rail
+        if not rail.state().homed_here:
+            self.confirm("rail", "it searches its home switch", "its whole travel at most", "half its configured speed")
+            rail.home().wait(120.0)
+
+    # --- pictures ---
+
+    def keep(self, result: Result, name: str, frame: Frame, marks: Any = None) -> None:
+        """Keep a picture for the protocol, with points (n, 2) px marked in it, and the whole frame in the run."""
+        if self.hands is not None:
+            self.hands.keep(name, frame)
+        pictures = self.folder / "pictures"
+        pictures.mkdir(parents=True, exist_ok=True)
+        path = pictures / f"{name}.png"
+        cv2.imwrite(str(path), _shown(frame.image, marks))
+        told = f"pictures/{path.name}"
+        if told not in result.pictures:
+            result.pictures.append(told)
+
+
+def _shown(image: Image, marks: Any) -> Any:
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    share = min(1.0, WIDEST_PICTURE / image.shape[1])
+    small = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+    for x, y in [] if marks is None else np.asarray(marks) * share:
+        cv2.circle(small, (round(float(x)), round(float(y))), 2, (0, 200, 0), -1)
+    return small
+
+
+def told(error: CellError) -> str:
+    """An error in one line."""
+    return " ".join(str(error).split())

@@ -1,0 +1,213 @@
+"""The arm's outputs: which one lights the laser and which one moves the claw, seen by camera and input.
+
+Each output is switched by itself; what the picture and the inputs do then tells what hangs on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.commission.check import Check, Finding, Result
+from cell.commission.desk import Desk
+from cell.commission.seeing import camera_of, centred_view, eye_of
+from cell.devices.built_in import OnArm
+from cell.vision import extract
+from drivers.errors import RefusedError
+from drivers.interfaces import Frame, Image
+
+LEAST_ROWS_SHARE = 0.25
+"""Of the picture's rows that a stripe has to cross to be one."""
+SETTLE_S = 0.3
+PHOTO_RATE = 10.0
+MOST_SATURATED, WIDEST_STRIPE = 20.0, 30.0
+OUTPUTS = 18
+
+
+@dataclass(frozen=True, eq=False)
+class Switched:
+    """What was seen when an output went on: the pictures before and after, and which inputs changed."""
+
+    off: Frame
+    on: Frame
+    inputs: int
+
+    @property
+    def stripe_rows(self) -> int:
+        """Rows of the picture in which something bright and narrow has come."""
+        return bright_rows(self.off.image, self.on.image)
+
+
+def bright_rows(off: Image, on: Image) -> int:
+    """Rows in which a narrow bright thing is in `on` that was not in `off`."""
+    change = on.astype(float) - off.astype(float)
+    noise = max(2.0, 1.4826 * float(np.median(np.abs(change - np.median(change)))))
+    peak = change.max(axis=1)
+    narrow = (change > 0.5 * peak[:, None]).mean(axis=1) < 0.1
+    return int(((peak > 10.0 * noise) & narrow).sum())
+
+
+def _outputs(desk: Desk, result: Result) -> None:
+    config = desk.config
+    if not isinstance(config.laser, OnArm) or not isinstance(config.claw, OnArm):
+        result.notes.append("laser or claw does not hang on the arm's outputs: each is tried as it is configured")
+        _laser_alone(desk, result)
+        desk.confirm("claw", "the claw opens and closes, hands out of it", "its whole stroke", "its own")
+        _claw(desk, result)
+        return
+    laser, claw = config.laser.output, config.claw.output
+    centred_view(desk, result, eye_of(desk, "scan_camera"))
+    desk.confirm(
+        "laser",
+        f"output {laser}: laser goggles on, nobody looks into the beam",
+        "half a second each time",
+        "on and off",
+    )
+    desk.confirm("claw", f"output {claw}: the claw opens and closes, hands out of it", "its whole stroke", "its own")
+    if not desk.person.does("Take whatever is in the claw out of it: it will open."):
+        raise RefusedError("the claw was not emptied, so its output was not switched. Take out what is in it")
+    # Both off first: an output that is on already shows nothing when it is switched on.
+    with desk.cell.maintenance("commissioning: what hangs on which output", ["own_switch"]):
+        for output in (claw, laser):
+            desk.devices.arm.set_digital_output(output, False)
+        desk.devices.clock.sleep(SETTLE_S)
+        by_laser = _switch(desk, laser)
+        by_claw = _switch(desk, claw)
+    desk.keep(result, "output-laser-on", by_laser.on)
+    desk.keep(result, "output-claw-on", by_claw.on)
+    rows = by_laser.on.image.shape[0]
+    enough = LEAST_ROWS_SHARE * rows
+    result.measure(f"rows with a stripe while laser.output ({laser}) is on", by_laser.stripe_rows, f"of {rows}")
+    result.measure(f"rows with a stripe while claw.output ({claw}) is on", by_claw.stripe_rows, f"of {rows}")
+    if by_laser.stripe_rows >= enough and by_claw.stripe_rows < enough:
+        _stripe(desk, result, by_laser.on)
+        _claw(desk, result)
+    elif by_claw.stripe_rows >= enough and by_laser.stripe_rows < enough:
+        result.find(
+            Finding(
+                "laser.output, claw.output",
+                "the outputs of laser and claw are swapped: the claw's output lights the laser",
+                f"laser {laser}, claw {claw}", f"laser {claw}, claw {laser}",
+                "Swap the two numbers, or the two wires.",
+                {"laser.output": str(claw), "claw.output": str(laser)},
+            )
+        )  # fmt: skip
+    else:
+        _no_light(desk, result, laser, claw, enough)
+
+
+def _no_light(desk: Desk, result: Result, laser: int, claw: int, enough: float) -> None:
+    """Neither of the two lights the laser, or both do: try the others, if a person agrees."""
+    others = [output for output in range(OUTPUTS) if output not in (laser, claw)]
+    lit: list[int] = []
+    if desk.person.go_ahead(
+        f"No stripe with outputs {laser} and {claw}. The others are switched on one after the other."
+    ):
+        with desk.cell.maintenance("commissioning: which output lights the laser", ["own_switch"]):
+            for output in others:
+                desk.look_around()
+                if _switch(desk, output).stripe_rows >= enough:
+                    lit.append(output)
+    result.find(
+        Finding(
+            "laser.output", "no stripe comes when the laser's output is switched on",
+            str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
+            "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
+            "is open, and that calibration.stripe_exposure is long enough.",
+            {"laser.output": str(lit[0])} if lit else {},
+        )
+    )  # fmt: skip
+
+
+def _switch(desk: Desk, output: int) -> Switched:
+    """Switch an output on and off again, with a picture and the inputs before and while it is on."""
+    arm, clock = desk.devices.arm, desk.devices.clock
+    eye = eye_of(desk, "scan_camera")
+    camera = camera_of(desk, eye)
+    camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
+    off, before = camera.grab(), arm.state().digital_inputs
+    try:
+        arm.set_digital_output(output, True)
+        clock.sleep(SETTLE_S)
+        on, after = camera.grab(), arm.state().digital_inputs
+    finally:
+        arm.set_digital_output(output, False)
+        clock.sleep(SETTLE_S)
+    return Switched(off, on, before ^ after)
+
+
+def _laser_alone(desk: Desk, result: Result) -> None:
+    eye = eye_of(desk, "scan_camera")
+    centred_view(desk, result, eye)
+    desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
+    camera = camera_of(desk, eye)
+    camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
+    off = camera.grab()
+    with desk.devices.interlocks.purpose("test"), desk.devices.laser.lit():
+        desk.devices.clock.sleep(SETTLE_S)
+        on = camera.grab()
+    desk.keep(result, "laser-on", on)
+    rows = bright_rows(off.image, on.image)
+    result.measure(
+        "rows with a stripe while the laser is lit", rows, f"of {on.image.shape[0]}",
+        least=LEAST_ROWS_SHARE * on.image.shape[0], remedy="See what switches the laser, its power and its shutter.",
+    )  # fmt: skip
+    _stripe(desk, result, on)
+
+
+def _stripe(desk: Desk, result: Result, lit: Frame) -> None:
+    """How good the stripe is: how many rows, how wide, how bright."""
+    profile = extract(lit.image)
+    rows = profile.rows
+    desk.keep(result, "stripe", lit, profile.pixels()[:: max(1, len(rows) // 60)])
+    exposure = "calibration.stripe_exposure"
+    result.measure(
+        "rows with a stripe centre", len(rows), "", least=LEAST_ROWS_SHARE * lit.image.shape[0],
+        remedy=f"Raise {exposure}, or see that the line lies across the board.",
+    )  # fmt: skip
+    if len(rows):
+        width = float(np.median(profile.width[rows]))
+        result.measure(
+            "width of the stripe, one sigma", width, "px", most=WIDEST_STRIPE, remedy="Focus the laser on the board."
+        )
+        across = np.clip(np.round(profile.pixels()[:, 0]).astype(int), 0, lit.image.shape[1] - 1)
+        peak = lit.image[rows, across]
+        result.measure(
+            "brightness of the stripe, median", float(np.median(peak)), "DN", least=40.0, remedy=f"Raise {exposure}."
+        )
+        result.measure(
+            "stripe rows that are saturated", 100.0 * float((peak >= 255).mean()), "%", most=MOST_SATURATED,
+            remedy=f"Lower {exposure}.",
+        )  # fmt: skip
+
+
+def _claw(desk: Desk, result: Result) -> None:
+    """With a part in it the claw's input shows it, and shows it no more when it has opened."""
+    claw = desk.devices.claw
+    if not desk.person.does("Hold a part between the fingers: the claw closes on it.", desk.fill_claw):
+        raise RefusedError("no part was put into the claw, so its feedback was not tried")
+    before = desk.devices.arm.state().digital_inputs
+    if not claw.holding:
+        claw.grip(5.0)
+    held = desk.devices.arm.state().digital_inputs
+    result.measure("claw.feedback shows the part when closed", float(claw.holding), "", least=1.0)
+    if not desk.person.does("Keep a hand below the part: the claw opens."):
+        return
+    with desk.cell.maintenance("commissioning: the claw opens in the open", ["claw_at_contact"]):
+        claw.release(5.0)
+    result.measure("claw.feedback shows the part when open", float(claw.holding), "", most=0.0)
+    changed = (held ^ desk.devices.arm.state().digital_inputs) | (before ^ held)
+    shown = ", ".join(str(k) for k in range(OUTPUTS) if changed >> k & 1) or "none"
+    result.notes.append(f"inputs that changed with the claw: {shown}")
+
+
+CHECKS = [
+    Check(
+        "outputs", "Outputs: laser and claw, each by what the camera and the inputs show",
+        "laser and claw, each by its own output; the arm to its view of the board", "half a second each",
+        "on and off", "a stripe with laser.output alone; claw.feedback follows claw.output",
+        ("laser", "claw", "scan_camera", "calibration.fine", "calibration.stripe_exposure"),
+        ("rail_direction",), _outputs,
+    ),
+]  # fmt: skip

@@ -1,0 +1,187 @@
+"""The order of the checks, and going through them: what is good already is passed over, what was found is mended.
+
+First what does not move, then each axis by itself and slowly, then what a wrong axis would make dangerous.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from cell.commission import (
+    arm_checks,
+    camera_checks,
+    closing_checks,
+    link_checks,
+    output_checks,
+    rail_checks,
+    stop_checks,
+    vehicle_checks,
+)
+from cell.commission.check import Check, Result, Verdict
+from cell.commission.desk import Declined, Desk, told
+from cell.commission.progress import Progress, done_well
+from cell.commission.toml_edit import write_changes
+from cell.run.recorded_work import Hands
+from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
+
+CHECKS: tuple[Check, ...] = (
+    *link_checks.CHECKS,
+    *arm_checks.CHECKS,
+    *camera_checks.CHECKS,
+    *rail_checks.CHECKS,
+    *output_checks.CHECKS,
+    *vehicle_checks.CHECKS,
+    *stop_checks.CHECKS,
+    *vehicle_checks.STATION_CHECKS,
+    *closing_checks.CHECKS,
+)
+MENDS = 3
+"""How often at most what a check found is written, and the check done again."""
+
+
+@dataclass
+class Commissioning:
+    """Goes through the checks at a `desk`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
+
+    desk: Desk
+    progress: Progress
+    path: Path
+    show: Callable[[Check, str, Result | None], None]
+
+    def go(self, checks: Sequence[Check]) -> bool:
+        """Do these checks in their order; True when all of them are good."""
+        good = True
+        for check in checks:
+            if done_well(self.progress.standing(check, self.desk.config)):
+                self.show(check, "good already", None)
+                continue
+            missing = [name for name in check.needs if not self._good(name)]
+            if missing:
+                self.show(check, f"waits for {', '.join(missing)}", None)
+                good = False
+                continue
+            good = self._until_good(check) and good
+        return good
+
+    def _good(self, name: str) -> bool:
+        return done_well(self.progress.standing(by_name(name), self.desk.config))
+
+    def _until_good(self, check: Check) -> bool:
+        """Do a check, mend what it found, and do it again, as often as that helps."""
+        mended = 0
+        while True:
+            result = self._once(check)
+            self.show(check, result.verdict.value, result)
+            if result.verdict is Verdict.GOOD:
+                return True
+            if mended < MENDS and self._mend(check, result):
+                mended += 1
+            elif not self._again(check, result):
+                return False
+
+    def _once(self, check: Check) -> Result:
+        result, begun = Result(), time.monotonic()
+        desk, run = self.desk, ""
+        try:
+            if check.recorded:
+                run = self._recorded(check, result)
+            else:
+                check.work(desk, result)
+        except Declined as declined:
+            result.verdict = Verdict.DECLINED
+            result.notes.append(str(declined))
+        except Aborted:
+            raise
+        except CellError as error:
+            result.verdict = Verdict.FAILED
+            result.notes.append(told(error))
+            if isinstance(error, RefusedError) and (frame := error.seen.get("frame")) is not None:
+                desk.keep(result, f"{check.name}-refused", frame)  # type: ignore[arg-type]
+            if isinstance(error, DeviceFault):
+                # Whatever it was: what follows begins with devices that are asked anew.
+                desk.close()
+        self.progress.keep(check, desk.config, result, time.monotonic() - begun, run)
+        return result
+
+    def _recorded(self, check: Check, result: Result) -> str:
+        """Do it as a run, so that it is in `cell runs` and hears `cell abort`; returns the run's name."""
+        desk = self.desk
+        name: list[str] = []
+
+        def work(hands: Hands) -> None:
+            current = desk.cell.current
+            if current is not None and current.folder is not None:
+                name.append(current.folder.name)
+            desk.hands = hands
+            try:
+                check.work(desk, result)
+            finally:
+                desk.hands = None
+
+        try:
+            desk.cell.perform("commission", work, info={"check": check.name})
+        finally:
+            desk.hands = None
+        return name[0] if name else ""
+
+    def _mend(self, check: Check, result: Result) -> bool:
+        """Write what was found into the configuration, if a person agrees; True when something was written."""
+        changes: dict[str, str] = {}
+        for finding in result.findings:
+            changes |= finding.write
+        if not changes:
+            return False
+        shown = "; ".join(f"{key} = {value}" for key, value in changes.items())
+        if not self.desk.person.sees(f"Write into {self.path.name}: {shown}? The old file is kept."):
+            return False
+        backup = write_changes(self.path, changes)
+        for finding in result.findings:
+            if finding.write:
+                self.progress.keep_mended(check, asdict(finding), backup.name)
+        self.desk.close()
+        try:
+            self.desk.cell  # noqa: B018  (opened as the file now says)
+        except ConfigError as error:
+            self.desk.close()
+            backup.replace(self.path)
+            raise ConfigError(
+                f"what was measured does not fit the configuration, which is as it was: {error}"
+            ) from error
+        return True
+
+    def _again(self, check: Check, result: Result) -> bool:
+        """Whether a person has changed something and wants the check done again."""
+        if result.verdict is Verdict.DECLINED:
+            return False
+        return self.desk.person.again(f"{check.title}: {result.verdict.value}. Mend it and measure again now?")
+
+
+def by_name(name: str) -> Check:
+    """The check of that name; `ConfigError` that lists them."""
+    for check in CHECKS:
+        if check.name == name:
+            return check
+    raise ConfigError(f'there is no check "{name}"; they are {", ".join(check.name for check in CHECKS)}')
+
+
+def chosen(only: Sequence[str], until: str | None) -> list[Check]:
+    """The checks named, or all, up to and with `until`."""
+    picked = [check for check in CHECKS if not only or check in [by_name(name) for name in only]]
+    if until is not None:
+        last = CHECKS.index(by_name(until))
+        picked = [check for check in picked if CHECKS.index(check) <= last]
+    return picked
+
+
+def table() -> str:
+    """The checks as the table of docs/commission.md."""
+    rows = ["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|"]
+    rows += [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    print(table())

@@ -1,0 +1,267 @@
+"""Stops: what moves or shines is stopped from each cause, and the time and the way until it rests are measured."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from cell.commission.check import Check, Result
+from cell.commission.desk import Desk
+from cell.run.recorded_work import Hands
+from cell.steps.approach import Planar, RelativeOdometry, drive_line
+from drivers.errors import Aborted, CellError, InterlockError
+from drivers.interfaces import ArmSafety, Motion
+
+RAIL_SPEED = 0.020
+ARM_SPEED, ARM_STEP = math.radians(5.0), math.radians(6.0)
+VEHICLE_SPEED = 0.10
+BEFORE_S, WATCH_S, PERIOD_S = 0.5, 1.0, 0.01
+MOST_S = 1.0
+MOST_WAY = {"rail": 10.0, "arm": 3.0, "vehicle": 120.0}
+"""mm, deg, mm from the cause to rest."""
+UNITS = {"rail": "mm", "arm": "deg", "vehicle": "mm"}
+AT_REST = {"rail": 0.05e-3, "arm": math.radians(0.02), "vehicle": 1e-3}
+"""Way within a period, m or rad, below which a device rests."""
+KEPT_ALIVE_S = 0.5
+BY = "the commissioning, which had stopped the cell itself"
+
+
+def _stops(desk: Desk, result: Result) -> None:
+    desk.fold()
+    desk.home_rail()
+    stood = RelativeOdometry(desk.devices.vehicle)
+    for name, start in (("rail", _rail_moves), ("arm", _arm_moves), ("vehicle", _vehicle_moves)):
+        if name == "vehicle" and not desk.config.vehicle.DRIVES:
+            continue
+        for sign, cause, stop in ((1.0, "Cell.stop()", _by_program), (-1.0, "`cell abort`", _by_request)):
+            _measured(desk, result, name, cause, partial(start, sign), stop)
+    _vehicle_unrenewed(desk, result)
+    _laser(desk, result)
+    _emergency(desk, result)
+    _drive_back(desk, stood)
+
+
+def _measured(
+    desk: Desk,
+    result: Result,
+    name: str,
+    cause: str,
+    start: Callable[[Desk], object],
+    stop: Callable[[Desk, Callable[[], None]], None],
+) -> None:
+    """Set the device in motion, stop it, and watch it until it rests."""
+    _prepare(desk, name)
+    marks: dict[str, float] = {}
+
+    def begin() -> None:
+        begun = desk.devices.clock.now()
+        start(desk)
+        while desk.devices.clock.now() - begun < BEFORE_S:
+            if name == "vehicle":
+                start(desk)
+            desk.devices.clock.sleep(0.05)
+        marks["at"], marks["from"] = desk.devices.clock.now(), _place(desk, name)
+
+    stop(desk, begin)
+    last, rested = _place(desk, name), desk.devices.clock.now()
+    until = rested + WATCH_S
+    while desk.devices.clock.now() < until:
+        desk.devices.clock.sleep(PERIOD_S)
+        here = _place(desk, name)
+        if abs(here - last) > AT_REST[name]:
+            last, rested = here, desk.devices.clock.now()
+    factor = math.degrees(1.0) if name == "arm" else 1e3
+    hurry = max(1.0, desk.devices.clock.rate)
+    result.measure(f"{name}, {cause}: time to rest, at most", rested - marks["at"], "s", most=MOST_S * hurry)
+    result.measure(
+        f"{name}, {cause}: way",
+        factor * abs(_place(desk, name) - marks["from"]),
+        UNITS[name],
+        most=MOST_WAY[name] * hurry,
+    )
+
+
+def _prepare(desk: Desk, name: str) -> None:
+    """Where the motion to be stopped begins."""
+    if name == "rail":
+        low, high = desk.config.rail.travel
+        desk.confirm("rail", "the carriage", "a part of its travel", f"{1e3 * RAIL_SPEED:.0f} mm/s")
+        desk.devices.rail.move_to(0.5 * (low + high), min(RAIL_SPEED, desk.config.rail.max_speed)).wait(60.0)
+    elif name == "arm":
+        desk.confirm(
+            "joint 1",
+            "this joint alone",
+            f"up to {math.degrees(ARM_STEP):.0f} deg",
+            f"{math.degrees(ARM_SPEED):.0f} deg/s",
+        )
+        desk.fold()
+    else:
+        desk.fold()
+        desk.confirm("vehicle", "its wheels, straight ahead", "about 100 mm", f"{1e3 * VEHICLE_SPEED:.0f} mm/s")
+        desk.devices.vehicle.enable()
+
+
+def _rail_moves(sign: float, desk: Desk) -> Motion:
+    low, high = desk.config.rail.travel
+    goal = 0.5 * (low + high) + sign * 0.4 * (high - low)
+    return desk.devices.rail.move_to(goal, min(RAIL_SPEED, desk.config.rail.max_speed))
+
+
+def _arm_moves(sign: float, desk: Desk) -> Motion:
+    arm = desk.devices.arm
+    if not desk.devices.vehicle.state().braked:
+        desk.devices.vehicle.recover()
+    goal = arm.state().joints.copy()
+    goal[0] += sign * ARM_STEP
+    return arm.move_joints(goal, ARM_SPEED, math.radians(40.0))
+
+
+def _vehicle_moves(sign: float, desk: Desk) -> None:
+    desk.devices.vehicle.drive(sign * VEHICLE_SPEED, 0.0)
+
+
+def _drive_back(desk: Desk, stood: RelativeOdometry) -> None:
+    """The vehicle to where it stood, by its wheels' counters."""
+    if not desk.config.vehicle.DRIVES:
+        return
+    desk.fold()
+    vehicle = desk.devices.vehicle
+    vehicle.enable()
+    try:
+        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, desk.look_around)
+    finally:
+        vehicle.brake()
+
+
+def _place(desk: Desk, name: str) -> float:
+    devices = desk.devices
+    if name == "rail":
+        return devices.rail.state().position
+    if name == "arm":
+        return float(devices.arm.state().joints[0])
+    state = devices.vehicle.state()
+    return float(math.hypot(state.x, state.y))
+
+
+def _by_program(desk: Desk, begin: Callable[[], None]) -> None:
+    begin()
+    desk.cell.stop()
+    desk.cell.clear_stop(BY)
+
+
+def _by_request(desk: Desk, begin: Callable[[], None]) -> None:
+    """The run is asked to end, as `cell abort` asks from another shell."""
+
+    def work(hands: Hands) -> None:
+        begin()
+        run = desk.cell.current
+        if run is not None:
+            run.abort("the commissioning tries how a request to end ends it")
+        hands.check()
+
+    try:
+        desk.cell.perform("commission", work, info={"check": "stops"})
+    except Aborted:
+        desk.cell.clear_stop(BY)
+        return
+    raise InterlockError("cell", "a run that was asked to end did not end")
+
+
+def _vehicle_unrenewed(desk: Desk, result: Result) -> None:
+    """A vehicle that hears nothing any more stops by itself."""
+    if not desk.config.vehicle.DRIVES:
+        return
+    desk.fold()
+    vehicle, clock = desk.devices.vehicle, desk.devices.clock
+    vehicle.enable()
+    try:
+        begun = clock.now()
+        while clock.now() - begun < BEFORE_S:
+            vehicle.drive(VEHICLE_SPEED, 0.0)
+            clock.sleep(0.05)
+        last = clock.now()
+        while abs(vehicle.state().speed) > 0.005 and clock.now() - last < 5.0:
+            clock.sleep(PERIOD_S)
+        result.measure(
+            "vehicle, commands not renewed: time to rest", clock.now() - last, "s",
+            most=(KEPT_ALIVE_S + MOST_S) * max(1.0, clock.rate),
+        )  # fmt: skip
+    finally:
+        vehicle.brake()
+
+
+def _laser(desk: Desk, result: Result) -> None:
+    """The laser goes off with a stop, whoever holds it."""
+    desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
+    if not desk.devices.vehicle.state().braked:
+        desk.devices.vehicle.recover()
+    laser, clock = desk.devices.laser, desk.devices.clock
+    with desk.devices.interlocks.purpose("test"), laser.lit():
+        clock.sleep(0.2)
+        begun = clock.now()
+        desk.cell.stop()
+        result.measure(
+            "laser, Cell.stop(): off after, at most", clock.now() - begun, "s", most=MOST_S * max(1.0, clock.rate)
+        )
+        result.measure("laser on after a stop", float(laser.is_on), "", most=0.0)
+    desk.cell.clear_stop(BY)
+
+
+def _emergency(desk: Desk, result: Result) -> None:
+    """A person stops the arm with the button while it turns; afterwards nothing goes on by itself."""
+    arm, clock = desk.devices.arm, desk.devices.clock
+    simulated = desk.simulated
+    desk.fold()
+    if not desk.devices.vehicle.state().braked:
+        desk.devices.vehicle.recover()
+    _arm_moves(1.0, desk)
+    clock.sleep(BEFORE_S)
+    begun, before = clock.now(), _place(desk, "arm")
+    cause = "emergency stop"
+    if simulated:
+        cause = "protective stop (simulated)"
+        desk.cause("arm.protective_stop")
+    elif not desk.person.does("Press the emergency stop now, while joint 1 turns."):
+        desk.cell.stop()
+        desk.cell.clear_stop(BY)
+        result.notes.append("the emergency stop was not tried")
+        return
+    deadline = time.monotonic() + 5.0
+    while arm.state().safety is ArmSafety.NORMAL and time.monotonic() < deadline:
+        clock.sleep(PERIOD_S)
+    stopped = arm.state().safety
+    while float(np.abs(arm.state().joint_speeds).max()) > 1e-3 and time.monotonic() < deadline:
+        clock.sleep(PERIOD_S)
+    result.notes.append(f"after the {cause} the arm told: {stopped.value}")
+    result.measure(f"arm, {cause}: it told so", float(stopped is not ArmSafety.NORMAL), "", least=1.0)
+    if simulated:
+        result.measure(
+            f"arm, {cause}: time to rest, at most", clock.now() - begun, "s", most=MOST_S * max(1.0, clock.rate)
+        )
+        result.measure(
+            f"arm, {cause}: way", math.degrees(abs(_place(desk, "arm") - before)), "deg", most=MOST_WAY["arm"]
+        )
+    refused = 0.0
+    try:
+        _arm_moves(1.0, desk).wait(1.0)
+    except CellError:
+        refused = 1.0
+    result.measure("a motion while it is stopped refused", refused, "", least=1.0)
+    if desk.person.does("Release the button, look that all is well, and switch the arm on again at its pendant."):
+        arm.recover(confirmed=True)
+    desk.fold()
+
+
+CHECKS = [
+    Check(
+        "stops", "Stops: from each cause, time and way",
+        "rail, joint 1 and wheels, one after the other, each stopped on its way; the laser",
+        "rail 20 mm, joint 1 6 deg, wheels 100 mm at most", "20 mm/s, 5 deg/s, 100 mm/s",
+        f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, {MOST_WAY['vehicle']:g} mm",
+        ("rail", "arm.model", "vehicle", "laser"), ("rail_limits", "vehicle", "outputs"), _stops, recorded=False,
+    ),
+]  # fmt: skip

@@ -1,0 +1,225 @@
+"""The vehicle: which way and how far its wheels take it, by their counters and by the station's board."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.store import nominal_camera
+from cell.commission.camera_checks import PITCH_OFF
+from cell.commission.check import Check, Finding, Result
+from cell.commission.desk import Desk
+from cell.commission.mounting import axes_from_shifts
+from cell.geometry.poses import from_parts, from_ur
+from cell.steps.approach import Planar, RelativeOdometry, drive_line
+from cell.steps.camera_poses import look_pose
+from cell.vision import board_pose, find_board, parse_board
+from drivers.errors import CellError, DeviceFault, RefusedError
+
+WAY, SPEED = 0.050, 0.050
+MOST_OFF_MM = 5.0
+MOST_OFF_SHARE = 0.4
+"""By how much, relative, what the camera sees may differ from what the wheels count: from afar it sees little."""
+SHIFT = 0.060
+"""By how much, m, the flange is shifted to measure the station's board, each way."""
+STRIDE, STRIDE_SPEED, LEAST_LEFT = 0.25, 0.15, 0.40
+"""How far the vehicle goes at a time, m, how fast, m/s, and how far it keeps from the job's target, m."""
+LEAST_SEEN = 0.012
+"""A way that the camera sees must be this long, m, to say which way it went."""
+PHOTO_RATE = 10.0
+
+
+def _wheels(desk: Desk, result: Result) -> None:
+    config, devices = desk.config, desk.devices
+    if not config.vehicle.DRIVES:
+        result.notes.append("the vehicle is fixed: nothing drives")
+        return
+    desk.fold()
+    desk.confirm("vehicle", "its wheels, straight ahead", f"{1e3 * WAY:.0f} mm and back", f"{1e3 * SPEED:.0f} mm/s")
+    devices.vehicle.enable()
+    try:
+        odometry = RelativeOdometry(devices.vehicle)
+        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+        there = odometry.pose()
+        seen = desk.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
+        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+    finally:
+        devices.vehicle.brake()
+    back = odometry.pose()
+    low, high = 1e3 * WAY - MOST_OFF_MM, 1e3 * WAY + MOST_OFF_MM
+    result.measure("ahead, by the wheels' counters", 1e3 * there.x, "mm", least=low, most=high)
+    result.measure("aside, by the wheels' counters", 1e3 * there.y, "mm", least=-MOST_OFF_MM, most=MOST_OFF_MM)
+    result.measure("turned, by the wheels' counters", math.degrees(there.yaw), "deg", least=-1.5, most=1.5)
+    result.measure("after the way back", 1e3 * back.x, "mm", least=-MOST_OFF_MM, most=MOST_OFF_MM)
+    result.measure("a person saw it go ahead", float(seen), "", least=1.0)
+
+
+def _station(desk: Desk, result: Result) -> None:
+    """Nearer to the station in strides until its board is seen; then the arm measures the board, and it the wheels."""
+    config, devices, job = desk.config, desk.devices, desk.job
+    look = look_pose(config, job, parse_board(job.board.spec), config.target_camera.flange_from_camera.se3())
+    devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
+    if config.vehicle.DRIVES and not desk.person.does(
+        f"The vehicle stands at the start of job {job.job.name}, and the way to the station is clear."
+    ):
+        raise RefusedError("the vehicle was not brought to the job's start")
+    desk.fold()
+    desk.mover().to(look, "the looking pose")
+    odometry = RelativeOdometry(devices.vehicle)
+    try:
+        before = _until_seen(desk, result, odometry)
+        if before is None:
+            raise RefusedError(
+                "the station's board was not seen on the way to it: see that it stands where the job has it, that it "
+                f"is {job.board.spec}, and that it has light"
+            )
+        _pitch(desk, result, look)
+        if config.vehicle.DRIVES:
+            _by_board(desk, result, odometry, before)
+    finally:
+        if config.vehicle.DRIVES:
+            desk.mover().to(look, "the looking pose")
+            _drive(desk, odometry, 0.0)
+
+
+def _until_seen(desk: Desk, result: Result, odometry: RelativeOdometry) -> np.ndarray | None:
+    """The station's board (3,) in the base once it is seen; None when it is not before the vehicle is near."""
+    approach = desk.job.approach
+    way = (Planar.of(approach.start.se3()).inverse() * Planar.of(approach.target.se3())).x
+    driven = 0.0
+    while (seen := _board_at(desk, result, "station-board")) is None:
+        driven += STRIDE
+        if not desk.config.vehicle.DRIVES or driven > way - LEAST_LEFT:
+            return None
+        desk.confirm(
+            "vehicle, to the station", "its wheels, in strides, until the board is seen",
+            f"at most {way - LEAST_LEFT:.1f} m, and back", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
+        )  # fmt: skip
+        _drive(desk, odometry, driven)
+    result.measure("driven until the station's board was seen", driven, "m")
+    return seen
+
+
+def _by_board(desk: Desk, result: Result, odometry: RelativeOdometry, before: np.ndarray) -> None:
+    """The wheels' way against the board, which stands: what comes nearer is the way of the vehicle."""
+    from_here = odometry.pose().x
+    _drive(desk, odometry, from_here + WAY)
+    after = _board_at(desk, result, "station-board-nearer")
+    if after is None:
+        raise RefusedError(f"{1e3 * WAY:.0f} mm nearer, the station's board is not seen any more; see its light")
+    counted = odometry.pose().x - from_here
+    way = desk.config.arm.vehicle_from_base.se3().rotation @ (before - after)
+    result.measure("ahead, by the wheels' counters", 1e3 * counted, "mm")
+    result.measure("ahead, by the station's board", 1e3 * way[0], "mm")
+    if np.linalg.norm(way) < LEAST_SEEN:
+        raise RefusedError(
+            f"the wheels counted {1e3 * counted:.0f} mm, the camera saw the board {1e3 * way[0]:.0f} mm nearer; "
+            "see that the wheels take the vehicle along, and that it is not jacked up"
+        )
+    if way[0] < 0.0:
+        result.find(
+            Finding(
+                "arm.vehicle_from_base", "the vehicle goes the other way than the arm has it: away from the board",
+                f"{1e3 * counted:+.0f} mm", f"{1e3 * way[0]:+.0f} mm",
+                "Turn arm.vehicle_from_base by 180 deg about z, or have the vehicle's maker reverse its drives.",
+            )
+        )  # fmt: skip
+        return
+    result.measure(
+        "that over the wheels' way", float(way[0]) / counted, "", least=1.0 - MOST_OFF_SHARE, most=1.0 + MOST_OFF_SHARE,
+        remedy="See the wheels' diameter, whether they slip, and the station's board.",
+    )  # fmt: skip
+
+
+def _drive(desk: Desk, odometry: RelativeOdometry, ahead: float) -> None:
+    """So far ahead of where the odometry began, m, and braked."""
+    vehicle = desk.devices.vehicle
+    vehicle.enable()
+    try:
+        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, _look(desk))
+    finally:
+        vehicle.brake()
+
+
+def _pitch(desk: Desk, result: Result, look: pin.SE3) -> None:
+    """How large the station's board is, by the ways of the arm before it; the arm is back at `look` afterwards."""
+    board, mover = parse_board(desk.job.board.spec), desk.mover()
+    flanges, boards = [], []
+    for shift in (np.zeros(3), *(sign * SHIFT * axis for axis in np.eye(3) for sign in (1.0, -1.0))):
+        desk.look_around()
+        try:
+            mover.to(look * from_parts(shift), "before the station's board")
+            frame = desk.devices.target_camera.grab()
+            seen = board_pose(find_board(frame.image, board), nominal_camera(desk.config.target_camera))
+        except DeviceFault:
+            raise
+        except CellError:
+            continue
+        flanges.append(from_ur(desk.devices.arm.state().flange))
+        boards.append(seen.camera_from_board)
+    mover.to(look, "the looking pose")
+    try:
+        across = axes_from_shifts(flanges, boards).across
+    except RefusedError as refused:
+        result.notes.append(f"the station's board could not be measured from here: {refused}")
+        return
+    result.measure("station's board by the arm's measure over its name", across, "")
+    if abs(across - 1.0) > PITCH_OFF:
+        result.find(
+            Finding(
+                "board.spec of the job",
+                "the station's board has another pitch than its name says, by the ways of the arm",
+                f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm",
+                "Measure from the first to the last point with a ruler, and name the board so in the job's file: the "
+                "vehicle drives by it.",
+            )
+        )  # fmt: skip
+
+
+def _look(desk: Desk) -> Callable[[], None]:
+    def look() -> None:
+        desk.look_around()
+        desk.cell.whereabouts.count()
+
+    return look
+
+
+def _board_at(desk: Desk, result: Result, name: str) -> np.ndarray | None:
+    """The station's board (3,) in the base, roughly; None when it is not seen."""
+    config, devices = desk.config, desk.devices
+    camera = devices.target_camera
+    camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
+    devices.clock.sleep(config.arm.settle_time)
+    frame = camera.grab()
+    try:
+        view = find_board(frame.image, parse_board(desk.job.board.spec))
+        pose = board_pose(view, nominal_camera(config.target_camera))
+    except RefusedError:
+        desk.keep(result, name, frame)
+        return None
+    desk.keep(result, name, frame, view.pixels)
+    flange = from_ur(devices.arm.state().flange)
+    found: pin.SE3 = flange * config.target_camera.flange_from_camera.se3() * pose.camera_from_board
+    return np.asarray(found.translation)
+
+
+CHECKS = [
+    Check(
+        "vehicle", "Vehicle: its wheels, direction and unit",
+        "the wheels, with the arm folded", f"{1e3 * WAY:.0f} mm ahead and back", f"{1e3 * SPEED:.0f} mm/s",
+        f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
+        ("vehicle",), ("target_mounting", "outputs"), _wheels,
+    ),
+]  # fmt: skip
+STATION_CHECKS = [
+    Check(
+        "station", "Station: its board by the arm's measure, the wheels by the board",
+        "the arm to the job's looking pose; the wheels, until the board is seen, and back",
+        f"up to {LEAST_LEFT:g} m before the job's target", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
+        f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
+        ("vehicle", "target_camera", "arm.vehicle_from_base", "job"), ("stops",), _station,
+    ),
+]  # fmt: skip
