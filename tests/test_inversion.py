@@ -61,6 +61,11 @@ def flat(x: Array, y: Array) -> Array:
     return 0.004 + 0.0 * x * y
 
 
+def ledges(x: Array, y: Array) -> Array:
+    """Two steep ledges that cross on a plane, m: of all points 0.7 and 1.3 % lie on them."""
+    return 0.004 + 0.003 * np.clip(x / 0.0005, 0.0, 1.0) + 0.002 * np.clip((y - 0.004) / 0.0005, 0.0, 1.0)
+
+
 def cap(x: Array, y: Array) -> Array:
     """A cap of a sphere of radius 40 mm about (0, 0, −32) mm, m."""
     return -0.032 + np.sqrt(np.maximum(0.040**2 - x**2 - y**2, 0.0))
@@ -310,6 +315,26 @@ def test_the_spin_stays_where_a_sharp_board_put_it() -> None:
     assert any("rotation about the z axis" in words for words in pose.verdict.unseen)
     assert difference(pose.base_from_surface, board)[5] == pytest.approx(0.0, abs=2e-4)
     assert np.linalg.norm((pose.base_from_surface.translation - TRUE.translation)[:2]) < 3e-5
+
+
+def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
+    """What the few points on a wall have in common moves the pose by many of the deviations that their noise gives."""
+    cloud = scanned(ledges, 1)
+    found = register(Scan.of(cloud, 4000), nominal(ledges), Prior(TRUE, BOARD))
+    assert np.sqrt(found.covariance[0, 0]) < 20e-6
+    with pytest.raises(NotObservable, match="is not determined"):
+        inverted(ledges, cloud, Prior(TRUE, BOARD))
+    pose = inverted(ledges, cloud, Prior(TRUE, np.diag([0.0001**2] * 3 + [0.001**2] * 3)))
+    assert pose.verdict.unseen
+    assert pose.sigma[0] > 2 * np.sqrt(found.covariance[0, 0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_prior_that_is_off_does_not_pull_the_pose_from_steep_walls(seed: int) -> None:
+    """Their points are known to micrometres along their normals; a coarse pose is not."""
+    prior = Prior(perturbed(TRUE, [0.005, 0.001, 0.001, 0.0, 0.0, 0.0]), BOARD)
+    found = register(Scan.of(scanned(ledges, seed), 4000), nominal(ledges), prior)
+    assert np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) < 1e-4
 
 
 def test_a_plane_leaves_three_motions_open() -> None:

@@ -19,6 +19,11 @@ FREE = 1e-3
 scan (docs/theory.md, section 9)."""
 
 
+FEW = 0.01
+"""A motion that fewer of the points tell than this share counts as not determined either: those of an upright wall, or
+of a drawing's facets. An error that they share does not average out, nor is it sure that they lie on the right wall."""
+
+
 @dataclass(frozen=True)
 class Tolerance:
     """What the job allows: translation in m, rotation in rad."""
@@ -77,6 +82,20 @@ class Verdict:
                 f"{motions}. Scan more of the surface, one with more relief, or photograph the board more often",
                 *(motion.measured() for motion in self.weak),
             )
+
+
+def determined(rows: Array, radius: float) -> Array:
+    """The information (6, 6) of a scan on the motions that more than a few of its points tell.
+
+    `rows` (n, 6), surface frame: by how many σ each point's distance from the surface changes with the pose. How many
+    points tell a motion is (Σ c)²/Σ c², c each one's part of what is known of it.
+    """
+    length = np.array([1.0] * 3 + [radius] * 3)
+    values, ways = np.linalg.eigh((rows / length).T @ (rows / length))
+    parts = (rows / length @ ways) ** 2
+    tellers = parts.sum(axis=0) ** 2 / np.maximum((parts**2).sum(axis=0), np.finfo(float).tiny)
+    kept = np.where(tellers < FEW * len(rows), 0.0, values)
+    return np.asarray((ways * kept) @ ways.T * np.outer(length, length))
 
 
 def judge(

@@ -16,7 +16,7 @@ from cell.inversion.correspondences import Scan
 from cell.inversion.demands import Demands, fit_figures, require_agreement, require_board, require_fit, require_whole
 from cell.inversion.dissent import dissent
 from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import Tolerance, Verdict, judge
+from cell.inversion.observability import Tolerance, Verdict, determined, judge
 from cell.inversion.registration import Prior, register
 from cell.inversion.sweeps import balance
 from cell.reconstruction.cloud import Cloud
@@ -126,14 +126,19 @@ def invert_pose(
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
-    covariance = found.covariance + shared
     correction = difference(pose, prior.base_from_surface)
     with _shown(pose, *numbers):
         disagreement = require_board(shared, prior, correction)
     turn = np.kron(np.eye(2), pose.rotation.T)
+    ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
+    told, board = determined(ways / found.sigmas[:, None], nominal.radius), turn @ prior.information() @ turn.T
+    # Where only a few points tell a motion, the scan counts as if it told nothing.
+    unsure = np.linalg.inv(board + told) - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
+    random = found.covariance + turn.T @ unsure @ turn
+    covariance = random + shared
     verdict = judge(
         turn @ covariance @ turn.T,
-        turn @ found.scan_information @ turn.T,
+        told,
         float(1.0 / np.mean(1.0 / found.sigmas**2)),
         len(found.used),
         nominal.radius,
@@ -143,7 +148,7 @@ def invert_pose(
         verdict.require()
     return PlacePose(
         base_from_surface=pose,
-        random=found.covariance,
+        random=np.asarray(random),
         systematic=np.asarray(shared),
         covariance=np.asarray(covariance),
         verdict=verdict,

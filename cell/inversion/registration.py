@@ -39,6 +39,8 @@ OTHER_START = (0.006, float(np.radians(12.0)))
 """How far the other starts lie from the given one: height (m) and tilt (rad)."""
 WELL_LEVELLED = float(np.radians(3.0))
 """A start turned by less than this against the pose found, rad, need not be searched from twice."""
+FLOORS = (1e-4, 5e-5, 2e-5, 1e-5, 0.0, 0.0, 0.0)
+"""What is added to the points' deviations in the steps from the coarse pose to the fine one, m."""
 LEAST_POINTS = 100
 
 
@@ -211,11 +213,15 @@ def _fit(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> float:
 
 
 def _fine(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:
-    """All points: first with a weight that rejects far ones, then with those that pass the χ² gate."""
-    for _ in range(3):
+    """All points: first with a weight that rejects far ones, then with those that pass the χ² gate.
+
+    Points on an upright wall are known to micrometres along its normal, the coarse pose is not: with less than `FLOORS`
+    they would all be rejected, and the prior alone would say where the surface lies along that normal.
+    """
+    for floor in FLOORS:
         rows = correspondences(pose, scan, nominal, FINE_GATE)
         _require_points(rows, scan)
-        sigmas = sigmas_along(scan, rows)
+        sigmas = np.hypot(sigmas_along(scan, rows), floor)
         ratio = rows.heights / (4.7 * robust_scale(rows.heights / sigmas) * sigmas)
         pose, step = _update(pose, rows, np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0) / sigmas**2, prior)
         if step < 2e-7:
