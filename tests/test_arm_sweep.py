@@ -27,12 +27,14 @@ def nothing(arm: DirectArm) -> None:
     """Nobody meddles."""
 
 
-def sweep(late: float = 0.0, meddle: Callable[[DirectArm], None] = nothing) -> tuple[Swath, float]:
+def sweep(
+    late: float = 0.0, meddle: Callable[[DirectArm], None] = nothing, made: VirtualCell | None = None
+) -> tuple[Swath, float]:
     """Sweep 20 mm at 20 mm/s, each state of the arm `late` s late; and how far off the lines truly lie, m.
 
     `meddle` is called with each of ten frames from the middle.
     """
-    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
     devices, arm, camera = cell.devices, cell.arm, cell.scan_camera
     devices.vehicle.brake()
     devices.rail.home().wait(60.0)
@@ -59,6 +61,14 @@ def test_a_sweep_that_nothing_disturbed_lies_where_it_says() -> None:
     assert len(swath.lines) == pytest.approx(20, abs=2)
     assert off < 10e-6
     assert off < swath.shift < 25e-6
+
+
+def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream() -> None:
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.scan_camera.lingers = 2.0
+    swath, _ = sweep(made=cell)
+    assert cell.world.laser.at(swath.times[-1])
+    assert not cell.world.laser.at(cell.clock.now() - 1.9)
 
 
 def test_an_arm_that_is_pushed_again_and_again_is_a_fault() -> None:

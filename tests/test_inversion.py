@@ -324,9 +324,12 @@ def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
     assert np.sqrt(found.covariance[0, 0]) < 20e-6
     with pytest.raises(NotObservable, match="is not determined"):
         inverted(ledges, cloud, Prior(TRUE, BOARD))
-    pose = inverted(ledges, cloud, Prior(TRUE, np.diag([0.0001**2] * 3 + [0.001**2] * 3)))
+    board = perturbed(TRUE, [0.0001, 0.0001, 0.0001, 0.0, 0.0, 0.0])
+    pose = inverted(ledges, cloud, Prior(board, np.diag([0.0001**2] * 3 + [0.001**2] * 3)))
     assert pose.verdict.unseen
     assert pose.sigma[0] > 2 * np.sqrt(found.covariance[0, 0])
+    off = difference(pose.base_from_surface, TRUE)
+    assert abs(off[2]) < 1e-5 < 2e-5 < off[0] < 1.1e-4
 
 
 @pytest.mark.parametrize("seed", range(3))

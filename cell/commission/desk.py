@@ -90,9 +90,7 @@ class Desk:
     @property
     def cell(self) -> Cell:
         """The cell, opened if need be."""
-        if self._cell is None:
-            self._cell = self.open_cell()
-        return self._cell
+        return self.connect()
 
     @property
     def config(self) -> CellConfig:
@@ -110,6 +108,12 @@ class Desk:
     def job(self) -> Job:
         """The first job."""
         return load_job(self.job_file)[0]
+
+    def connect(self) -> Cell:
+        """Open the cell as the file now says, unless it is open."""
+        if self._cell is None:
+            self._cell = self.open_cell()
+        return self._cell
 
     def close(self) -> None:
         """Let go of the cell; `cell` opens it again."""

@@ -26,6 +26,7 @@ from cell.commission.progress import Progress, done_well
 from cell.commission.toml_edit import write_changes
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
+from drivers.interfaces import Frame
 
 CHECKS: tuple[Check, ...] = (
     *link_checks.CHECKS,
@@ -98,8 +99,8 @@ class Commissioning:
         except CellError as error:
             result.verdict = Verdict.FAILED
             result.notes.append(told(error))
-            if isinstance(error, RefusedError) and (frame := error.seen.get("frame")) is not None:
-                desk.keep(result, f"{check.name}-refused", frame)  # type: ignore[arg-type]
+            if isinstance(error, RefusedError) and isinstance(frame := error.seen.get("frame"), Frame):
+                desk.keep(result, f"{check.name}-refused", frame)
             if isinstance(error, DeviceFault):
                 # Whatever it was: what follows begins with devices that are asked anew.
                 desk.close()
@@ -143,7 +144,7 @@ class Commissioning:
                 self.progress.keep_mended(check, asdict(finding), backup.name)
         self.desk.close()
         try:
-            self.desk.cell  # noqa: B018  (opened as the file now says)
+            self.desk.connect()
         except ConfigError as error:
             self.desk.close()
             backup.replace(self.path)

@@ -84,8 +84,9 @@ class Verdict:
             )
 
 
-def determined(rows: Array, radius: float) -> Array:
-    """The information (6, 6) of a scan on the motions that more than a few of its points tell.
+def determined(rows: Array, radius: float) -> tuple[Array, Array]:
+    """The information (6, 6) of a scan on the motions that more than a few of its points tell, and what is left of the
+    scan's pull (6,) on the pose without the others, as a matrix (6, 6) to take it with.
 
     `rows` (n, 6), surface frame: by how many σ each point's distance from the surface changes with the pose. How many
     points tell a motion is (Σ c)²/Σ c², c each one's part of what is known of it.
@@ -94,8 +95,9 @@ def determined(rows: Array, radius: float) -> Array:
     values, ways = np.linalg.eigh((rows / length).T @ (rows / length))
     parts = (rows / length @ ways) ** 2
     tellers = parts.sum(axis=0) ** 2 / np.maximum((parts**2).sum(axis=0), np.finfo(float).tiny)
-    kept = np.where(tellers < FEW * len(rows), 0.0, values)
-    return np.asarray((ways * kept) @ ways.T * np.outer(length, length))
+    kept = np.where(tellers < FEW * len(rows), 0.0, 1.0)
+    told = (ways * values * kept) @ ways.T * np.outer(length, length)
+    return np.asarray(told), np.asarray((ways * kept) @ ways.T * np.outer(length, 1.0 / length))
 
 
 def judge(

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import difference
+from cell.geometry.poses import difference, perturbed
 from cell.inversion.closest import Array
 from cell.inversion.correspondences import Scan
 from cell.inversion.demands import Demands, fit_figures, require_agreement, require_board, require_fit, require_whole
@@ -131,9 +131,13 @@ def invert_pose(
         disagreement = require_board(shared, prior, correction)
     turn = np.kron(np.eye(2), pose.rotation.T)
     ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
-    told, board = determined(ways / found.sigmas[:, None], nominal.radius), turn @ prior.information() @ turn.T
-    # Where only a few points tell a motion, the scan counts as if it told nothing.
-    unsure = np.linalg.inv(board + told) - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
+    told, pull = determined(ways / found.sigmas[:, None], nominal.radius)
+    board = turn @ prior.information() @ turn.T
+    # Where only a few points tell a motion, the scan counts as if it told nothing: the pose goes back to the board's.
+    known = np.linalg.inv(board + told)
+    pose = perturbed(pose, -turn.T @ known @ (np.eye(6) - pull) @ board @ turn @ correction)
+    correction = difference(pose, prior.base_from_surface)
+    unsure = known - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
     random = found.covariance + turn.T @ unsure @ turn
     covariance = random + shared
     verdict = judge(
