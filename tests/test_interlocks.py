@@ -497,6 +497,17 @@ def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell)
     assert rail.state().position == pytest.approx(0.02, abs=1e-6)
 
 
+def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_is_tried(cell: Cell) -> None:
+    """Where the numbers of laser and claw are swapped in the configuration, the claw's output lights the laser."""
+    arm, claw = cell.devices.arm, CONFIG.claw.output
+    with cell.maintenance("what hangs on which output", ["own_switch"]), cell.devices.interlocks.tried(claw):
+        arm.set_digital_output(claw, True)
+        cell.stop()
+        arm.set_digital_output(claw, False)
+        assert not arm.state().digital_outputs >> claw & 1
+    refused("after_a_stop", lambda: arm.set_digital_output(7, False), "clear_stop(by)")
+
+
 class ReadSlowly(os.PathLike[str]):
     """A job's file that is read so slowly that a stop comes meanwhile."""
 

@@ -127,13 +127,15 @@ def _switch(desk: Desk, output: int) -> Switched:
     camera = camera_of(desk, eye)
     camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
     off, before = camera.grab(), arm.state().digital_inputs
-    try:
-        arm.set_digital_output(output, True)
-        clock.sleep(SETTLE_S)
-        on, after = camera.grab(), arm.state().digital_inputs
-    finally:
-        arm.set_digital_output(output, False)
-        clock.sleep(SETTLE_S)
+    # What lights up may be the laser, whatever the configuration says: a stop must not leave it on.
+    with desk.devices.interlocks.tried(output):
+        try:
+            arm.set_digital_output(output, True)
+            clock.sleep(SETTLE_S)
+            on, after = camera.grab(), arm.state().digital_inputs
+        finally:
+            arm.set_digital_output(output, False)
+    clock.sleep(SETTLE_S)
     return Switched(off, on, before ^ after)
 
 

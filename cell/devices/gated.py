@@ -130,9 +130,9 @@ class GatedArm(Gated[Arm]):
         self.bare.set_payload(mass, centre)
 
     def set_digital_output(self, index: int, value: bool) -> None:
-        """See `Arm.set_digital_output`. The laser is switched off also after a stop."""
+        """See `Arm.set_digital_output`. A laser, or what may be one, is switched off also after a stop."""
         command = Command("arm", "set_digital_output", {"index": index, "value": value})
-        if value or self.gate.interlocks.situation.outputs.get(index) != "laser":
+        if value or not self.gate.interlocks.may_be_laser(index):
             self.gate.require(command)
         self.bare.set_digital_output(index, value)
 

@@ -101,6 +101,7 @@ class Interlocks:
         self.situation = situation
         self._rules = tuple(rules)
         self._lifted: list[frozenset[str]] = []
+        self._tried: list[int] = []
 
     def require(self, command: Command) -> None:
         """Raise `InterlockError`, which names the rule, when one stands against the command; nothing was sent then."""
@@ -128,6 +129,19 @@ class Interlocks:
             yield
         finally:
             self._lifted.remove(entry)
+
+    @contextmanager
+    def tried(self, output: int) -> Iterator[None]:
+        """Inside this context nobody knows what hangs on this output of the arm: it counts as a laser's."""
+        self._tried.append(output)
+        try:
+            yield
+        finally:
+            self._tried.remove(output)
+
+    def may_be_laser(self, output: int) -> bool:
+        """Whether this output of the arm is switched off at any time, because a laser hangs on it or might."""
+        return self.situation.outputs.get(output) == "laser" or output in self._tried
 
     @contextmanager
     def purpose(self, name: str) -> Iterator[None]:

@@ -267,7 +267,7 @@ RULES = (
          "rail.move_to", "rail.nudge", "rail.sweep", "vehicle.enable", "vehicle.recover", "vehicle.drive", "laser.lit",
          "claw.grip", "claw.release"),
         "it belongs to a run that began later, or a person has said `Cell.clear_stop(by)`; work that was going on "
-        "begins nothing more; the laser's output may be switched off",
+        "begins nothing more; the laser's output may be switched off, and one that a commissioning is trying",
         None,
         liftable=False,
     ),
