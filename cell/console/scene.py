@@ -1,7 +1,7 @@
 """The cell's bodies for drawing: the same boxes and capsules that the planner keeps apart, each in its own frame.
 
-Made once for a configuration and a job. Whoever draws it turns the joints, shifts the carriage and places the station as
-the readings say; nothing here moves. Lengths are in m, poses 16 numbers of a 4×4 matrix, row after row.
+Made once for a configuration and a job. Whoever draws it turns the joints, shifts the carriage and places the station
+as the readings say; nothing here moves. Lengths are in m, poses 16 numbers of a 4×4 matrix, row after row.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cell.config import CellConfig
 from cell.device_config import CameraConfig
 from cell.inversion.nominal import read_mesh
-from cell.job import Job
+from cell.job import Job, load_job
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.obstacles import station_obstacles, vehicle_obstacles
@@ -35,14 +35,15 @@ SIGHT_M = {"scan": 0.15, "target": 0.30}
 """How far the cameras' pyramids are drawn."""
 
 
-def cell_scene(config: CellConfig, job: Job | None, mesh: Path | None, table: LinkTable | None = None) -> dict[str, Any]:
+def scene(config: CellConfig, job: str | Path | None = None, table: LinkTable | None = None) -> dict[str, Any]:
     """What stands and moves in the cell, as a JSON object (docs/console.md); without a job neither part nor station.
 
-    `mesh` is the file of the job's surface, `table` what the arm's controller told of its links.
+    `table` is what the arm's controller told of its links. Raises `ConfigError` for a job that cannot be read.
     """
+    loaded, mesh = (None, None) if job is None else load_job(job)
     kinematics = arm_kinematics(config.arm.model, table)
     carried = mounted(config)
-    grasp = None if job is None else job.grasp
+    grasp = None if loaded is None else loaded.grasp
     held, at = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
     swept = tool_bodies(held, at, carried)
     head = next(body for body in tool_bodies(None, None, replace(carried, travel=(0.0, 0.0))) if body.name == ON_RAIL)
@@ -65,9 +66,9 @@ def cell_scene(config: CellConfig, job: Job | None, mesh: Path | None, table: Li
             "scan": _camera(config.scan_camera, carried.scan, SIGHT_M["scan"]),
             "target": _camera(config.target_camera, carried.target, SIGHT_M["target"]),
         },
-        "sheet": _sheet(config, job),
+        "sheet": _sheet(config, loaded),
         "vehicle_from_base": _numbers(config.arm.vehicle_from_base.se3()),
-        "station": None if job is None or mesh is None else _station(config, job, mesh),
+        "station": None if loaded is None or mesh is None else _station(config, loaded, mesh),
     }
 
 
@@ -91,13 +92,14 @@ def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, Any]:
         },
         "surface_from_part": _numbers(job.place.surface_from_part.se3()),
         "base_from_place": _numbers(base_from_place_at_target(config, job)),
+        "place_from_start": _numbers(job.approach.start.se3()),
     }
 
 
 def coarser(
     vertices: NDArray[np.float64], triangles: NDArray[np.int64], most: int = MOST_TRIANGLES
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The mesh of vertices (n, 3) m and triangles (m, 3), or one of at most `most`: what lies in one cube is one vertex."""
+    """The mesh of vertices (n, 3) m and triangles (m, 3), or one of at most `most`: one vertex for all in a cube."""
     edge = float(np.ptp(vertices, axis=0).max()) / 512
     points, faces = vertices, triangles
     while len(faces) > most:
@@ -113,7 +115,7 @@ def coarser(
 
 
 def _sheet(config: CellConfig, job: Job | None) -> dict[str, Any]:
-    """The laser's fan in the scan camera's frame: from the laser to both ends of the stripe, a bit below the surface."""
+    """The laser's fan in the scan camera's frame: from the laser to both ends of the stripe, a bit below the work."""
     laser, camera = config.laser, config.scan_camera
     depth = 1.1 * (SIGHT_M["scan"] if job is None else job.scan.stand_off)
     half = depth * 0.5 * camera.height * camera.pixel / camera.focal_length

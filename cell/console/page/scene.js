@@ -64,7 +64,7 @@ export class CellScene {
   // `stage` is the element that holds the canvas. Throws where the browser draws no 3-D.
   constructor(stage) {
     this.stage = stage;
-    this.renderer = new THREE.WebGLRenderer({ antialias: true });
+    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 1.5));
     const canvas = this.renderer.domElement;
     canvas.setAttribute('role', 'img');
@@ -174,14 +174,16 @@ export class CellScene {
     return new THREE.Mesh(geometry, new THREE.MeshBasicMaterial(look));
   }
 
-  // Where all is now: joints in rad, rail in m, base_from_place and base_from_part as 16 numbers or null.
-  pose({ joints, rail, laser, holding, place: basePlace, part }) {
+  // Where all is now: joints in rad, rail in m, the vehicle's x, y, yaw since its start; base_from_place, where it was
+  // measured, and base_from_part once it was let go, as 16 numbers.
+  pose({ joints, rail, laser, holding, vehicle, place: measured, part }) {
     if (!this.scene) return;
+    const basePlace = measured ?? this.reckoned(vehicle);
     if (joints) this.joints.forEach((joint, k) => { joint.rotation.z = joints[k]; });
     if (rail !== null && rail !== undefined) this.carriage.position.copy(this.railWay).multiplyScalar(rail);
     this.sheet.visible = Boolean(laser);
     // The station stands still on the screen, the vehicle drives.
-    if (basePlace) place(this.base, matrix(basePlace).invert());
+    if (basePlace) place(this.base, (basePlace.isMatrix4 ? basePlace.clone() : matrix(basePlace)).invert());
     if (this.part) {
       const loose = part ?? null;
       const parent = loose ? this.base : this.flange;
@@ -197,6 +199,14 @@ export class CellScene {
     this.wake();
   }
 
+  // base_from_place by odometry from the job's start pose; null without a station or a reading.
+  reckoned(vehicle) {
+    const station = this.scene.station;
+    if (!station || !vehicle) return null;
+    const driven = new THREE.Matrix4().makeRotationZ(vehicle.yaw).setPosition(vehicle.x, vehicle.y, 0);
+    return matrix(station.place_from_start).multiply(driven).multiply(matrix(this.scene.vehicle_from_base)).invert();
+  }
+
   // The way that was planned: points in the base, m.
   path(points) {
     if (!this.way) return;
@@ -208,8 +218,8 @@ export class CellScene {
   // Look at the "cell" or at the "place" from near.
   view(what) {
     const near = what === 'place';
-    this.controls.target.set(near ? 0 : -0.45, 0, near ? 0.02 : 0.1);
-    this.camera.position.set(near ? -0.16 : -2.0, near ? -0.3 : -2.1, near ? 0.24 : 1.35);
+    this.controls.target.set(near ? 0 : -0.6, 0, near ? 0.01 : 0.0);
+    this.camera.position.set(near ? -0.11 : -1.9, near ? -0.2 : -1.95, near ? 0.16 : 1.15);
     this.controls.update();
     this.wake();
   }
