@@ -34,11 +34,18 @@ class Setup:
 
 @dataclass(frozen=True)
 class Request:
-    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`."""
+    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`.
+
+    `attend` with wall seconds: from now on whatever moves is stopped unless this is said again within them; 0 ends that.
+    """
 
     number: int
     name: str
     arguments: tuple[Any, ...] = ()
+
+
+UNANSWERED = -1
+"""The number of a request whose reply nobody waits for."""
 
 
 @dataclass(frozen=True)
