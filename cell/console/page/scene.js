@@ -219,7 +219,8 @@ export class CellScene {
   view(what) {
     const near = what === 'place';
     this.controls.target.set(near ? 0 : -0.6, 0, near ? 0.01 : 0.0);
-    this.camera.position.set(near ? -0.11 : -1.9, near ? -0.2 : -1.95, near ? 0.16 : 1.15);
+    const back = Math.max(1, 1.25 / this.camera.aspect);
+    this.camera.position.set(...(near ? [-0.11, -0.2, 0.15] : [-1.3, -1.95, 1.15]).map((part) => back * part)).add(this.controls.target);
     this.controls.update();
     this.wake();
   }

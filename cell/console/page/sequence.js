@@ -16,7 +16,7 @@ export class Sequence {
       event.preventDefault();
       this.begin();
     };
-    byId('dry-run').onclick = () => ask('dry_run', { job: byId('job').value });
+    byId('dry-run').onclick = () => this.rehearse(byId('job').value);
     document.querySelectorAll('[data-do]').forEach((button) => {
       button.onclick = () => this.work(button.dataset.do);
     });
@@ -42,7 +42,7 @@ export class Sequence {
     byId('until').replaceChildren(el('option', { value: '', textContent: 'the end' }), ...until);
   }
 
-  state({ run, last, dry_run: dry }, mine) {
+  state({ run, last }, mine) {
     const paused = run !== null && ['pausing', 'paused'].includes(run.state);
     say(byId('run-title'), run ? `${words(run.kind)} ${run.job ?? ''}`.trim() + this.mood(run) : 'No run');
     say(byId('run-text'), run ? this.now(run) : this.ended(last));
@@ -57,7 +57,7 @@ export class Sequence {
     byId('go-on').disabled = !mine || !paused;
     byId('abort').disabled = !mine;
     byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine; });
-    this.dry(dry ?? null);
+    if (this.computing) byId('dry-run').disabled = true;
   }
 
   mood(run) {
@@ -94,20 +94,14 @@ export class Sequence {
     return [retries, step.duration_s ? `${step.duration_s.toFixed(1)} s` : ''].filter(Boolean).join(' · ');
   }
 
-  // How the dry run in the background goes; when it has ended its motion is shown.
-  dry(dry) {
-    const said = byId('dry-said');
-    if (!dry) return say(said, '');
-    if (dry.state === 'running') {
-      const share = dry.fraction ? ` ${Math.round(100 * dry.fraction)} %` : '';
-      say(said, `Dry run of ${dry.job}${share}: ${dry.text || 'computing'} …`);
-      this.awaited = true;
-    } else {
-      say(said, `Dry run of ${dry.job}: ${dry.outcome ?? dry.state}${dry.reason ? `. ${dry.reason}` : ''}`);
-      if (this.awaited && dry.run) this.link.tell('replay', { run: dry.run, job: dry.job, dry: true });
-      this.awaited = false;
-    }
-    return undefined;
+  // The job on the virtual clock, in a process of its own: nothing moves here. Then its motion is shown.
+  async rehearse(job) {
+    byId('dry-run').disabled = this.computing = true;
+    say(byId('dry-said'), `Dry run of ${job}: computing, half a minute or so …`);
+    const answer = await this.ask('dry_run', { job });
+    this.computing = false;
+    say(byId('dry-said'), answer.text ?? '');
+    if (answer.run) this.link.tell('replay', { run: answer.run, job, dry: true });
   }
 
   heard(event) {
