@@ -13,7 +13,7 @@ from queue import Empty, Queue
 from typing import Any
 from urllib.parse import urlsplit
 
-from playwright.sync_api import Browser, Page, Playwright, Request
+from playwright.sync_api import Browser, Page, Playwright, Request, expect
 
 from tests.wire.cells import started
 
@@ -89,7 +89,7 @@ class Screen:
         screen.page.goto(link)
         # The link must not stay in the address, nor be offered again.
         assert "token" not in screen.page.url
-        screen.until("!document.body.classList.contains('stale')")
+        screen.page.wait_for_selector("body:not(.stale)")
         return screen
 
     def _asked(self, request: Request) -> None:
@@ -101,13 +101,9 @@ class Screen:
         if kind == "error" and "WebGL" not in text:
             self.complaints.append(text)
 
-    def until(self, expression: str, timeout: float = 20.0) -> None:
-        """Wait until JavaScript holds on the page."""
-        self.page.wait_for_function(expression, timeout=1e3 * timeout)
-
     def shows(self, where: str, pattern: str, timeout: float = 20.0) -> None:
         """Wait until the text of an element, by its id, matches."""
-        self.until(f"/{pattern}/i.test(document.getElementById('{where}').textContent)", timeout)
+        expect(self.page.locator(f"#{where}")).to_have_text(re.compile(pattern, re.IGNORECASE), timeout=1e3 * timeout)
 
     def hold(self, name: str = "Ann") -> None:
         """Take the cell in hand."""

@@ -42,7 +42,7 @@ export class Sequence {
     byId('until').replaceChildren(el('option', { value: '', textContent: 'the end' }), ...until);
   }
 
-  state({ run, last }, mine) {
+  state({ run, last, dry_run: dry }, mine) {
     const paused = run !== null && ['pausing', 'paused'].includes(run.state);
     say(byId('run-title'), run ? `${words(run.kind)} ${run.job ?? ''}`.trim() + this.mood(run) : 'No run');
     say(byId('run-text'), run ? this.now(run) : this.ended(last));
@@ -57,7 +57,8 @@ export class Sequence {
     byId('go-on').disabled = !mine || !paused;
     byId('abort').disabled = !mine;
     byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine; });
-    if (this.computing) byId('dry-run').disabled = true;
+    if (dry?.state === 'running') byId('dry-run').disabled = true;
+    this.dry(dry ?? null);
   }
 
   mood(run) {
@@ -94,14 +95,23 @@ export class Sequence {
     return [retries, step.duration_s ? `${step.duration_s.toFixed(1)} s` : ''].filter(Boolean).join(' · ');
   }
 
-  // The job on the virtual clock, in a process of its own: nothing moves here. Then its motion is shown.
+  // The job on the virtual clock, in a process of its own: nothing moves here.
   async rehearse(job) {
-    byId('dry-run').disabled = this.computing = true;
-    say(byId('dry-said'), `Dry run of ${job}: computing, half a minute or so …`);
-    const answer = await this.ask('dry_run', { job });
-    this.computing = false;
-    say(byId('dry-said'), answer.text ?? '');
-    if (answer.run) this.link.tell('replay', { run: answer.run, job, dry: true });
+    if ((await this.ask('dry_run', { job })).ok) this.awaited = 'asked';
+  }
+
+  // How that goes; when it has ended, whoever asked for it is shown its motion.
+  dry(dry) {
+    const said = byId('dry-said');
+    if (!dry) return say(said, '');
+    const computed = dry.state !== 'running';
+    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
+    if (!computed && this.awaited === 'asked') this.awaited = 'computing';
+    if (computed && this.awaited === 'computing') {
+      this.awaited = null;
+      if (dry.run) this.link.tell('replay', { run: dry.run, job: dry.job, dry: true });
+    }
+    return undefined;
   }
 
   heard(event) {
