@@ -42,7 +42,7 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     screen.page.click("#go-on")
     watcher.until(lambda state: state["run"]["state"] == "running")
     screen.page.click("#stop")
-    ended = watcher.until(idle)
+    ended = watcher.until(lambda state: idle(state) and state["last"])
     assert ended["last"]["outcome"] == "aborted"
     screen.shows("stop-said", "was carried out")
     screen.shows("run-text", "aborted")
