@@ -74,6 +74,10 @@ class Questions:
             raise ConfigError(f"question {number} is not asked any more; nothing was confirmed")
         return f"question {number} is confirmed"
 
+    def _given(self) -> tuple[str, str | None, str]:
+        with self._lock:
+            return self._answer or (ABORT, None, "no answer was given")
+
     def _ask(self, name: str, failure: Failure, steps: tuple[str, ...]) -> Again | None:
         """Called by the run, with the cell at rest."""
         with self._lock:
@@ -91,8 +95,7 @@ class Questions:
                 run = self._run
                 if run is not None and run.control.token.reason is not None:
                     return None
-            assert self._answer is not None
-            choice, step, said = self._answer
+            choice, step, said = self._given()
         finally:
             with self._lock:
                 self._refusal = None
