@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,7 @@ from cell.cli.options import ConfigOption, JobOption, Level, LevelOption, SeedOp
 
 if TYPE_CHECKING:
     from cell.console.console import Address
+    from cell.run.job_run import Observer, RunOutcome
     from cell.supervisor import Cell
 
 NoOpenOption = Annotated[bool, typer.Option("--no-open", help="Do not open the page; its link is printed.")]
@@ -81,6 +83,27 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     return 0
 
 
+def run_shown(
+    cell: Cell, display: Observer, *, job: str, inject: Sequence[str], until: str | None, port: int, open_page: bool
+) -> RunOutcome:
+    """Run a job and show it, and until its pages are closed what it was; on the virtual clock computed first."""
+    import time
+
+    from cell.console.console import Address, Console
+    from statemachine.watch import SignalWatch
+
+    virtual = cell.simulated is not None and cell.simulated.facts["clock"] == "virtual"
+    with Console(cell, job, Address(port=port), page_teller(open_page)) as console:
+        with console.computing(job) if virtual else nullcontext() as done:
+            outcome = cell.run(job, display, inject, until=until, script=console.script(job))
+            if done is not None:
+                done(outcome)
+        with SignalWatch() as signals:
+            while signals.reason is None and console.seen:
+                time.sleep(0.2)
+    return outcome
+
+
 def page_teller(open_page: bool) -> Callable[[str], None]:
     """What is done with each new link: printed, and the first one opened."""
     import webbrowser
@@ -88,7 +111,9 @@ def page_teller(open_page: bool) -> Callable[[str], None]:
     told: list[str] = []
 
     def tell(link: str) -> None:
-        typer.echo(f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}")
+        typer.echo(
+            f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}", err=True
+        )
         if not told and open_page:
             webbrowser.open(link)
         told.append(link)

@@ -10,7 +10,8 @@ import logging
 import socket
 import ssl
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -21,8 +22,13 @@ from cell.console.facts import cell_facts
 from cell.console.link import ServerProcess
 from cell.console.look import Look
 from cell.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
+from cell.console.trace import Trace
+from cell.job import load_job
+from cell.run.job_run import RunOutcome
 from cell.run.run import Run
+from cell.steps.kinds import find_kind
 from drivers.errors import CellError, ConfigError, InterlockError
+from statemachine.script import Script
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
@@ -136,9 +142,44 @@ class Console:
         """Process id of the server."""
         return self._server.pid
 
+    @property
+    def seen(self) -> bool:
+        """Whether a page is open."""
+        return bool(self.desk.holders.rows())
+
+    def script(self, job: str) -> Script:
+        """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
+        return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, lambda: self.seen)
+
     def began(self, run: Run[Any], job: str | None) -> None:
         """A run was begun by somebody else than a page; it is shown as well."""
+        self.desk.questions.hold(run)
         self._look.began(run, job)
+
+    @contextmanager
+    def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:
+        """Inside this context a job is done on the virtual clock, and noted; give its outcome to what this gives.
+
+        The page is told that it is being computed, and offers its motion when it is.
+        """
+        rehearsals, seed = self.desk.rehearsals, None
+        if self._cell.simulated is not None:
+            seed = self._cell.simulated.facts["seed"]
+        about = {"job": job, "seed": seed, "run": None}
+        rehearsals.present = {"state": "running", "text": "computing", **about}
+        trace = Trace(self._cell.devices, virtual=True)
+
+        def done(outcome: RunOutcome) -> None:
+            trace.write(outcome.folder)
+            told = {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
+            rehearsals.present = {**about, "state": "done", **told}
+
+        try:
+            with trace.taken():
+                yield done
+        finally:
+            if rehearsals.present["state"] == "running":
+                rehearsals.present = {**about, "state": "done", "outcome": "failed", "reason": "it could not be done"}
 
     def close(self) -> None:
         """End it: what is held by a page stops. The cell stays open."""

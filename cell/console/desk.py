@@ -259,12 +259,15 @@ class Desk:
     def _diag(self) -> Answer:
         if self.cell.current is not None:
             raise InterlockError("cell", "is at work, and its devices are asked only while it rests; wait for the end")
+        served = () if self.cell.simulated is None else self.cell.simulated.simulated
         with self._beginning:
             rows = []
             for device in self.cell.devices:
                 bare: Any = device.bare if isinstance(device, Gated) else device
                 record = self.cell.config.device(device.name)
-                rows.append(ask(device.name, record.place, bare, self.cell.devices.clock).as_dict())
+                row = ask(device.name, record.place, bare, self.cell.devices.clock)
+                row.simulated = device.name in served
+                rows.append(row.as_dict())
         well = all(row["ok"] for row in rows)
         return {"text": "all devices are well" if well else "not all devices are well", "rows": rows}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from cell.console.run_view import RunView
@@ -26,10 +27,13 @@ class Questions:
         self._answer: tuple[str, str | None, str] | None = None
         self._answered = threading.Event()
 
-    def script(self, steps: tuple[str, ...]) -> Script:
-        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there."""
+    def script(self, steps: tuple[str, ...], seen: Callable[[], bool] = lambda: True) -> Script:
+        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there.
+
+        Nobody is asked, and the refusal ends the run, when it is not `seen` by anybody then.
+        """
         self._run = None
-        return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps))
+        return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps) if seen() else None)
 
     def hold(self, run: Run[Any]) -> None:
         """This is the run that asks."""

@@ -101,7 +101,8 @@ class Server:
             http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",
             log_config=None, access_log=False, server_header=False, date_header=False, proxy_headers=False,
             ws_max_size=MOST_BYTES, ws_max_queue=8, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
-            ws_per_message_deflate=False, h11_max_incomplete_event_size=16384, timeout_keep_alive=10, timeout_graceful_shutdown=1,
+            ws_per_message_deflate=False, h11_max_incomplete_event_size=16384,
+            timeout_keep_alive=10, timeout_graceful_shutdown=1,
             ssl_certfile=self._setup.cert, ssl_keyfile=self._setup.key, backlog=WAITING,
         )  # fmt: skip
         server = uvicorn.Server(config)

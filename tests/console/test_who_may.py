@@ -266,21 +266,21 @@ def test_more_pages_than_there_is_room_for_are_told_so(server: Served) -> None:
 
 def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) -> None:
     """The state and pictures: the newest. The cloud: every increment, up to a bound."""
-    big = "x" * 100_000
+    big = "x" * 60_000
     slow = server.live(max_queue=1)
     quick = server.live()
     try:
         for page in (slow, quick):
             page.recv(timeout=10)
-        for n in range(300):
+        for n in range(150):
             server.process.tell(Show(json.dumps({"type": "state", "n": n, "fill": big})))
             time.sleep(0.004)
         server.process.tell(CloudPart({"type": "cloud", "reset": False}, b"\0" * 16))
-        seen = _states(quick, 299)
-        assert seen[-1] == 299
-        late = _states(slow, 299)
+        seen = _states(quick, 149)
+        assert seen[-1] == 149
+        late = _states(slow, 149)
         # What was on its way before it was slow, and then the newest: nothing old was kept for it.
-        assert late[-1] == 299
+        assert late[-1] == 149
         assert len(late) < len(seen)
     finally:
         slow.close()
