@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 
 class _Stay(urllib.request.HTTPRedirectHandler):
@@ -27,7 +27,6 @@ class Watcher:
 
     def __init__(self, link: str) -> None:
         self.state: dict[str, Any] = {}
-        self.pictures: set[str] = set()
         self._changed = threading.Condition()
         parts = urlsplit(link)
         try:
@@ -35,17 +34,16 @@ class Watcher:
             raise AssertionError("the link sends on to the page")
         except urllib.error.HTTPError as answer:
             cookie = answer.headers["set-cookie"].split(";")[0]
-        self._socket = connect(
+        self._link = connect(
             f"ws://{parts.netloc}/live",
             origin=f"{parts.scheme}://{parts.netloc}",
             additional_headers={"Cookie": cookie},
             compression=None,
         )
-        threading.Thread(target=self._hear, daemon=True).start()
 
-    def _hear(self) -> None:
+    def _hear(self, socket: ClientConnection) -> None:
         try:
-            for message in self._socket:
+            for message in socket:
                 if isinstance(message, bytes):
                     continue
                 said = json.loads(message)
@@ -57,11 +55,12 @@ class Watcher:
             pass
 
     def __enter__(self) -> Watcher:
+        threading.Thread(target=self._hear, args=(self._link.__enter__(),), daemon=True).start()
         self.until(lambda state: True)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._socket.close()
+        self._link.__exit__(None, None, None)
 
     def until(self, holds: Callable[[dict[str, Any]], Any], timeout: float = 20.0) -> dict[str, Any]:
         """Wait for a state in which something holds, and give it."""
