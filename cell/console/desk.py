@@ -16,7 +16,7 @@ from cell.console.holders import Holders
 from cell.console.holding import Press, Presses
 from cell.console.manual import Manual
 from cell.console.questions import Questions
-from cell.console.rehearsal import rehearse_job
+from cell.console.rehearsal import Rehearsals
 from cell.devices.diagnosis import ask
 from cell.devices.gate import Gated
 from cell.devices.jogging import Jog
@@ -52,13 +52,13 @@ class Desk:
         self.cell = cell
         self.job = job
         self.questions = Questions()
+        self.rehearsals = Rehearsals(cell)
         self.holders = Holders(self._lost)
         self.presses = Presses()
         self._say = say
         self._began = began
         self._beginning = threading.Lock()
         self.manual = Manual(cell, load_job(job)[0], self._pressed)
-        self.last: dict[str, Any] | None = None
         self._doing: dict[str, Callable[[str, Words], Answer | str]] = {
             "hold": lambda client, words: self.holders.hold(client, _text(words, "name", "")),
             "leave": lambda client, words: self.holders.leave(client),
@@ -66,7 +66,7 @@ class Desk:
             "clear_stop": self._clear_stop,
             "start": self._start,
             "resume": self._resume,
-            "dry_run": lambda client, words: rehearse_job(cell, self._job(words), _seed(words)),
+            "dry_run": lambda client, words: self.rehearsals.begin(self._job(words), self._seed(words)),
             "pause": lambda client, words: self._running("pause", Run.pause),
             "go_on": lambda client, words: self._running("go on", Run.go_on),
             "abort": self._abort,
@@ -193,7 +193,9 @@ class Desk:
 
         with self._beginning:
             if (going := self.cell.current) is not None:
-                raise InterlockError("cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again")
+                raise InterlockError(
+                    "cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again"
+                )
             threading.Thread(target=perform, name=f"console: {what}", daemon=True).start()
             for _ in range(500):
                 if begun.wait(0.01) or self.cell.current is not None:
@@ -209,7 +211,9 @@ class Desk:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", f"nothing is going on that could {what}")
         act(run)
-        return {"pause": f"asked the {run.kind} to hold before its next motion"}.get(what, f"asked the {run.kind} to {what}")
+        return {"pause": f"asked the {run.kind} to hold before its next motion"}.get(
+            what, f"asked the {run.kind} to {what}"
+        )
 
     def _abort(self, client: str, words: Words) -> str:
         reason = _text(words, "reason", "asked for at the operator's screen")
@@ -255,14 +259,24 @@ class Desk:
     def _diag(self) -> Answer:
         if self.cell.current is not None:
             raise InterlockError("cell", "is at work, and its devices are asked only while it rests; wait for the end")
+        served = () if self.cell.simulated is None else self.cell.simulated.simulated
         with self._beginning:
             rows = []
             for device in self.cell.devices:
                 bare: Any = device.bare if isinstance(device, Gated) else device
                 record = self.cell.config.device(device.name)
-                rows.append(ask(device.name, record.place, bare, self.cell.devices.clock).as_dict())
+                row = ask(device.name, record.place, bare, self.cell.devices.clock)
+                row.simulated = device.name in served
+                rows.append(row.as_dict())
         well = all(row["ok"] for row in rows)
         return {"text": "all devices are well" if well else "not all devices are well", "rows": rows}
+
+    def _seed(self, words: Words) -> int:
+        own = None if self.cell.simulated is None else self.cell.simulated.facts["seed"]
+        seed = words.get("seed", 1 if own is None else own)
+        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= 999_999:
+            raise ConfigError("a seed is a whole number from 0 to 999999")
+        return seed
 
     def _job(self, words: Words) -> str:
         """The job that is named, one of those that `/api/cell` lists; the console's own without one."""
@@ -280,10 +294,3 @@ def _text(words: Words, key: str, otherwise: str | None = None) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"this needs {key!r}, a text")
     return value[:400]
-
-
-def _seed(words: Words) -> int:
-    seed = words.get("seed", 1)
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= 999_999:
-        raise ConfigError("a seed is a whole number from 0 to 999999")
-    return seed

@@ -111,4 +111,4 @@ def _places(rail: object, times: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(readings) < 2:
         return np.zeros(len(times))
     told = np.array([row[:2] for row in readings])
-    return np.interp(times, told[:, 0], told[:, 1])
+    return np.asarray(np.interp(times, told[:, 0], told[:, 1]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from cell.console.run_view import RunView
@@ -26,10 +27,13 @@ class Questions:
         self._answer: tuple[str, str | None, str] | None = None
         self._answered = threading.Event()
 
-    def script(self, steps: tuple[str, ...]) -> Script:
-        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there."""
+    def script(self, steps: tuple[str, ...], seen: Callable[[], bool] = lambda: True) -> Script:
+        """Asks about each refusal of a run of these steps, and waits; `hold` tells it the run once it is there.
+
+        Nobody is asked, and the refusal ends the run, when it is not `seen` by anybody then.
+        """
         self._run = None
-        return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps))
+        return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps) if seen() else None)
 
     def hold(self, run: Run[Any]) -> None:
         """This is the run that asks."""
@@ -74,6 +78,10 @@ class Questions:
             raise ConfigError(f"question {number} is not asked any more; nothing was confirmed")
         return f"question {number} is confirmed"
 
+    def _given(self) -> tuple[str, str | None, str]:
+        with self._lock:
+            return self._answer or (ABORT, None, "no answer was given")
+
     def _ask(self, name: str, failure: Failure, steps: tuple[str, ...]) -> Again | None:
         """Called by the run, with the cell at rest."""
         with self._lock:
@@ -91,8 +99,7 @@ class Questions:
                 run = self._run
                 if run is not None and run.control.token.reason is not None:
                     return None
-            assert self._answer is not None
-            choice, step, said = self._answer
+            choice, step, said = self._given()
         finally:
             with self._lock:
                 self._refusal = None

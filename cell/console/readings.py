@@ -7,7 +7,7 @@ virtual clock have no time of the wall and are not read here.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -54,7 +54,7 @@ class Readings:
             return
         rail = self._devices.rail
         motion = rail.motion
-        readings = getattr(motion, "readings", ())
+        readings: Sequence[Any] = getattr(motion, "readings", ())
         if motion is not None and len(readings) and (not motion.done or motion is not self._rail_motion):
             self.rail = float(readings[-1][1])
         if idle and time.monotonic() - self._asked > REST_S and (motion is None or motion.done):
@@ -84,12 +84,7 @@ class Readings:
             "joints": None if self.arm is None else [round(float(q), 5) for q in self.arm.joints],
             "flange": None if self.arm is None else [round(float(v), 6) for v in self.arm.flange],
             "rail": None if self.rail is None else round(self.rail, 6),
-            "vehicle": None
-            if vehicle is None
-            else {
-                "x": round(vehicle.x, 5), "y": round(vehicle.y, 5), "yaw": round(vehicle.yaw, 6),
-                "speed": round(vehicle.speed, 4), "yaw_rate": round(vehicle.yaw_rate, 5), "braked": vehicle.braked,
-            },  # fmt: skip
+            "vehicle": None if vehicle is None else _vehicle(vehicle),
             "laser": self.laser,
         }
 
@@ -145,3 +140,14 @@ class Readings:
                 held = self._of("claw", lambda: self._devices.claw.holding)
                 return "" if held is None else "holds a part" if held else "empty"
         return ""
+
+
+def _vehicle(state: VehicleState) -> dict[str, Any]:
+    return {
+        "x": round(state.x, 5),
+        "y": round(state.y, 5),
+        "yaw": round(state.yaw, 6),
+        "speed": round(state.speed, 4),
+        "yaw_rate": round(state.yaw_rate, 5),
+        "braked": state.braked,
+    }

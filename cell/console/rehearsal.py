@@ -8,49 +8,69 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import subprocess
 import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cell.config import CONFIGURATION
 from drivers.errors import CellError, InterlockError
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
 
 LONGEST_S = 600.0
-_ONE = threading.Lock()
 
 log = logging.getLogger(__name__)
 
 
-def rehearse_job(cell: Cell, job: str, seed: int) -> dict[str, Any]:
-    """Do it, and wait for it: `run` is its folder's name. `CellError` when it could not be done."""
-    if not _ONE.acquire(blocking=False):
-        raise InterlockError("cell", "another dry run is being computed; wait for it")
-    try:
-        where = cell.folder / "cell.toml"
-        config = str(where) if where.is_file() else ""
-        level = cell.simulated.facts.get("level") if cell.simulated is not None else None
-        command = [sys.executable, "-m", "cell.console.rehearsal", job, str(seed), str(level or "nominal"), config]
-        # It works beside a cell that may be moving: that comes first.
-        done = subprocess.run(
-            ["nice", "-n", "10", *command], cwd=cell.folder, capture_output=True, text=True, timeout=LONGEST_S,
-            stdin=subprocess.DEVNULL,
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise CellError(f"the dry run could not be computed: {error}") from error
-    finally:
-        _ONE.release()
-    lines = done.stdout.strip().splitlines()
-    try:
-        told: dict[str, Any] = json.loads(lines[-1])
-    except (IndexError, ValueError):
-        raise CellError(f"the dry run could not be computed: {done.stderr.strip()[-300:]}") from None
-    if "error" in told:
-        raise CellError(str(told["error"]))
-    return {"text": f"dry run of {job}, seed {seed}: {told['outcome']}: {told['reason']}", **told}
+class Rehearsals:
+    """The dry runs of one cell, one at a time; `present` is the newest as the page shows it, None before."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+        self._lock = threading.Lock()
+        self.present: dict[str, Any] | None = None
+
+    def begin(self, job: str, seed: int) -> str:
+        """Begin one; `InterlockError` while another one is computed."""
+        with self._lock:
+            if self.present is not None and self.present["state"] == "running":
+                raise InterlockError("cell", "another dry run is being computed; wait for it")
+            self.present = {"state": "running", "job": job, "seed": seed, "text": "computing", "run": None}
+        threading.Thread(target=self._perform, args=(job, seed), name="console dry run", daemon=True).start()
+        return f"the dry run of {job} is being computed"
+
+    def _perform(self, job: str, seed: int) -> None:
+        about = {"state": "done", "job": job, "seed": seed, "run": None}
+        try:
+            self.present = {**about, **self._computed(job, seed)}
+        except CellError as error:
+            log.warning("dry run of %s: %s", job, error)
+            self.present = {**about, "outcome": "failed", "reason": str(error)}
+
+    def _computed(self, job: str, seed: int) -> dict[str, Any]:
+        cell = self._cell
+        config = cell.folder / CONFIGURATION
+        level = "nominal" if cell.simulated is None else str(cell.simulated.facts["level"])
+        command = [sys.executable, "-m", __name__, job, str(seed), level, str(config) if config.is_file() else ""]
+        try:
+            # Gives way: the cell beside it may be moving.
+            done = subprocess.run(
+                ["nice", "-n", "10", *command],
+                capture_output=True, text=True, timeout=LONGEST_S, stdin=subprocess.DEVNULL,
+                env=dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path)),
+            )  # fmt: skip
+            told: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise CellError(f"it could not be computed: {error}") from error
+        except (IndexError, ValueError):
+            raise CellError(f"it could not be computed: {done.stderr.strip()[-300:]}") from None
+        if "error" in told:
+            raise CellError(str(told["error"]))
+        return told
 
 
 def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
@@ -62,7 +82,7 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
     ) as cell:  # fmt: skip
-        trace = Trace(cell.devices)
+        trace = Trace(cell.devices, virtual=True)
         with trace.taken():
             outcome = cell.run(job, trace)
         trace.write(outcome.folder)

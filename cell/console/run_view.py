@@ -36,13 +36,15 @@ class RunView:
         while (event := self._events.take(0.0)) is not None:
             self._take(event)
             if event.kind != "progress":
-                told.append({"type": "event", "t": event.at, "step": event.step, "kind": event.kind, "text": words(event)})
+                told.append(
+                    {"type": "event", "t": event.at, "step": event.step, "kind": event.kind, "text": words(event)}
+                )
         return told
 
     @property
     def over(self) -> bool:
         """Whether the run has ended and everything that it told was taken."""
-        return self.run.done and self._events.closed and self.ended is not None
+        return self.run.done and self._events.closed
 
     def as_dict(self) -> dict[str, Any]:
         """For the page: see docs/console.md."""

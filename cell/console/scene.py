@@ -104,8 +104,7 @@ def coarser(
     points, faces = vertices, triangles
     while len(faces) > most:
         cubes = np.floor((vertices - vertices.min(axis=0)) / edge).astype(np.int64)
-        _, owner = np.unique(cubes, axis=0, return_inverse=True)
-        owner = owner.ravel()
+        _, owner = np.unique(cubes @ np.array([1, 1 << 20, 1 << 40]), return_inverse=True)
         count = np.bincount(owner)
         points = np.column_stack([np.bincount(owner, weights=vertices[:, axis]) / count for axis in range(3)])
         faces = owner[triangles]

@@ -6,7 +6,7 @@ Taken on the cell's own clock, so also of a run on the virtual one.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,16 @@ PERIOD_S = 0.1
 MOST = 40_000
 """Places that are kept at most: more than an hour."""
 OLD_S = 1.0
+LONGEST_S = 86_400.0
 
 
 class Trace:
     """Notes where the devices are; an observer of the run, whose steps it notes, too."""
 
-    def __init__(self, devices: Devices) -> None:
+    def __init__(self, devices: Devices, *, virtual: bool) -> None:
+        """On the virtual clock asking the rail takes no time of its line."""
         self._devices = devices
+        self._virtual = virtual
         self._begun = devices.clock.now()
         self._times: list[float] = []
         self._joints: list[list[float] | None] = []
@@ -65,13 +68,14 @@ class Trace:
         return PERIOD_S
 
     def _place(self) -> float | None:
-        """Of the rail, as its own motion has read it; where simulated in this process, as it is."""
+        """Of the rail, as its own motion has read it; on the virtual clock as it is."""
         if "rail" not in self._devices:
             return None
         rail = self._devices.rail
-        readings = getattr(rail.motion, "readings", None)
-        if readings is None:
-            return _told(lambda: round(float(rail.state().position), 6))
+        if self._virtual:
+            place: float | None = _told(lambda: round(float(rail.state().position), 6))
+            return place
+        readings: Sequence[Any] = getattr(rail.motion, "readings", ())
         return round(float(readings[-1][1]), 6) if len(readings) else (self._rail[-1] if self._rail else None)
 
     def as_dict(self) -> dict[str, Any]:
@@ -88,7 +92,7 @@ class Trace:
 def traced(devices: Devices, run: Run[Any], trace: Trace) -> None:
     """Note a run until its end, and write the trace into its folder. Blocks; for a thread of its own on the wall."""
     with trace.taken():
-        run.ended(float("inf"))
+        run.ended(LONGEST_S)
     if run.folder is not None:
         trace.write(run.folder)
 

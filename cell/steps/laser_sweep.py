@@ -51,7 +51,8 @@ def laser_sweep(
 ) -> SweepRecord:
     """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
 
-    `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep` and `arm_sweep` raise.
+    `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep`
+    and `arm_sweep` raise.
     """
     sweep = arm_sweep if scan.mode == "arm" else rail_sweep
     progress(0.01, "preparing")

@@ -26,7 +26,7 @@ def arm_lines(state: ArmState | None, limits: tuple[Sequence[float], Sequence[fl
     values = "".join(f"{v:>10.2f}{'!' if n else ' '}" for v, n in zip(joints, near, strict=True))
     return [
         f"{'arm':<{LABEL}}safety {state.safety.value}, {moves}{control}",
-        f"{'':<{LABEL}}flange {position} mm   rotation {turn} deg",
+        f"{'':<{LABEL}}flange {position} mm  rotation {turn} deg",
         f"{'  joint':<{LABEL}}" + "".join(f"{f'j{k}':>10} " for k in range(1, 7)),
         f"{'  deg':<{LABEL}}{values}",
         f"{'  limits':<{LABEL}}" + "".join(f"{f'{a:.0f}…{b:.0f}':>10} " for a, b in zip(low, high, strict=True)),

@@ -36,7 +36,7 @@ class Setup:
 class Request:
     """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`.
 
-    `attend` with wall seconds: from now on whatever moves is stopped unless this is said again within them; 0 ends that.
+    `attend` with wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
     """
 
     number: int

@@ -47,8 +47,8 @@ class RailMotion:
     """A running motion of the rail `name`.
 
     `arrived` is asked again and again: True ends the motion well, a `CellError` ends it with that error. `halt` stops
-    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s. `readings` are
-    those of its way so far, as far as it is told: host time in s, position in m, round trip in s.
+    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s. `readings`
+    are those of its way so far, as far as it is told: host time in s, position in m, round trip in s.
     """
 
     def __init__(

@@ -136,7 +136,8 @@ export class Jog {
     if (this.held) return this.end('second touch');
     this.press += 1;
     const message = { type: 'jog', press: this.press, device: entry.device, axis: entry.axis, sign };
-    const beat = () => { if (!this.link.send(message)) this.end('lost link'); };
+    // With the page's own time: one that was long on its way counts for nothing.
+    const beat = () => { if (!this.link.send({ ...message, at: performance.now() })) this.end('lost link'); };
     this.held = { button, pointer, press: this.press, timer: setInterval(beat, this.link.hello?.beat_ms ?? 80) };
     button.classList.add('held');
     say(byId('jog-said'), `Moving ${words(entry.device)} ${entry.axis} …`);

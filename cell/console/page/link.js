@@ -29,7 +29,8 @@ export class Link extends EventTarget {
     this.socket = socket;
     socket.binaryType = 'arraybuffer';
     socket.onmessage = ({ data }) => (typeof data === 'string' ? this.text(JSON.parse(data)) : this.binary(data));
-    socket.onclose = () => {
+    socket.onclose = ({ code, reason }) => {
+      console.warn(`link closed: ${code} ${reason}`);
       this.hello = null;
       this.tell('closed');
       this.look();

@@ -74,6 +74,8 @@ export class CellScene {
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener('change', () => this.wake());
+    // Who turns it looks where they want; until then the view goes with the vehicle.
+    this.controls.addEventListener('start', () => { this.looked = null; });
     this.world = new THREE.Scene();
     const sun = new THREE.DirectionalLight(0xffffff, 1.7);
     sun.position.set(-1.5, -2, 4);
@@ -184,6 +186,7 @@ export class CellScene {
     this.sheet.visible = Boolean(laser);
     // The station stands still on the screen, the vehicle drives.
     if (basePlace) place(this.base, (basePlace.isMatrix4 ? basePlace.clone() : matrix(basePlace)).invert());
+    this.follow();
     if (this.part) {
       const loose = part ?? null;
       const parent = loose ? this.base : this.flange;
@@ -215,13 +218,29 @@ export class CellScene {
     this.wake();
   }
 
-  // Look at the "cell" or at the "place" from near.
+  // Look at the whole "cell", vehicle and station, or at the "place" from near.
   view(what) {
-    const near = what === 'place';
-    this.controls.target.set(near ? 0 : -0.6, 0, near ? 0.01 : 0.0);
-    this.camera.position.set(near ? -0.11 : -1.9, near ? -0.2 : -1.95, near ? 0.16 : 1.15);
+    const base = new THREE.Vector3().setFromMatrixPosition(this.base.matrix);
+    const near = what === 'place' || !this.scene?.station;
+    this.looked = what === 'cell' ? base : null;
+    const back = Math.max(1, 1.25 / this.camera.aspect);
+    if (what === 'place') {
+      this.controls.target.set(0, 0, 0.01);
+      this.camera.position.set(-0.11, -0.2, 0.15).multiplyScalar(back).add(this.controls.target);
+    } else {
+      const apart = near ? 0 : base.length();
+      this.controls.target.copy(base).multiplyScalar(near ? 1 : 0.75).setZ(0);
+      this.camera.position.set(-1.3, -1.95, 1.15).multiplyScalar(back * (0.72 + 0.35 * apart)).add(this.controls.target);
+    }
     this.controls.update();
     this.wake();
+  }
+
+  // The view goes along with a vehicle that has driven a piece.
+  follow() {
+    if (!this.looked) return;
+    const base = new THREE.Vector3().setFromMatrixPosition(this.base.matrix);
+    if (base.distanceTo(this.looked) > 0.05) this.view('cell');
   }
 
   fit() {

@@ -16,7 +16,7 @@ export class Sequence {
       event.preventDefault();
       this.begin();
     };
-    byId('dry-run').onclick = () => ask('dry_run', { job: byId('job').value });
+    byId('dry-run').onclick = () => this.rehearse(byId('job').value);
     document.querySelectorAll('[data-do]').forEach((button) => {
       button.onclick = () => this.work(button.dataset.do);
     });
@@ -57,6 +57,7 @@ export class Sequence {
     byId('go-on').disabled = !mine || !paused;
     byId('abort').disabled = !mine;
     byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine; });
+    if (dry?.state === 'running') byId('dry-run').disabled = true;
     this.dry(dry ?? null);
   }
 
@@ -94,18 +95,21 @@ export class Sequence {
     return [retries, step.duration_s ? `${step.duration_s.toFixed(1)} s` : ''].filter(Boolean).join(' · ');
   }
 
-  // How the dry run in the background goes; when it has ended its motion is shown.
+  // The job on the virtual clock, in a process of its own: nothing moves here.
+  async rehearse(job) {
+    if ((await this.ask('dry_run', { job })).ok) this.awaited = 'asked';
+  }
+
+  // How that goes; when it has ended, whoever asked for it is shown its motion.
   dry(dry) {
     const said = byId('dry-said');
     if (!dry) return say(said, '');
-    if (dry.state === 'running') {
-      const share = dry.fraction ? ` ${Math.round(100 * dry.fraction)} %` : '';
-      say(said, `Dry run of ${dry.job}${share}: ${dry.text || 'computing'} …`);
-      this.awaited = true;
-    } else {
-      say(said, `Dry run of ${dry.job}: ${dry.outcome ?? dry.state}${dry.reason ? `. ${dry.reason}` : ''}`);
-      if (this.awaited && dry.run) this.link.tell('replay', { run: dry.run, job: dry.job, dry: true });
-      this.awaited = false;
+    const computed = dry.state !== 'running';
+    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
+    if (!computed && this.awaited === 'asked') this.awaited = 'computing';
+    if (computed && this.awaited === 'computing') {
+      this.awaited = null;
+      if (dry.run) this.link.tell('replay', { run: dry.run, job: dry.job, dry: true });
     }
     return undefined;
   }
