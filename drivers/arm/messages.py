@@ -34,7 +34,10 @@ class Setup:
 
 @dataclass(frozen=True)
 class Request:
-    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`."""
+    """Do `name` with `arguments`.
+
+    Names: stop, close, output, safe_off, payload, zero_force, move_joints, move_linear, follow.
+    """
 
     number: int
     name: str

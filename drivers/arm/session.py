@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 from drivers.arm.dashboard import Dashboard
@@ -60,7 +61,7 @@ class ArmSession:
         self._connect_timeout = connect_timeout
         self._forward, self._unknown = forward, unknown
         self._on_ended, self._on_broken = on_ended, on_broken
-        self._safing = Safing(name, setup.address, setup.safe_off, self.statistics)
+        self._safing = Safing(name, setup.address, lambda: self.setup.safe_off, self.statistics)
         self._closed = False
         self._stops = 0
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
@@ -128,6 +129,24 @@ class ArmSession:
             if value or index not in self.setup.safe_off:
                 raise
             self._require_safe_without(error)
+
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """Inside the context this output counts as one of those that are switched off for safety."""
+        before = self.setup.safe_off
+        if index in before:
+            yield
+            return
+        self._keep_off((*before, index))
+        try:
+            yield
+        finally:
+            self._keep_off(before)
+
+    def _keep_off(self, outputs: tuple[int, ...]) -> None:
+        # Known here first: should the child be lost meanwhile, the other way takes them from here.
+        self.setup = replace(self.setup, safe_off=outputs)
+        self.ask("safe_off", outputs, deadline=_OUTPUT_S)
 
     def stop(self) -> None:
         """Bring the arm to rest, and a recovery to its end; without the link by the other way."""

@@ -238,6 +238,12 @@ class UrArm:
         """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
         self._session.set_output(_check_output(self.name, index), bool(value))
 
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """See `drivers.interfaces.TriesOutputs`."""
+        with self._session.trying(_check_output(self.name, index)):
+            yield
+
     def digital_input(self, index: int) -> bool:
         """Read a digital input (0-7 standard, 8-15 configurable, 16-17 tool) from the newest state."""
         _check_output(self.name, index)

@@ -10,7 +10,7 @@ leaves the device safe and is idempotent.
 """
 
 from drivers.clock_map import Latch
-from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, why_untold
+from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, TriesOutputs, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
 from drivers.interfaces.device import Device, Examined, Identity, LinkStatistics, Motion, Reading, Vector
 from drivers.interfaces.rail import LONGEST_NUDGE_M, Nudged, Rail, RailState, Sweep
@@ -44,6 +44,7 @@ __all__ = [
     "SaysHowKnown",
     "SaysWhyUntold",
     "Sweep",
+    "TriesOutputs",
     "Vector",
     "Vehicle",
     "VehicleState",

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cell import Cell
+from cell.devices.followed_camera import FollowedCamera
 from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
@@ -60,11 +61,13 @@ def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where
             camera.grab()
             told = world.truth()["rail"]
             assert told["carriage"] == pytest.approx(0.02 * told["scale"], abs=5e-5)
+            assert isinstance(camera, FollowedCamera)
             moving = rail.move_to(0.06)
             with pytest.raises(DeadlineError):
-                camera.grab(0.4)
-            moving.wait(10.0)
+                camera.bare.grab(0.4)
             camera.grab()
+            assert camera.statistics.errors["picture asked for again"] >= 1, "into the gap once more, then after it"
+            moving.wait(10.0)
             figures = cell.devices.following.figures()
             assert figures["not_made"] >= 1
             assert "the rail" in figures["why_not"]
