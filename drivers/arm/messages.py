@@ -114,7 +114,10 @@ _SAFETY_CODES = (
     (0b0000_1110_0000, "arm.emergency_stop"),
     (0b0011_0000_0000, "arm.safety_fault"),
     (0b0000_0000_0100, "arm.protective_stop"),
+    (0b0000_0000_1000, "arm.recovery_mode"),
     (0b0000_0001_0000, "arm.safeguard_stop"),
+    # Stopped for safety by none of these: a three-position switch that was let go.
+    (0b0100_0000_0000, "arm.safeguard_stop"),
 )
 
 

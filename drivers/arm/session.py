@@ -12,6 +12,7 @@ from typing import Any
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import fault, require_remote, unlock
 from drivers.arm.feed import StateFeed
+from drivers.arm.first_look import look
 from drivers.arm.link import ArmLink
 from drivers.arm.messages import MODE_RUNNING, PLAYING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.safing import Safing
@@ -65,6 +66,7 @@ class ArmSession:
         self._closed = False
         self._stops = 0
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
+        look(name, setup.address, clock, connect_timeout)
         if setup.control:
             self._require_remote()
         self.link = self._connect(lambda: True)

@@ -46,6 +46,7 @@ _SAFETY = {
     "arm.protective_stop": ArmSafety.PROTECTIVE_STOP,
     "arm.safeguard_stop": ArmSafety.SAFEGUARD_STOP,
     "arm.emergency_stop": ArmSafety.EMERGENCY_STOP,
+    "arm.recovery_mode": ArmSafety.FAULT,
     "arm.safety_fault": ArmSafety.FAULT,
 }
 
