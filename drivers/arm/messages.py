@@ -86,12 +86,28 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """How regularly the points of a trajectory went out: their number, their rate in Hz, and the time between two, in s
+    on the wall: median, 99 % and longest."""
+
+    points: int
+    rate: float
+    median: float
+    p99: float
+    longest: float
+
+
+@dataclass(frozen=True)
 class Ended:
-    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`."""
+    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`.
+
+    `pace` is that of a trajectory's points.
+    """
 
     motion: int
     how: str
     text: str = ""
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True)

@@ -289,6 +289,7 @@ class UrArm:
     def _on_ended(self, ended: Ended) -> None:
         motion = self._motion
         if motion is not None and motion.number == ended.motion:
+            motion.pace = ended.pace
             motion.end(ended.how, ended.text)
 
     def _end_motion(self, error: Exception) -> None:
