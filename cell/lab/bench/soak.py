@@ -44,6 +44,9 @@ def soak(
                 "job": len(rows) + 1, "outcome": outcome.outcome, "reason": outcome.reason,
                 "minutes": round((time.monotonic() - begun) / 60.0, 2), "processes": counted(os.getpid()),
             })  # fmt: skip
+            if outcome.outcome == "aborted":
+                # Somebody wants the end.
+                break
             progress(min(1.0, (time.monotonic() - begun) / (60.0 * minutes)), f"job {len(rows)}: {outcome.outcome}")
     growth = growth_of(rows)
     return {"speed": speed, "jobs": rows, "growth_a_job": growth, "limits": MOST_GROWTH, "verdict": verdict(growth)}
