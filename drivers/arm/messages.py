@@ -36,12 +36,17 @@ class Setup:
 class Request:
     """Do `name` with `arguments`.
 
-    Names: stop, close, output, safe_off, payload, zero_force, move_joints, move_linear, follow.
+    Names: stop, close, output, safe_off, attend, payload, zero_force, move_joints, move_linear, follow. `attend` with
+    wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
     """
 
     number: int
     name: str
     arguments: tuple[Any, ...] = ()
+
+
+UNANSWERED = -1
+"""The number of a request whose reply nobody waits for."""
 
 
 @dataclass(frozen=True)

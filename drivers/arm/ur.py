@@ -11,7 +11,7 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from drivers.arm.wrong_arm import Forward
 from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
-from drivers.interfaces import ArmSafety, ArmState, Identity, Reading, Vector
+from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, Reading, Vector
 from drivers.link_table import LinkTable
 from drivers.quantities import check_positive, shown
 
@@ -222,6 +222,19 @@ class UrArm:
         process of its own; a `DeviceFault` says when the arm has not shown within 5 s that this was done.
         """
         self._session.stop()
+
+    @contextmanager
+    def attended(self) -> Iterator[Callable[[], None]]:
+        """While it is open, the child stops what moves once it hears nothing; see `drivers.interfaces.Attended`."""
+        self._session.require_control()
+        self._session.require_link()
+        link = self._session.link
+        link.tell("attend", ATTENDED_S)
+        try:
+            yield lambda: link.tell("attend", ATTENDED_S)
+        finally:
+            with suppress(DeviceError):
+                link.tell("attend", 0.0)
 
     # --- settings, inputs and outputs ---
 

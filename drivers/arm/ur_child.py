@@ -7,6 +7,7 @@ switches outputs off and sees that the arm stands.
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import signal
@@ -25,7 +26,7 @@ from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.messages import MODE_RUNNING, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
 from drivers.arm.outbox import Message, Outbox
 from drivers.arm.ur_control import ControlThread
 from drivers.arm.ur_outputs import OFF_S, keep_low, make_safe, switch_output
@@ -57,6 +58,7 @@ class Child:
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
         self._outbox = Outbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        self._attended_until = math.inf
         self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
 
@@ -114,6 +116,9 @@ class Child:
                     self._send(Reply(request.number, self._switch(*request.arguments)))
                 elif request.name == "safe_off":
                     self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
+                elif request.name == "attend":
+                    silence = request.arguments[0]
+                    self._attended_until = time.monotonic() + silence if silence > 0 else math.inf
                 else:
                     self._control.submit(request)
         self.shut_down(closing)
@@ -167,6 +172,9 @@ class Child:
         while True:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
+            if time.monotonic() > self._attended_until:
+                self._attended_until = math.inf
+                self._control.submit(Request(UNANSWERED, "stop"))
             if not self._packets.connected:
                 self._lose("the arm closed the connection")
             if os.getppid() != self._parent:

@@ -9,6 +9,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 from drivers.clock import Clock
@@ -34,6 +35,9 @@ class Link(Protocol):
     @property
     def closed(self) -> bool:
         """True once `close` was called."""
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
 
     def stop(self) -> None:
         """Stop whatever the drive does; commands issued earlier are refused."""
@@ -138,12 +142,14 @@ class RailAxis(ABC):
         with self._starting:
             issued = self._free()
             duration = self._start(position, speed, issued)
+            readings: Samples = []
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=self._arrival(position, issued, []),
+                arrived=self._arrival(position, issued, readings),
                 halt=self._halt(issued),
                 duration=duration,
+                readings=readings,
             )
             return self._motion
 
@@ -203,6 +209,11 @@ class RailAxis(ABC):
         self._require_control()
         self._homing = False
         self._link.stop()
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """While it is open, a helper stops the motor once it hears nothing; see `drivers.interfaces.Attended`."""
+        self._require_control()
+        return self._link.attended()
 
     def close(self) -> None:
         """Stop the motor, unless it is only looked at, and close the port."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, descriptor_of
+from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.rail.registers import Action
 from drivers.serial_port import FAILURES, open_port
 
@@ -160,7 +161,11 @@ class ModbusLink:
                 self._last_words.close()
             self._port.close()
 
-    def _stop_after_death(self) -> None:
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
+        return attended_by(self.name, self._stop_after_death())
+
+    def _stop_after_death(self) -> LastWords | None:
         """From the first motion on: who never moved it has nothing to end."""
         port = descriptor_of(self._port)
         if self._last_words is None and port is not None:
@@ -168,6 +173,7 @@ class ModbusLink:
             words = [_frame(self._unit, WRITE_ONE, *_words(action.address, value)) for value in action.writes]
             # Twice: the owner may have died in the middle of a frame of its own, which spoils the first one.
             self._last_words = LastWords(self.name, port, words * 2)
+        return self._last_words
 
     def _exchange(self, request: bytes, length: int, what: str, issued: int | None) -> tuple[bytes, float, float]:
         """The choke point: send `request`, give its reply of `length` bytes, the middle of the round trip, its length.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from typing import TypeVar
 
 import serial
@@ -17,7 +17,7 @@ import serial
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, descriptor_of
+from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.rail.tmcl_codec import (
     STATUS_OK,
     STATUS_TEXT,
@@ -163,11 +163,16 @@ class TmclLink:
                 self._last_words.close()
             self._port.close()
 
-    def _stop_after_death(self) -> None:
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
+        return attended_by(self.name, self._stop_after_death())
+
+    def _stop_after_death(self) -> LastWords | None:
         """From the first motion on: who never moved it has nothing to end."""
         port = descriptor_of(self._port)
         if self._last_words is None and port is not None:
             self._last_words = LastWords(self.name, port, self._stop_words)
+        return self._last_words
 
     def _command(self, command: Command, kind: int, value: int = 0, *, issued: int | None = None) -> Reply:
         request = Request(self._address, command, kind, self._motor, value)
