@@ -15,6 +15,7 @@ from cell.inversion.closest import Array
 from cell.inversion.correspondences import Scan
 from cell.inversion.demands import Demands, fit_figures, require_agreement, require_board, require_fit, require_whole
 from cell.inversion.dissent import dissent
+from cell.inversion.elsewhere import require_alone
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, determined, judge
 from cell.inversion.registration import Prior, register
@@ -133,6 +134,8 @@ def invert_pose(
     ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
     told, pull = determined(ways / found.sigmas[:, None], nominal.radius)
     board = turn @ prior.information() @ turn.T
+    with _shown(pose, *numbers):
+        require_alone(scan, pose, nominal, prior, tolerance, told)
     # Where only a few points tell a motion, the scan counts as if it told nothing: the pose goes back to the board's.
     known = np.linalg.inv(board + told)
     pose = perturbed(pose, -turn.T @ known @ (np.eye(6) - pull) @ board @ turn @ correction)
