@@ -90,6 +90,20 @@ def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell) -> None
         world.scene = scene
 
 
+def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
+    virtual, before, since = cell
+    world, scene = virtual.world, virtual.world.scene
+    shown = world._cameras._shown
+    drifted = replace(scene, workshop=replace(scene.workshop, pointing=0.4e-3))
+    world._cameras._shown = drifted, *shown[1:]
+    world.stand(1e5)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        world._cameras._shown = shown
+    assert slip.size < 2.5e-5
+
+
 def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
     virtual, before, since = cell
     spec = virtual.scan_camera.model.spec
@@ -111,6 +125,8 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
     assert "slipped by +0.075 mm along" in some.notes[0]
     # In the base, along the camera's x axis, and no less than the plate shows.
     assert np.sqrt(np.diag(some.covariance(axes))[2]) >= 1.5 * NOTED_M
+    # A head that turned on its mount, 85 mm before the plate.
+    assert np.sqrt(np.diag(some.covariance(axes))[3:]) == pytest.approx(3 * [1.5 * NOTED_M / 0.085])
     small.require(), some.require()
     with pytest.raises(RefusedError, match=r"scan head has slipped by \+0\.165 mm along"):
         far.require()

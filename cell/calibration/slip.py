@@ -21,6 +21,7 @@ NOTED_M = 0.05e-3
 LARGEST_M = 0.15e-3
 LARGEST_LAG_S = 8e-3
 """Pictures that come so much later than at the calibration are paired with the wrong places of the rail."""
+PLATE_DEPTH_M = 0.085
 LEVER = 1.5
 """What a head that has turned on its mount does at the surface, of what it does at the nearer plate."""
 ENDS_DIFFER = 3.0
@@ -31,12 +32,13 @@ ENDS_DIFFER = 3.0
 class Slip:
     """How far the head has moved against the plate since the calibration: `along` the rail's way and `across` it, m, in
     the camera's frame (across: 0 where a covered end hides it, which `hidden` says), and how much later, s, its
-    pictures come (`lag`)."""
+    pictures come (`lag`). `depth` is how far the plate is from the camera, m."""
 
     along: float
     across: float
     lag: float
     hidden: bool = False
+    depth: float = PLATE_DEPTH_M
 
     @property
     def shift(self) -> tuple[float, float]:
@@ -71,6 +73,8 @@ class Slip:
         if self.size > NOTED_M:
             shift = LEVER * (axes @ np.array([self.along, self.across, 0.0]))
             made[:3, :3] = np.outer(shift, shift)
+            # A turn on its mount that shifts the plate by as much.
+            made[3:, 3:] = (self.size / self.depth) ** 2 * np.eye(3)
         return made
 
     def require(self) -> None:
@@ -98,7 +102,8 @@ def slip_since(before: Witness, now: Witness, camera: CameraModel, plane: LightP
     both = np.flatnonzero(np.isfinite(before.columns) & np.isfinite(now.columns))
     at = np.column_stack([before.columns[both], both.astype(np.float64)])
     points, _ = triangulate(camera, plane, at)
-    per_px = float(np.median(points[:, 2])) / camera.fx
+    depth = float(np.median(points[:, 2]))
+    per_px = depth / camera.fx
     # A laser that points elsewhere meets the plate elsewhere, and its edge at another place of the rail.
     by_line = per_px * float(np.median(now.columns[both] - before.columns[both]))
     along = (now.edge.place - before.edge.place) * float(rail_direction[0]) + by_line
@@ -106,4 +111,4 @@ def slip_since(before: Witness, now: Witness, camera: CameraModel, plane: LightP
     hidden = bool(abs(ends[1] - ends[0]) > ENDS_DIFFER)
     # The plate is seen to move against the head; the head has moved the other way.
     across = 0.0 if hidden else -per_px * camera.fx / camera.fy * float(ends.mean())
-    return Slip(-along, across, now.edge.lag - before.edge.lag, hidden)
+    return Slip(-along, across, now.edge.lag - before.edge.lag, hidden, depth)

@@ -14,7 +14,7 @@ from cell.inversion.closest import Array
 from cell.inversion.correspondences import Scan, sigmas_along
 from cell.inversion.correspondences import correspondences as matched
 from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import FREE, Tolerance
+from cell.inversion.observability import FREE
 from cell.inversion.registration import Prior
 from cell.inversion.search import MOST_SHIFT, candidates
 from drivers.errors import Measured, RefusedError
@@ -33,12 +33,12 @@ TOLD_APART = 25.0
 """By so much more, in squared σ, the board has to be against the other place: 5 σ."""
 LEAST_TOLD = 3 * FREE
 """Least information of a motion, in those of a point along its normal, for it to lead to another place."""
+APART_M = 1e-3
+"""By less at the surface no other place is one of its own."""
 STEPS, GATE = 12, 0.002
 
 
-def require_alone(
-    scan: Scan, pose: pin.SE3, nominal: NominalSurface, prior: Prior, tolerance: Tolerance, information: Array
-) -> None:
+def require_alone(scan: Scan, pose: pin.SE3, nominal: NominalSurface, prior: Prior, information: Array) -> None:
     """Refuse a place base_from_surface beside which there is another one that scan and board allow as well.
 
     `information` (6, 6) of the scan on the pose, surface axes: along a motion that it leaves to the board there are no
@@ -56,7 +56,7 @@ def require_alone(
         moved = pose.inverse() * other
         middle = moved.act(nominal.centre) - nominal.centre
         turned = float(np.linalg.norm(pin.log3(moved.rotation)))
-        if np.linalg.norm(middle) < tolerance.translation and turned < tolerance.rotation:
+        if np.linalg.norm(middle) + turned * nominal.radius < APART_M:
             continue
         away = difference(other, prior.base_from_surface)
         against = float(away @ board @ away - off @ board @ off)

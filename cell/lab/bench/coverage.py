@@ -1,8 +1,8 @@
 """What a counted coverage says of the true one: k of n worlds inside leave an interval, and few worlds a wide one.
 
-Of 20 worlds a product whose stated 95 % ellipsoids are right has all inside in 36 % of campaigns, 17 or fewer in
-8 %. So a count is held against 90 to 98 % by its interval: it is wrong where no true coverage of that range explains it.
-Of 20 worlds that is so from 14 on downwards; that too many are inside shows from 183 worlds on.
+Of 20 worlds a product whose stated 95 % ellipsoids are right has all inside in 36 % of campaigns, 17 or fewer in 8 %.
+So a count is held against 90 to 98 % by its interval: it is wrong where no true coverage of that range explains it. Of
+20 worlds that is so from 14 on downwards; that too many are inside shows from 183 worlds on.
 """
 
 from __future__ import annotations
