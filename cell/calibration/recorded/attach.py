@@ -121,6 +121,10 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
             f"leaves {best.left}; by name they leave {decision.by_name.left}"
         )
+    understood.notes += [
+        f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
+        for name in decision.boards_own
+    ]
     problem, refused = scale_problem(best, pitch)
     if problem and refused:
         understood.refused = f"no hand-eye: {problem}"
