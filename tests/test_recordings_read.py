@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cell.calibration.recorded.attach import Options, attach_poses
+from cell.calibration.recorded.command import calibrate_folder
 from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
@@ -464,6 +466,37 @@ def test_poses_that_are_shifted_by_one_picture_are_named(recording, seen):
     assert "previous picture" in understood.refused
     assert "shifted by one" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
+
+
+@pytest.mark.parametrize("whose", ["poses", "pictures"])
+def test_mirror_images_are_named(recording, seen, whose):
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    left_handed = whose == "poses"
+    one_file_each(recording, lambda p: row((mirror @ p @ mirror if left_handed else p).ravel()))
+    if not left_handed:
+        # In a mirror the board's rows begin at their other end.
+        ends = np.arange(35).reshape(5, 7)[:, ::-1].ravel()
+        flipped = [replace(f.view, pixels=([SIZE[0] - 1, 0] + [-1, 1] * f.view.pixels)[ends]) for f in seen.values()]
+        seen = {n: replace(f, view=v) for (n, f), v in zip(seen.items(), flipped, strict=True)}
+    _, understood, _ = understand(recording, seen)
+    assert "as mirror images they agree" in understood.refused
+
+
+def test_rows_that_are_sorted_as_words_are_found_out_and_said(tmp_path, pictures, seen):
+    names = [f"shot{k}.png" for k in range(8, 16)]
+    for name, path in zip(names, sorted(pictures.iterdir()), strict=True):
+        (tmp_path / name).symlink_to(path)
+    order = sorted(range(len(names)), key=names.__getitem__)
+    (tmp_path / "poses.txt").write_text("\n".join(row([*POSES[k][:3, 3], *quaternion(POSES[k])]) for k in order))
+    frames, understood, _ = understand(tmp_path, dict(zip(names, seen.values(), strict=True)))
+    assert "sorted as words (1, 10, 2)" in understood.notes[0]
+    assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
+
+
+def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):
+    (tmp_path / "left").symlink_to(pictures)
+    with pytest.raises(ConfigError, match=r"8 pictures with --board.*pictures are in left \(8\)"):
+        calibrate_folder(tmp_path, None)
 
 
 def test_times_match_poses_to_pictures(tmp_path, pictures, seen):

@@ -16,6 +16,7 @@ from cell.calibration.recorded.agreement import SCALE_SIGMAS, UNITS, Fit, angle,
 from cell.calibration.recorded.conventions import readings_of, why_not
 from cell.calibration.recorded.series import Series
 from cell.calibration.solve.consistency import turns_apart
+from cell.geometry.poses import from_parts
 from drivers.errors import RefusedError
 
 # The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
@@ -24,6 +25,8 @@ CLEAR, AGREES = 2.5, 0.06
 AS_MUCH, CLEAR_SHIFT, LEAST_SHIFT = 0.95, 5.0, 0.002
 # Poses that are shifted by one picture are named when they then agree so much better, in so many frames.
 SHIFTED, LEAST_SHIFTED = 0.5, 6
+# What a mirror in the camera, or a left-handed base, does.
+MIRROR = np.diag([-1.0, 1.0, 1.0])
 QUICK_LOOK, ALIKE = 24, 0.2
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
@@ -134,7 +137,7 @@ def _shifted(
     setup: str | None,
     shifts: Sequence[int],
 ) -> str:
-    """The question that poses ask which agree with no picture: do they agree with the pictures before or after?"""
+    """The question that poses ask which agree with no picture: do they with the one before or after, or in a mirror?"""
     for step in shifts:
         moved = []
         for one in series:
@@ -149,6 +152,15 @@ def _shifted(
                 f"with the pose of the {'next' if step > 0 else 'previous'} picture, {fits[0].text}, they leave "
                 f"{fits[0].left}: are poses and pictures shifted by one, and one of either missing? Number them anew"
             )
+    mirrored = {
+        k: [from_parts(MIRROR @ b.translation, MIRROR @ b.rotation @ MIRROR) for b in boards[k]] for k in boards
+    }
+    fits, _ = _all_fits(series, mirrored, wanted, setup) if _turn_alike(series, boards, wanted) else ([], [])
+    if fits and fits[0].score < SHIFTED * AGREES and len(boards) >= LEAST_SHIFTED:
+        return (
+            f"as mirror images they agree, {fits[0].text}, and leave {fits[0].left}: are the pictures flipped, or are "
+            "the poses from a left-handed system? Save the pictures as the sensor has them, or turn one axis round"
+        )
     angles = any(one.count == 6 for one in series)
     return (
         f"are they the poses of these pictures, of the flange{' (and not joint angles)' if angles else ''}, and is the "
