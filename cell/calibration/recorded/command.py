@@ -120,7 +120,7 @@ def _from_frames(
     try:
         found = camera_of(frames, options.camera)
     except RefusedError as error:
-        notes.append(f"no intrinsics: {error}")
+        result["refused"]["intrinsics"] = f"no intrinsics: {error}"
     understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
     result["poses"] = understood.about
     notes += understood.notes
