@@ -96,18 +96,15 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
 def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:
     """RefusedError where the pictures from one on are of another camera than those before, by the cameras of both."""
     roomy = replace(found, model=replace(found.model, k1=True, k2=True, one_focal=False))
-    at = parted_at(roomy, views)
-    if at is None:
-        return
-    before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
-    focal = before.camera.fx, after.camera.fx
-    sigma = before.sigma[0], after.sigma[0]
-    if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
-        raise RefusedError(
-            f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from {names[at]} on "
-            f"{focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; give both parts by "
-            "themselves, each in a folder of its own"
-        )
+    for at in parted_at(roomy, views):
+        before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
+        focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
+        if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
+            raise RefusedError(
+                f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from {names[at]} "
+                f"on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; give both parts "
+                "by themselves, each in a folder of its own"
+            )
 
 
 def _of_all(found: Intrinsics, views: Sequence[BoardView]) -> Intrinsics:

@@ -24,6 +24,8 @@ FOREIGN = 10.0
 """F from which a picture may be foreign. Chance brings 2 among ten pictures, 7 once in 10⁵ of them."""
 AT_ONCE = 2.5
 """So many times the F of two mixtures of pictures from before and after."""
+ABOUT = 0.8
+"""Splits of so much of the largest F are looked at, too."""
 LEAST_PART = 3
 """Pictures before and after a change of the camera that may tell one."""
 ALONE = 4.0
@@ -50,19 +52,21 @@ def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, fl
     return (odd, float(wants[odd])) if wants[odd] > ALONE * others.max() else None
 
 
-def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> int | None:
-    """The view from which on all want another camera than those before, or None; by the test alone.
+def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
+    """Views from each of which on all may want another camera than those before; empty where none is. By the test alone.
 
     Where any half of the views wants one, board or lens are not what the model has, and nothing was changed in between.
     """
     count = len(views)
     if count < 2 * LEAST_PART:
-        return None
+        return []
     splits = [np.arange(count) >= k for k in range(LEAST_PART, count - LEAST_PART + 1)]
     mixed = [np.arange(count) % step < step // 2 for step in (2, 4)]
     wants = own_cameras(found, views, [*splits, *mixed])
-    best = int(np.argmax(wants[: len(splits)]))
-    return best + LEAST_PART if wants[best] > max(FOREIGN, AT_ONCE * wants[len(splits) :].max()) else None
+    split, rest = wants[: len(splits)], wants[len(splits) :]
+    if split.max() < max(FOREIGN, AT_ONCE * rest.max()):
+        return []
+    return [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
 
 
 def own_cameras(found: Intrinsics, views: Sequence[BoardView], groups: Sequence[Array] | None = None) -> Array:
