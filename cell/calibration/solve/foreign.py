@@ -53,7 +53,7 @@ def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, fl
 
 
 def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
-    """Views from each of which on all may want another camera than those before; empty where none is. By the test alone.
+    """Views from each of which on all may want another camera than those before, by the test alone; empty where none is.
 
     Where any half of the views wants one, board or lens are not what the model has, and nothing was changed in between.
     """
