@@ -152,7 +152,7 @@ def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
     left = [k for k, f in enumerate(frames) if f.shows is None and f.reason not in ASIDE]
     if len(left) != len(one.records):
         return False
-    one.by, one.of = "order", dict(zip(left, one.records, strict=True))
+    one.by, one.of, one.alone = "order", dict(zip(left, one.records, strict=True)), []
     return True
 
 
