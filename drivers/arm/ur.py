@@ -46,6 +46,7 @@ _SAFETY = {
     "arm.protective_stop": ArmSafety.PROTECTIVE_STOP,
     "arm.safeguard_stop": ArmSafety.SAFEGUARD_STOP,
     "arm.emergency_stop": ArmSafety.EMERGENCY_STOP,
+    "arm.recovery_mode": ArmSafety.FAULT,
     "arm.safety_fault": ArmSafety.FAULT,
 }
 
@@ -251,6 +252,12 @@ class UrArm:
         """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
         self._session.set_output(_check_output(self.name, index), bool(value))
 
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """See `drivers.interfaces.TriesOutputs`."""
+        with self._session.trying(_check_output(self.name, index)):
+            yield
+
     def digital_input(self, index: int) -> bool:
         """Read a digital input (0-7 standard, 8-15 configurable, 16-17 tool) from the newest state."""
         _check_output(self.name, index)
@@ -295,6 +302,7 @@ class UrArm:
     def _on_ended(self, ended: Ended) -> None:
         motion = self._motion
         if motion is not None and motion.number == ended.motion:
+            motion.pace = ended.pace
             motion.end(ended.how, ended.text)
 
     def _end_motion(self, error: Exception) -> None:

@@ -49,6 +49,7 @@ class Child:
     def __init__(self, pipe: Connection, setup: Setup) -> None:
         self._pipe = pipe
         self._setup = setup
+        self._safe_off = setup.safe_off
         self._parent = os.getppid()
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
@@ -113,9 +114,14 @@ class Child:
                     break
                 if request.name == "output":
                     self._send(Reply(request.number, self._switch(*request.arguments)))
+<<<<<<< HEAD
                 elif request.name == "attend":
                     silence = request.arguments[0]
                     self._attended_until = time.monotonic() + silence if silence > 0 else math.inf
+=======
+                elif request.name == "safe_off":
+                    self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
+>>>>>>> main
                 else:
                     self._control.submit(request)
         self.shut_down(closing)
@@ -124,6 +130,18 @@ class Child:
         if switch_output(self._io, index, value):
             return None
         return "arm.refused", f"the controller did not accept a value for output {index}"
+
+    def _go_off_in_the_end(self, outputs: tuple[int, ...]) -> tuple[str, str] | None:
+        """From now on these go off when the owner is lost, and no others."""
+        freed = tuple(index for index in self._safe_off if index not in outputs)
+        # Both until the controller knows: one too many does no harm.
+        self._safe_off = (*outputs, *freed)
+        try:
+            keep_low(self._setup.address, outputs, freed)
+        except (RuntimeError, OSError) as error:
+            return "arm.refused", f"the controller did not take which outputs it keeps low: {error}"
+        self._safe_off = outputs
+        return None
 
     def shut_down(self, closing: int = 0) -> None:
         """Outputs off, motion stopped, then the end; bounded in time whatever the arm does."""
@@ -137,13 +155,13 @@ class Child:
         os._exit(0)
 
     def _leave_safe(self) -> None:
-        for index in self._setup.safe_off:
+        for index in self._safe_off:
             switch_output(self._io, index, False)
         self._control.submit(Request(0, "close"))
         if not self._control.finished.wait(3.0):
             with suppress(DeviceError):
                 Dashboard("arm", self._setup.address).ask("stop")
-        mask = sum(1 << index for index in self._setup.safe_off)
+        mask = sum(1 << index for index in self._safe_off)
         for _ in range(250):
             if not self._snapshot.outputs & mask:
                 break

@@ -10,7 +10,7 @@ leaves the device safe and is idempotent.
 """
 
 from drivers.clock_map import Latch
-from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, why_untold
+from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, TriesOutputs, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
 from drivers.interfaces.device import (
     ATTENDED_S,
@@ -56,6 +56,7 @@ __all__ = [
     "SaysHowKnown",
     "SaysWhyUntold",
     "Sweep",
+    "TriesOutputs",
     "Vector",
     "Vehicle",
     "VehicleState",
