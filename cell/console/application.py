@@ -98,8 +98,8 @@ class Application:
             Route("/", self._index),
             Route(ENTER, self._enter),
             Route("/api/cell", self._tell_cell),
-            Route("/api/runs", lambda request: self._from_archive(Archive.runs)),
-            Route("/api/trend", lambda request: self._from_archive(Archive.trend)),
+            Route("/api/runs", self._runs),
+            Route("/api/trend", self._trend),
             Route("/api/runs/{run}", self._run),
             Route("/api/runs/{run}/replay", self._replay),
             Route("/api/runs/{run}/pictures/{name}", self._picture),
@@ -126,6 +126,12 @@ class Application:
             return _json(self._cell)
         status, words = await self._of_job(job[:200])
         return _json(words, status)
+
+    async def _runs(self, request: Request) -> Response:
+        return await self._from_archive(Archive.runs)
+
+    async def _trend(self, request: Request) -> Response:
+        return await self._from_archive(Archive.trend)
 
     async def _from_archive(self, what: Callable[[Archive], Any]) -> Response:
         return _json(await run_in_threadpool(what, self._archive))

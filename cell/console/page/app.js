@@ -89,9 +89,9 @@ function hold(state) {
   show(byId('hold-form'), !state.holder);
   show(byId('hold-mine'), mine());
   const others = state.clients.filter((client) => client.id !== link.hello?.id);
-  remake(byId('hand-over'), others, () => [el('option', { value: '', textContent: others.length ? 'Hand over to …' : 'Nobody else is here' }),
+  remake(byId('hand-over'), others, () => [el('option', { value: '', textContent: 'Hand over to …' }),
     ...others.map((client) => el('option', { value: client.id, textContent: client.name || `screen ${client.id}` }))]);
-  byId('hand-over').disabled = !others.length;
+  show(byId('hand-over'), others.length > 0);
   byId('clear-stop').disabled = !mine();
 }
 
@@ -113,7 +113,7 @@ link.on('freshness', ({ stale, age }) => {
   document.body.classList.toggle('stale', stale);
   show(byId('lost'), stale);
   const since = Number.isFinite(age) ? ` for ${(age / 1e3).toFixed(0)} s` : '';
-  if (stale) say(byId('lost'), `NO CONNECTION to the cell${since}. What you see is old. STOP may not get through: use the emergency stop.`);
+  if (stale) say(byId('lost'), `NO CONNECTION to the cell${since}. What you see is old. STOP may not get through: use the emergency stop. ${link.refused}`);
 });
 link.on('cloud', ({ header, payload }) => {
   if (!scene) return;
@@ -149,6 +149,7 @@ async function meet(job) {
     notice({ ok: false, text: problem.message });
     return;
   }
+  sceneOf = job ?? cell.job ?? null;
   say(byId('cell-name'), cell.name);
   document.title = `${cell.name} · assembly cell`;
   if (!job) {

@@ -11,6 +11,7 @@ export class Link extends EventTarget {
     this.hello = null;
     this.state = null;
     this.stale = null;
+    this.refused = '';
     this.connect();
     setInterval(() => this.look(), 100);
   }
@@ -29,13 +30,19 @@ export class Link extends EventTarget {
     this.socket = socket;
     socket.binaryType = 'arraybuffer';
     socket.onmessage = ({ data }) => (typeof data === 'string' ? this.text(JSON.parse(data)) : this.binary(data));
-    socket.onclose = ({ code, reason }) => {
-      console.warn(`link closed: ${code} ${reason}`);
+    socket.onclose = () => {
+      if (this.hello === null) this.why();
       this.hello = null;
       this.tell('closed');
       this.look();
       setTimeout(() => this.connect(), AGAIN_MS);
     };
+  }
+
+  // Why there is no link: a server that knows this browser no more says so in words.
+  async why() {
+    const answer = await fetch('/api/cell').catch(() => null);
+    this.refused = answer?.status === 401 ? await answer.text() : '';
   }
 
   text(message) {
