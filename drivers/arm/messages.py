@@ -34,15 +34,10 @@ class Setup:
 
 @dataclass(frozen=True)
 class Request:
-<<<<<<< HEAD
-    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`.
-
-    `attend` with wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
-=======
     """Do `name` with `arguments`.
 
-    Names: stop, close, output, safe_off, payload, zero_force, move_joints, move_linear, follow.
->>>>>>> main
+    Names: stop, close, output, safe_off, payload, zero_force, move_joints, move_linear, follow; `attend` with wall
+    seconds: from now on what moves is stopped unless this is said again within them, and 0 ends that.
     """
 
     number: int
