@@ -96,12 +96,20 @@ def invert_pose(
     return replace(registered(by_poses, kinematic + unknown), notes=(words(rocking),))
 
 
+def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
+    """What a scan head that has slipped since the calibration may move the place by, (6, 6), base axes."""
+    if sweep.slip is None:
+        return np.zeros((6, 6))
+    camera = sweep.base_from_flange.rotation @ here.calibration.scan.flange_from_camera.rotation
+    return sweep.slip.covariance(camera)
+
+
 def _at(here: Workplace, context: StepContext) -> PlacePose:
     sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
     times = np.concatenate([swath.times for swath in sweep.swaths])
     taken = Lines(times, here.config.arm.vehicle_from_base.se3().inverse())
     try:
-        found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+        found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
     except NotObservable as refused:
         if not sweep.notes:
             raise

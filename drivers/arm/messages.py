@@ -36,8 +36,8 @@ class Setup:
 class Request:
     """Do `name` with `arguments`.
 
-    Names: stop, close, output, safe_off, payload, zero_force, move_joints, move_linear, follow; `attend` with wall
-    seconds: from now on what moves is stopped unless this is said again within them, and 0 ends that.
+    Names: stop, close, output, safe_off, attend, payload, zero_force, move_joints, move_linear, follow. `attend` with
+    wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
     """
 
     number: int

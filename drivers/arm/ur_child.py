@@ -114,11 +114,11 @@ class Child:
                     break
                 if request.name == "output":
                     self._send(Reply(request.number, self._switch(*request.arguments)))
+                elif request.name == "safe_off":
+                    self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
                 elif request.name == "attend":
                     silence = request.arguments[0]
                     self._attended_until = time.monotonic() + silence if silence > 0 else math.inf
-                elif request.name == "safe_off":
-                    self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
                 else:
                     self._control.submit(request)
         self.shut_down(closing)

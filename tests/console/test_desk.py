@@ -25,15 +25,6 @@ from tests.console.server import until
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
 
 
-@pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    folder = tmp_path_factory.mktemp("cell")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        with Cell.open(sim="all", seed=3, clock="virtual") as opened:
-            yield opened
-
-
 @pytest.fixture
 def desk(cell: Cell) -> Iterator[Desk]:
     made = Desk(cell, "pot", lambda client, words: None)
