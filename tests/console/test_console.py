@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -94,10 +95,11 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
 
 
 def test_the_server_ends_with_its_program(console: Console) -> None:
-    process = console._server._process  # what is looked at is its end
-    console._server._pipe.close()
-    console._server._stops.close()
-    assert process.wait(5) is not None
+    """Its pipes end, as they do when it is killed."""
+    server = console._server
+    for pipe in (server._pipe, server._stops):
+        socket.socket(fileno=os.dup(pipe.fileno())).shutdown(socket.SHUT_RDWR)
+    assert server._process.wait(5) is not None
 
 
 # --- where it listens ---
