@@ -205,7 +205,8 @@ class JobRun:
         )
 
     def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
-        self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
+        base_from_place = base_from_surface * self.job.surface.place_from_surface.se3().inverse()
+        self.run.sweeping = Sweeping(collector, base_from_surface, base_from_place, self.nominal)
 
     def _following(self, following: Following) -> dict[str, Any]:
         try:
