@@ -1,6 +1,6 @@
 """Whether pages that look cost the cell anything: its streams to the arm and from the camera without and with them.
 
-Each page is read by a client of others, in a process of its own: everything that the server sends, twenty states and ten
+Each page is read by a client of others, in a process of its own: all that the server sends, twenty states and ten
 pictures a second. A bare loop beside it shows what this machine lets anybody do at that time.
 """
 
