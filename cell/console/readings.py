@@ -96,6 +96,7 @@ class Readings:
             "rail": None if self.rail is None else round(self.rail, 6),
             "vehicle": None if vehicle is None else _vehicle(vehicle),
             "laser": self.laser,
+            "holding": self._held,
         }
 
     def safety(self) -> dict[str, Any]:

@@ -135,6 +135,7 @@ class Workplace:
             lambda frame: self.frames.keep(what, frame),
             lambda: self.devices.clock.sleep(APART_S),
         )
+        self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
         return fix

@@ -134,7 +134,7 @@ link.on('replay', async (wish) => {
 });
 
 function live(state) {
-  scene?.pose({ ...state, holding: state.devices.claw?.state !== 'empty' });
+  scene?.pose(state);
   if (state.path && state.path.n !== pathDrawn) scene?.path(state.path.points);
   if (state.path === null && pathDrawn !== null) scene?.path([]);
   pathDrawn = state.path?.n ?? null;
