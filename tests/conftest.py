@@ -74,8 +74,8 @@ GROUPS = (
     ("test_interlocks.py",),
     ("test_calibration.py",),
 )
-"""Groups of files in the order in which they begin, those over the wires first. Other files over the wires end the first
-one, those of `SCREENS` the second; any other is a group of its own, after them."""
+"""Groups of files in the order in which they begin, the wires first. Other files over the wires end the first one,
+those of `SCREENS` the second; any other is a group of its own, after them."""
 
 VIRTUAL_JOB = 2
 """The group whose files share `placed_pot`."""
