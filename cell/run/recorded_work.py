@@ -83,7 +83,7 @@ class RecordedWork:
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
-        frames = FrameStore(folder / FRAMES)
+        frames = self.run.frames = FrameStore(folder / FRAMES)
         try:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)

@@ -49,10 +49,12 @@ def laser_sweep(
     keep_frame: Callable[[Frame], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
+    sweeping: Callable[[Collector], None] = lambda collector: None,
 ) -> SweepRecord:
     """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
 
-    `check` raises when the run is to end. Raises what `rail_sweep` and `arm_sweep` raise.
+    `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep`
+    and `arm_sweep` raise.
     """
     sweep = arm_sweep if scan.mode == "arm" else rail_sweep
     progress(0.01, "preparing")
@@ -66,7 +68,9 @@ def laser_sweep(
             progress((k + fraction) / len(plans), f"{name}: {text}" if len(plans) > 1 else text)
 
         tell(0.02, "arm to the scan pose")
-        swaths.append(sweep(plan, mover, devices, errors, Collector(geometry, scan, keep_frame, tell)))
+        collector = Collector(geometry, scan, keep_frame, tell)
+        sweeping(collector)
+        swaths.append(sweep(plan, mover, devices, errors, collector))
     return SweepRecord(tuple(swaths))
 
 
@@ -141,6 +145,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         lambda frame: here.frames.keep("stripe", frame),
         context.check,
         context.progress,
+        lambda collector: here.sweeping(collector, base_from_surface),
     )
     record = replace(record, pointing=pointing, slip=slip, doubts=(*doubts, *here.notes))
     for note in record.notes:

@@ -42,6 +42,8 @@ class RtdeLink:
         """The payload of the next packet of this kind; others are passed over."""
         while True:
             size, got = _HEADER.unpack(self._take(_HEADER.size))
+            if size < _HEADER.size:
+                raise ConnectionAbortedError(f"a packet of {size} bytes came, which is none of RTDE")
             payload = self._take(size - _HEADER.size)
             if chr(got) == kind:
                 return payload
