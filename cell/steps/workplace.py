@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -130,4 +130,4 @@ class Workplace:
         )
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
-        return fix
+        return replace(fix, number=self._photographs)
