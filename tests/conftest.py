@@ -33,6 +33,7 @@ GROUPS = (
         "test_verify_job.py",
         "test_touch.py",
         "test_confirmed_turn.py",
+        "test_record.py",
     ),
     # One device at a time.
     (
@@ -125,10 +126,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
-def placed_pot() -> JobRecord:
+def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
     """The job `pot` on the virtual clock, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
     job, nominal = pot()
-    record = run_whole_job(CONFIG, job, nominal, 2, "nominal")
+    record = run_whole_job(CONFIG, job, nominal, 2, "nominal", runs=tmp_path_factory.mktemp("placed"))
     assert (record.outcome, record.reason) == ("placed", "")
     return record
 

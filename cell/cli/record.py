@@ -74,6 +74,8 @@ def info(name: RunArgument = None, config: ConfigOption = None, json: JsonOption
     console.print(table)
     whole = "whole" if data["whole"] else f"cut off, {data['lost_bytes']} bytes at its end are of no use"
     typer.echo(f"{path}: {data['bytes'] / 1e6:.1f} MB, {data['messages']} messages over {data['span_s']} s, {whole}")
+    if data["cpu_s"] is not None and data["span_s"]:
+        typer.echo(f"writing it took {data['cpu_s']:.2f} s of a core, {100 * data['cpu_s'] / data['span_s']:.1f} %")
     if data["dropped"] is None:
         typer.echo("it was cut off before it told what was let go; `cell record repair` closes it")
     for topic, count in (data["dropped"] or {}).items():

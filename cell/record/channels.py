@@ -50,7 +50,7 @@ CHANNELS = (
     Channel("/vehicle/can", "cell.Can", "each CAN frame that the driver sent or heard, its data in hex"),
     Channel("/{device}/serial", "cell.Bytes", "bytes on its serial line or socket, in hex", ("rail", "laser", "claw")),
     Channel("/arm/rtde", "cell.Rtde", "RTDE packets, the values of each state, requests, dashboard lines"),
-    Channel("/record/dropped", "cell.Dropped", "the last message: how many of each topic were let go"),
+    Channel("/record/end", "cell.End", "the last message: what was let go, by topic; s of a core it took"),
 )  # fmt: skip
 
 _NUMBER, _TEXT, _OBJECT, _TRUTH = ({"type": kind} for kind in ("number", "string", "object", "boolean"))
@@ -67,7 +67,7 @@ _FIELDS: dict[str, dict[str, object]] = {
                  "fd": _TRUTH, "data": _TEXT},
     "cell.Bytes": {"sent": _TRUTH, "data": _TEXT},
     "cell.Rtde": {"sent": _TRUTH, "data": _TEXT, "text": _TEXT, "request": _TEXT, "state": _OBJECT},
-    "cell.Dropped": {"dropped": _OBJECT},
+    "cell.End": {"dropped": _OBJECT, "cpu_s": _NUMBER},
 }  # fmt: skip
 """By schema: its fields. Not all of them are in each message, and a reading has those of its device."""
 

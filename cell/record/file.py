@@ -7,6 +7,7 @@ pictures are, and the rest is little.
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 import time
@@ -104,7 +105,8 @@ class RecordFile:
                 out.writer.flush()
                 flushed = time.monotonic()
             self.cpu_s = time.thread_time()
-        out.say_dropped(last, dict(self.dropped))
+        end = {"dropped": dict(self.dropped), "cpu_s": None if self._lossless else round(time.thread_time(), 3)}
+        out.add("/record/end", last, json.dumps(end).encode(), 1)
         out.writer.finish()
         self.cpu_s = time.thread_time()
 
@@ -146,11 +148,6 @@ class _Out:
             self._channels[topic] = channel
         self.newest = max(self.newest, at)
         self.writer.add_message(channel, at, data, at, sequence)
-
-    def say_dropped(self, at: int, dropped: dict[str, int]) -> None:
-        import json
-
-        self.add("/record/dropped", at, json.dumps({"dropped": dropped}).encode(), 1)
 
     def _schema(self, name: str) -> int:
         if name not in self._schemas:

@@ -12,15 +12,16 @@ from drivers.errors import CellError
 
 
 def information(path: Path) -> dict[str, Any]:
-    """Its channels with their messages and bytes, its span in s, whether it was closed, what was let go.
+    """Its channels with their messages and bytes, its span in s, whether it was closed, what was let go, by topic.
 
-    `dropped` is None where the record was cut off before it could tell. Raises as `said` does.
+    `dropped` is None where the record was cut off before it could tell. `cpu_s` of a core were taken to write it: None
+    then, and on the virtual clock. Raises as `said` does.
     """
     counts: Counter[str] = Counter()
     sizes: Counter[str] = Counter()
     schemas: dict[str, str] = {}
     times: list[int] = []
-    dropped: dict[str, int] | None = None
+    end: dict[str, Any] = {}
     told = Parts()
     try:
         for message in said(path, told):
@@ -28,8 +29,8 @@ def information(path: Path) -> dict[str, Any]:
             sizes[message.topic] += len(message.data)
             schemas[message.topic] = message.schema
             times = [min([message.at, *times]), max([message.at, *times])]
-            if message.topic == "/record/dropped":
-                dropped = json.loads(message.data)["dropped"]
+            if message.topic == "/record/end":
+                end = json.loads(message.data)
     except CellError as error:
         raise CellError(f"{path}: {error}") from error
     return {
@@ -40,7 +41,8 @@ def information(path: Path) -> dict[str, Any]:
         "messages": counts.total(),
         "begun_ns": times[0] if times else None,
         "span_s": round(1e-9 * (times[1] - times[0]), 3) if times else None,
-        "dropped": dropped,
+        "dropped": end.get("dropped"),
+        "cpu_s": end.get("cpu_s"),
         "channels": [
             {"topic": topic, "schema": schemas[topic], "messages": counts[topic], "bytes": sizes[topic]}
             for topic in sorted(counts)

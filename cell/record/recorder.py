@@ -21,7 +21,7 @@ from cell.config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from cell.devices.interlocks import Command
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
-from cell.record.channels import GATED
+from cell.record.channels import CAMERAS, GATED
 from cell.record.file import FILE, RecordFile, missing
 from cell.record.seen import Lines, RailPath
 from cell.record.sketch import Sketch
@@ -164,7 +164,7 @@ class Recorder(logging.Handler):
 
     def frame(self, what: str, frame: Frame, picture: Picture) -> None:
         """A frame is kept, see `cell.run.frames.FrameStore`."""
-        camera = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
+        camera = self._camera_of(what, frame)
         at = self._times.of(frame.mid_exposure)
         told = {
             "file": picture.name,
@@ -179,6 +179,13 @@ class Recorder(logging.Handler):
         self._put(f"/{camera}/calibration", at, partial(self._sketch.lens, camera=camera))
         self._put(f"/{camera}/image", at, partial(self._sketch.image, camera=camera, picture=picture))
 
+    def _camera_of(self, what: str, frame: Frame) -> str:
+        """Which camera took it, by its size; where both have the same, by what it is kept as."""
+        there = {name: getattr(self._devices, name).shape for name in CAMERAS if name in self._devices}
+        fits = [name for name, shape in there.items() if shape == frame.image.shape]
+        named = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
+        return fits[0] if len(fits) == 1 else named
+
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         at = self._times.of_wall(record.created)
@@ -189,7 +196,7 @@ class Recorder(logging.Handler):
         put, tell = self.file.put, rtde if device == "arm" else wire
 
         def listen(sent: bool, what: object) -> None:
-            put(topic, time.time_ns(), lambda: as_json(tell(sent, what)))
+            put(topic, time.time_ns(), partial(tell, sent, what))
 
         return listen
 

@@ -19,7 +19,11 @@ MOST_NUMBERS = 2000
 
 def as_json(data: object) -> bytes:
     """Strict JSON."""
-    return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).encode()
+    try:
+        return _ENCODER.encode(data).encode()
+    except (ValueError, TypeError):
+        # A number that is none, or a key that is no text.
+        return _ENCODER.encode(plain(data)).encode()
 
 
 def plain(value: object) -> Any:
@@ -47,23 +51,30 @@ def plain(value: object) -> Any:
     return str(value)
 
 
-def wire(sent: bool, what: object) -> dict[str, object]:
-    """A CAN frame, or bytes."""
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=plain)
+_WORDS = (b"false", b"true")
+
+
+def wire(sent: bool, what: object) -> bytes:
+    """A CAN frame, or bytes, as JSON. Written out, because hundreds come in a second."""
     if isinstance(what, can.Message):
-        return {
-            "sent": sent, "id": what.arbitration_id, "extended": what.is_extended_id, "remote": what.is_remote_frame,
-            "error": what.is_error_frame, "dlc": what.dlc, "fd": what.is_fd, "data": bytes(what.data).hex(),
-        }  # fmt: skip
-    return {"sent": sent, "data": bytes(what).hex() if isinstance(what, bytes | bytearray) else str(what)}
+        flags = (what.is_extended_id, what.is_remote_frame, what.is_error_frame, what.is_fd)
+        extended, remote, error, fd = (_WORDS[flag] for flag in flags)
+        return (
+            b'{"sent":%s,"id":%d,"extended":%s,"remote":%s,"error":%s,"fd":%s,"dlc":%d,"data":"%s"}'
+            % (_WORDS[sent], what.arbitration_id, extended, remote, error, fd, what.dlc, what.data.hex().encode())
+        )  # fmt: skip
+    data = what.hex() if isinstance(what, bytes | bytearray) else str(what)
+    return as_json({"sent": sent, "data": data})
 
 
-def rtde(sent: bool, what: object) -> dict[str, object]:
-    """What passes between the arm and its driver: packets as bytes, lines of the dashboard, values, requests."""
+def rtde(sent: bool, what: object) -> bytes:
+    """What passes between the arm and its driver, as JSON: packets as bytes, the dashboard's lines, values, requests."""
     match what:
         case bytes() | bytearray():
-            return {"sent": sent, "data": bytes(what).hex()}
+            return as_json({"sent": sent, "data": what.hex()})
         case str():
-            return {"sent": sent, "text": what}
+            return as_json({"sent": sent, "text": what})
         case (str() as name, tuple() as arguments):
-            return {"sent": sent, "request": name, "arguments": arguments}
-    return {"sent": sent, "state": what}
+            return as_json({"sent": sent, "request": name, "arguments": arguments})
+    return as_json({"sent": sent, "state": vars(what)})
