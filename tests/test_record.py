@@ -397,7 +397,8 @@ def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(
     kept = json.loads((copied / PERCEPTION).read_text(encoding="utf-8"))
     kept["photograph"]["flange"][0] += 1e-9
     (copied / PERCEPTION).write_text(json.dumps(kept), encoding="utf-8")
-    middle = sorted((copied / "frames").glob("stripe-*.png"))[70]
+    stripes = sorted((copied / "frames").glob("stripe-*.png"))
+    middle = stripes[len(stripes) // 2]
     image = cv2.imread(str(middle), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(middle), np.roll(image, 1, axis=1))
     monkeypatch.setattr("sys.argv", ["cell", "replay", str(copied), "--json"])

@@ -69,7 +69,7 @@ def wire(sent: bool, what: object) -> bytes:
 
 
 def rtde(sent: bool, what: object) -> bytes:
-    """What passes between the arm and its driver, as JSON: packets as bytes, the dashboard's lines, values, requests."""
+    """What passes between arm and driver, as JSON: packets as bytes, lines of the dashboard, values, requests."""
     match what:
         case bytes() | bytearray():
             return as_json({"sent": sent, "data": what.hex()})
