@@ -214,6 +214,11 @@ def job_path(name: str | Path) -> Path:
     )
 
 
+def ships(path: Path) -> bool:
+    """Whether a job's file is one of those that ship, which nobody changes."""
+    return path.parent == _job_folder()
+
+
 def load_job(name: str | Path) -> tuple[Job, Path]:
     """Read and check a job; also gives the path of its mesh, which exists. Raises `ConfigError`."""
     path = job_path(name)

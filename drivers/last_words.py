@@ -2,7 +2,8 @@
 
 A stepper module runs on to its target, and a vehicle drives on for half a second, when nobody talks to them any more.
 The helper holds the same port and waits at a pipe. When the pipe ends, the owner is gone: it says the last words and
-ends. It does nothing while the owner lives, and nothing after `close()`.
+ends. It does nothing while the owner lives, and nothing after `close()`; only while a motion is `attended` it says them
+as well as soon as the owner is silent for a moment.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from drivers.errors import InterlockError
+from drivers.interfaces import ATTENDED_S
 
 PAUSE_S = 0.02
 """Between two of the last words."""
@@ -31,13 +35,24 @@ def descriptor_of(port: Any) -> int | None:
         return None
 
 
+def attended_by(name: str, helper: LastWords | None) -> AbstractContextManager[Callable[[], None]]:
+    """`LastWords.attended` of the device's helper; `InterlockError` for a port that is no file, which has none."""
+    if helper is None:
+        raise InterlockError(
+            name, "nothing beside this process would stop it when nobody holds the button. Move it by steps"
+        )
+    return helper.attended()
+
+
 class LastWords:
     """Holds the port with the file `descriptor`; writes each of `words` to it by one system call, in their order."""
 
     def __init__(self, name: str, descriptor: int, words: Sequence[bytes]) -> None:
+        self._name = name
         reader, self._pipe = os.pipe()
         script = Path(__file__).with_name("last_words_child.py")
-        command = [sys.executable, "-I", "-S", str(script), str(reader), str(descriptor), repr(PAUSE_S)]
+        command = [sys.executable, "-I", "-S", str(script), str(reader), str(descriptor)]
+        command += [repr(PAUSE_S), repr(ATTENDED_S)]
         try:
             self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
                 [*command, *(word.hex() for word in words)],
@@ -51,6 +66,28 @@ class LastWords:
             self._process = None
         finally:
             os.close(reader)
+
+    @contextmanager
+    def attended(self) -> Iterator[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`; `InterlockError` when there is no helper."""
+        self._say(b"+")
+        try:
+            yield lambda: self._say(b"+")
+        finally:
+            with suppress(InterlockError):
+                self._say(b"-")
+
+    def _say(self, word: bytes) -> None:
+        try:
+            if self._process is None or self._pipe < 0:
+                raise OSError("it is not there")
+            os.write(self._pipe, word)
+        except OSError as error:
+            raise InterlockError(
+                self._name,
+                f"the process that would stop it when nobody holds the button cannot be told: {error}. Move it by "
+                "steps, and open the cell again",
+            ) from error
 
     def close(self) -> None:
         """Say goodbye: the helper ends without a word. Idempotent."""

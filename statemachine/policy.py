@@ -6,7 +6,7 @@ A failure is looked at in this order: an end that was asked for; a retry; a reco
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 
@@ -25,7 +25,7 @@ class Failure:
     """Why a step did not succeed: the outcome it leads to unless it is repeated, and the reason in words.
 
     `code` is short and stable, for scripts. `recoverable` says that a recovery can clear it; `needs_person` that a
-    person has to look and confirm before that.
+    person has to look and confirm before that. `error` is the exception behind it, for whoever decides.
     """
 
     outcome: Outcome
@@ -33,6 +33,7 @@ class Failure:
     code: str = ""
     recoverable: bool = False
     needs_person: bool = False
+    error: BaseException | None = field(default=None, compare=False, repr=False)
 
 
 class OnFailure(Enum):

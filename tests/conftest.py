@@ -16,24 +16,12 @@ from cell.lab.bench.whole_job import JobRecord, run_whole_job
 from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 
 GROUPS = (
-    # One cell at a time, as an engineer runs it; those first that need little of what the virtual job compiles.
+    # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
     (
         "wire/test_commands.py",
         "wire/test_serve.py",
         "wire/test_one_authority.py",
         "wire/test_whole_job.py",
-    ),
-    # The virtual job, and what is told of its ends.
-    (
-        "test_virtual_door.py",
-        "test_report.py",
-        "test_end_screen.py",
-        "test_direct_devices.py",
-        "test_described_jobs.py",
-        "test_verify_job.py",
-        "test_touch.py",
-        "test_confirmed_turn.py",
-        "test_record.py",
     ),
     # One device at a time.
     (
@@ -63,6 +51,21 @@ GROUPS = (
         "wire/test_contracts_over_wires.py",
         "wire/test_safe_stop_over_wires.py",
     ),
+    # The virtual job, and what is told of its ends.
+    (
+        "test_virtual_door.py",
+        "test_report.py",
+        "test_end_screen.py",
+        "test_direct_devices.py",
+        "test_described_jobs.py",
+        "test_verify_job.py",
+        "test_touch.py",
+        "test_confirmed_turn.py",
+        "test_quiet.py",
+        "test_timing.py",
+        "test_fixed_vehicle.py",
+        "test_record.py",
+    ),
     # Long ones begin early, so that no worker is left with one of them at the end.
     ("recorded/test_recorded_calibration.py", "recorded/test_recorded_command.py"),
     ("test_inversion.py",),
@@ -74,11 +77,15 @@ GROUPS = (
 """Groups of files in the order in which they begin. Other files over the wires end the first one; any other is a group
 of its own, after them."""
 
+VIRTUAL_JOB = 2
+"""The group whose files share `placed_pot`."""
+
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
-WHOLE_CELL, COMPUTES = 5, 10
-"""How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
-deadlines of seconds on the wall, and what only computes keeps none."""
+NICE = (5, 0)
+COMPUTES = 19
+"""How much each group gives way, and those after them: a single device's times are compared to milliseconds, a whole
+cell keeps deadlines of seconds on the wall, and what only computes gets what the others leave."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
 
@@ -91,6 +98,11 @@ def place(file: Path) -> tuple[int, int]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what lasts longest."""
     items.sort(key=lambda item: place(item.path))
+    for item in items:
+        if "placed_pot" in getattr(item, "fixturenames", ()) and place(item.path)[0] != VIRTUAL_JOB:
+            raise pytest.UsageError(
+                f"{item.path.name} uses placed_pot, which takes 20 s for each worker: add it to the third of GROUPS"
+            )
 
 
 class Grouped(LoadFileScheduling):
@@ -107,20 +119,21 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileS
     return Grouped(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Before the workers start, which inherit it."""
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
+    if config.getoption("numprocesses"):
+        # Without bytecode on disk each worker and each of the commands that tests start would compile all sources.
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A worker gives way to those whose times matter more; a worker's groups come in that order."""
+    """A worker gives way to those whose times matter more; it may not take that back, so the wires come first."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
-    if item.get_closest_marker("wire") is None:
-        wanted = COMPUTES
-    else:
-        wanted = WHOLE_CELL if place(item.path)[0] == 0 else 0
+    group, _ = place(item.path)
+    wanted = NICE[group] if group < len(NICE) else COMPUTES
     if os.nice(0) < wanted:
         os.nice(wanted - os.nice(0))
 

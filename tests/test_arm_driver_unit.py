@@ -105,12 +105,14 @@ def test_pose_difference_agrees_with_an_independent_one():
     ("bit", "code"),
     [
         (2, "arm.protective_stop"),
+        (3, "arm.recovery_mode"),
         (4, "arm.safeguard_stop"),
         (5, "arm.emergency_stop"),
         (6, "arm.emergency_stop"),
         (7, "arm.emergency_stop"),
         (8, "arm.safety_fault"),
         (9, "arm.safety_fault"),
+        (10, "arm.safeguard_stop"),
     ],
 )
 def test_safety_bits_have_the_makers_meaning(bit, code):

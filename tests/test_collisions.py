@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.config import load_config
+from cell.devices.described import Described
 from cell.job import load_job
 from cell.motion.bodies import BASE, FLANGE, Body, arm_bodies, tool_bodies
 from cell.motion.kinematics import ArmKinematics
@@ -18,8 +21,10 @@ from sim_backends.models.vehicle import MOTOR_FAULT, Mode, State
 from sim_backends.world import nominal
 from sim_backends.world.arm_points import BODIES
 from sim_backends.world.collisions import DECK, Collisions
+from sim_backends.world.drawing import read
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
+from tests.described_cells import described, pose
 
 OVER_DECK = np.deg2rad([0.0, -100.0, 100.0, -90.0, -90.0, 0.0])
 
@@ -120,6 +125,36 @@ def test_an_arm_that_was_unlocked_can_leave_what_it_hit(world: World) -> None:
     assert world.arm.safety is Safety.NORMAL
     assert np.allclose(world.arm.base_from_flange(world.clock.now())[:3, 3], up[:3, 3], atol=1e-3)
     assert len(world.collisions.found) == count
+
+
+def test_obstacles_of_configuration_and_job_are_solid(tmp_path: Path) -> None:
+    config, job = described(tmp_path)
+    half_m = f"{500 * nominal.TABLE_HEIGHT:g}"
+    config.write_text(
+        config.read_text(encoding="utf-8") + '\n[[obstacle]]\nname = "rack"\nsize = ["400 mm", "100 mm", "400 mm"]\n'
+        f"base_from_centre = {pose((-600.0, 260.0, 600.0), (0.0, 0.0, 0.0))}\n",
+        encoding="utf-8",
+    )
+    job.write_text(
+        job.read_text(encoding="utf-8") + '\n[[obstacle]]\nname = "fence"\n'
+        f'size = ["100 mm", "1000 mm", "{half_m} mm"]\n'
+        f"place_from_centre = {pose((-800.0, 0.0, -1.5 * float(half_m)), (0.0, 0.0, 0.0))}\n",
+        encoding="utf-8",
+    )
+    drawing = read(Described.of(job).drawing(load_config(config)).as_json())
+    world = World(seed=1, level="ideal", clock=SteppedClock(), drawing=drawing)
+    world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
+    advance(world, 8.0)
+    aside = world.arm.base_from_flange(world.clock.now()).copy()
+    aside[1, 3] += 0.4
+    world.arm.start(LinearMove(aside, 0.1, 0.5))
+    advance(world, 6.0)
+    assert world.arm.safety is Safety.PROTECTIVE_STOP
+    assert "hit the obstacle rack" in world.arm.fault_text
+    world.vehicle.set_mode(0.0, Mode.CAN)
+    advance(world, 10.0, speed=0.4)
+    assert outline(world)[:, 0].max() == pytest.approx(-0.85, abs=0.003)
+    assert {row["obstacle"] for row in truth(world)["collisions"]} == {"obstacle rack", "station obstacle fence"}
 
 
 def test_no_point_of_the_worlds_arm_reaches_beyond_the_bodies_that_the_cell_plans_with(world: World) -> None:

@@ -15,11 +15,15 @@ from cell.commission.begin import begin
 from cell.commission.check import Check, Result
 from cell.commission.person import PersonAtTheConsole, SimulatedPerson
 from cell.commission.protocol import write_protocol
-from cell.commission.sequence import CHECKS, Commissioning, chosen
+from cell.commission.sequence import CHECKS, Commissioning, by_name, chosen
+from cell.commission.vehicle_checks import judge_board
 from cell.config import default_toml, load_config
 from cell.devices.described import Described
 from cell.devices.direct import VirtualCell
+from cell.job import load_job
+from cell.vision import parse_board
 from drivers.errors import DeadlineError
+from tests.described_cells import described
 
 SEED = 3
 
@@ -44,13 +48,13 @@ def files(folder: Path, truth: Callable[[str], str], cell: Callable[[str], str] 
     (folder / "cell.toml").write_text(cell(text), encoding="utf-8")
 
 
-def opened(folder: Path, shown: Shown, ask: Callable[[str], bool] | None = None) -> Commissioning:
+def opened(folder: Path, shown: Shown, ask: Callable[[str], bool] | None = None, job: str = "pot") -> Commissioning:
     person = SimulatedPerson(lambda text: None) if ask is None else PersonAtTheConsole(ask)
     return begin(
         folder / "cell.toml",
         person,
         shown,
-        job="pot",
+        job=job,
         sim="all",
         seed=SEED,
         clock="virtual",
@@ -75,6 +79,10 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
         return text.replace(old, new)
 
     return change
+
+
+def same(text: str) -> str:
+    return text
 
 
 def test_a_wrong_payload_is_weighed_written_and_not_weighed_again(tmp_path: Path) -> None:
@@ -128,6 +136,28 @@ def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it
     assert right.world.rail.carriage(right.clock.now()) == pytest.approx(0.0, abs=1e-4)
 
 
+def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_not_into_one_that_ships(
+    tmp_path: Path,
+) -> None:
+    files(tmp_path, same)
+    _, job = described(tmp_path / "own")
+    check, shown = by_name("station"), Shown()
+    for name, written in (("pot", {}), (str(job), {"board.spec": '"marked_dots:9x7:24mm"'})):
+        made, result = opened(tmp_path, shown, job=name), Result()
+        try:
+            judge_board(name, parse_board(made.desk.job.board.spec), 1.201, result)
+            (finding,) = result.findings
+            assert finding.write_job == written
+            assert 'write spec = "marked_dots:9x7:24mm"' in str(finding) or "own.toml it has to read" in str(finding)
+            made.progress.keep(check, made.desk.config, Result(), 1.0, "")
+            assert made._mend(check, result) is bool(written)
+            assert made.progress.standing(check, made.desk.config) == ("stale" if written else "good")
+        finally:
+            made.desk.close()
+    assert load_job(job)[0].board.spec == "marked_dots:9x7:24mm"
+    assert len(list(job.parent.glob("own.toml.before-*"))) == 1
+
+
 def swapped(text: str) -> str:
     return re.sub(r"^output = (\d)", lambda found: f"output = {1 - int(found[1])}", text, flags=re.MULTILINE)
 
@@ -143,10 +173,6 @@ def mounting(camera: str, rotation: str) -> Callable[[str], str]:
         return "\n".join(lines) + "\n"
 
     return change
-
-
-def same(text: str) -> str:
-    return text
 
 
 @pytest.mark.campaign

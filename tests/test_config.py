@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import tomllib
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cell import units
 from cell.check.fit import require_fit
 from cell.config import CellConfig, default_toml, load_config, validate
 from cell.job import job_path, load_job, shipped_jobs
@@ -47,6 +49,12 @@ def edited(**changes: Any) -> dict[str, Any]:
 )
 def test_a_quantity_is_read_into_si(text: str, unit: str, expected: float) -> None:
     assert parse_quantity(text, unit) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_usual_units_are_those_of_the_library_to_the_last_bit() -> None:
+    for unit, number in product(units._USUAL, ("35", "0.1", "-7.3e-3", "+123456.789", ".6", "1e3")):
+        text = f"{number} {unit}"
+        assert parse_quantity(text, unit) == units._converted(text, unit)[1], text
 
 
 @pytest.mark.parametrize(

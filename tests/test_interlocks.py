@@ -508,6 +508,18 @@ def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_
     refused("after_a_stop", lambda: arm.set_digital_output(7, False), "clear_stop(by)")
 
 
+def test_an_output_that_is_tried_counts_as_a_lasers_for_the_arm_as_well(cell: Cell) -> None:
+    """A recovery switches off what may be a laser's, and leaves a claw's alone otherwise."""
+    arm, claw = cell.devices.arm, CONFIG.claw.output
+    with cell.maintenance("what hangs on which output", ["own_switch"]):
+        arm.set_digital_output(claw, True)
+        arm.recover()
+        assert arm.state().digital_outputs >> claw & 1
+        with cell.devices.interlocks.tried(claw):
+            arm.recover()
+            assert not arm.state().digital_outputs >> claw & 1
+
+
 class ReadSlowly(os.PathLike[str]):
     """A job's file that is read so slowly that a stop comes meanwhile."""
 

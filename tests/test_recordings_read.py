@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cell.calibration.recorded.attach import Options, attach_poses
+from cell.calibration.recorded.command import calibrate_folder
 from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
 from cell.calibration.recorded.series import match_series, read_series
@@ -259,7 +261,66 @@ def program_of_the_arm(folder: Path) -> None:
     (folder / "photographs.script").write_text(start + "\n".join(moves) + "\nend\n")
 
 
+def halves_in_one_file(folder: Path) -> None:
+    """As OpenCV's hand-eye solvers take them, with what they are to give beside."""
+    np.savez(
+        folder / "calib.npz",
+        R_gripper2base=np.array([p[:3, :3] for p in POSES]),
+        t_gripper2base=np.array([p[:3, 3:] for p in POSES]),
+        camera_matrix=CAMERA.matrix,
+    )
+
+
+def halves_in_two_files(folder: Path) -> None:
+    turns = "\n".join(row(line) for p in POSES for line in p[:3, :3])
+    (folder / "R_base.txt").write_text(turns)
+    (folder / "t_base.txt").write_text("\n".join(row(1e3 * p[:3, 3]) for p in POSES))
+
+
+def halves_as_opencv_stores_them(folder: Path) -> None:
+    turns = row(np.ravel([p[:3, :3] for p in POSES]), ", ")
+    places = row(np.ravel([p[:3, 3] for p in POSES]), ", ")
+    for name, kind, data in (("rotations", '"3d"', turns), ("positions", "d", places)):
+        matrix = f"m: !!opencv-matrix\n   rows: {len(POSES)}\n   cols: 3\n   dt: {kind}\n   data: [ {data} ]\n"
+        (folder / f"{name}.yml").write_text("%YAML:1.0\n---\n" + matrix)
+
+
+def opencv_xml(folder: Path) -> None:
+    parts = [
+        f'<pose_{k + 3} type_id="opencv-matrix"><rows>4</rows><cols>4</cols><dt>d</dt><data>\n{row(p.ravel())}</data>'
+        f"</pose_{k + 3}>"
+        for k, p in enumerate(POSES)
+    ]
+    text = '<?xml version="1.0"?>\n<opencv_storage>' + "\n".join(parts) + "</opencv_storage>"
+    (folder / "robot.xml").write_text(text)
+
+
+def xml_with_joints_beside(folder: Path) -> None:
+    parts = []
+    for k, p in reversed(list(enumerate(POSES))):
+        joints = "".join(f"<joint{j}>{10 * j + k}.5</joint{j}>" for j in range(1, 7))
+        values = [*1e3 * p[:3, 3], *angles(p, "xyz", degrees=False)]
+        pose = "".join(f"<pose{j + 1}>{v:.9f}</pose{j + 1}>" for j, v in enumerate(values))
+        parts.append(f'<stop name="{k}"><picture>./images/frame{k + 3:02d}.png</picture>{joints}{pose}</stop>')
+    (folder / "robot.xml").write_text(f"<stops>{''.join(parts)}</stops>")
+
+
+def words_beside_named_numbers(folder: Path) -> None:
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    entries = [
+        {"file": f"frame{k + 3:02d}.png", "by": "Ann", **dict(zip(names, [*p[:3, 3], *quaternion(p)], strict=True))}
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "data.json").write_text(json.dumps(entries[::-1]))
+
+
 SPELLINGS = {
+    halves_in_one_file: ("rotation-9+xyz", "m", "order"),
+    halves_in_two_files: ("rotation-9+xyz", "mm", "order"),
+    halves_as_opencv_stores_them: ("rotation-9+xyz", "m", "order"),
+    opencv_xml: ("matrix-4x4", "m", "name"),
+    xml_with_joints_beside: ("xyz+rpy-rad", "mm", "name"),
+    words_beside_named_numbers: ("xyz+quaternion-xyzw", "m", "name"),
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
     rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
     wxyz_in_mm_with_names: ("xyz+quaternion-wxyz", "mm", "name"),
@@ -321,6 +382,36 @@ def test_two_fields_that_both_agree_are_asked_for(recording, seen):
         understand(recording, seen, pose_field="tcp2")
 
 
+def boards_poses(turned: bool) -> list[np.ndarray]:
+    """camera_from_board of each view, or its inverse, as somebody's detector gave them."""
+    poses = [np.linalg.inv(FLANGE_FROM_CAMERA) @ np.linalg.inv(p) @ BASE_FROM_BOARD for p in POSES]
+    return [np.linalg.inv(p) if turned else p for p in poses]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_boards_poses_beside_the_pictures_are_not_taken_for_the_flanges(recording, seen, turned):
+    # They agree with the pictures better than any arm's.
+    for k, pose in enumerate(boards_poses(turned)):
+        (recording / f"board{k + 3:02d}.txt").write_text(row(np.r_[1.03 * pose[:3, 3], quaternion(pose)]))
+    _, alone, _ = understand(recording, seen)
+    assert "those of the board as the camera sees it" in alone.refused
+    tuples(recording)
+    frames, understood, _ = understand(recording, seen)
+    assert not understood.refused
+    assert "boardN.txt not used: its poses are those of the board" in " ".join(understood.notes)
+    assert understood.about["source"] == ["poseN.txt"]
+    assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
+
+
+def test_the_same_poses_in_two_files_of_different_units_are_no_question(recording, seen):
+    rotation_vectors_in_a_table(recording)
+    rows = [row([*1e3 * p[:3, 3], *angles(p, "xyz")], ",") for p in POSES]
+    (recording / "raw.csv").write_text("\n".join(rows))
+    _, understood, _ = understand(recording, seen)
+    assert not understood.refused
+    assert understood.about["turn_deg"] < 0.1
+
+
 def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
     tuples(recording)
     _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
@@ -375,6 +466,37 @@ def test_poses_that_are_shifted_by_one_picture_are_named(recording, seen):
     assert "previous picture" in understood.refused
     assert "shifted by one" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
+
+
+@pytest.mark.parametrize("whose", ["poses", "pictures"])
+def test_mirror_images_are_named(recording, seen, whose):
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    left_handed = whose == "poses"
+    one_file_each(recording, lambda p: row((mirror @ p @ mirror if left_handed else p).ravel()))
+    if not left_handed:
+        # In a mirror the board's rows begin at their other end.
+        ends = np.arange(35).reshape(5, 7)[:, ::-1].ravel()
+        flipped = [replace(f.view, pixels=([SIZE[0] - 1, 0] + [-1, 1] * f.view.pixels)[ends]) for f in seen.values()]
+        seen = {n: replace(f, view=v) for (n, f), v in zip(seen.items(), flipped, strict=True)}
+    _, understood, _ = understand(recording, seen)
+    assert "as mirror images they agree" in understood.refused
+
+
+def test_rows_that_are_sorted_as_words_are_found_out_and_said(tmp_path, pictures, seen):
+    names = [f"shot{k}.png" for k in range(8, 16)]
+    for name, path in zip(names, sorted(pictures.iterdir()), strict=True):
+        (tmp_path / name).symlink_to(path)
+    order = sorted(range(len(names)), key=names.__getitem__)
+    (tmp_path / "poses.txt").write_text("\n".join(row([*POSES[k][:3, 3], *quaternion(POSES[k])]) for k in order))
+    frames, understood, _ = understand(tmp_path, dict(zip(names, seen.values(), strict=True)))
+    assert "sorted as words (1, 10, 2)" in understood.notes[0]
+    assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
+
+
+def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):
+    (tmp_path / "left").symlink_to(pictures)
+    with pytest.raises(ConfigError, match=r"8 pictures with --board.*pictures are in left \(8\)"):
+        calibrate_folder(tmp_path, None)
 
 
 def test_times_match_poses_to_pictures(tmp_path, pictures, seen):

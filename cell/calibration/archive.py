@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
-from cell.calibration.witness import Witness
+from cell.calibration.witness import Witness, read_edge
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
@@ -77,6 +77,7 @@ def write_archive(path: Path, observations: Observations) -> None:
     if o.witness is not None:
         arrays |= {"witness_columns": o.witness.columns, "witness_sigma": o.witness.sigma}
         about["witness_rail"] = o.witness.rail
+        about["witness_edge"] = None if o.witness.edge is None else vars(o.witness.edge)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
@@ -140,7 +141,7 @@ def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness 
     columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
     if columns.ndim != 1 or columns.shape != sigma.shape:
         raise ValueError("the witness needs a deviation for each of its columns")
-    return Witness(float(about["witness_rail"]), columns, sigma)
+    return Witness(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.edge import with_edge
 from cell.calibration.collect.timing import collect_timing, look_at_shutter
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.finding import find_calibration
@@ -94,7 +95,9 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
         made = solve_observations(observations).calibration
         tell(0.98, "looking at the scan camera's shutter")
-        return observations, look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
+        made = look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
+        made = with_edge(config, devices, hands.keep, made)
+        return replace(observations, witness=made.scan.witness), made
 
     observations, calibration = cell.recorded(run, "calibration", work)
     save_with_observations(calibration, observations, cell.calibrations_folder)

@@ -31,20 +31,31 @@ SAME_RAIL_M = 50e-6
 """The carriage has to be where it was: the plate may be tilted, and the rail is not along the camera's rows."""
 
 
+@dataclass(frozen=True)
+class Edge:
+    """Where the line leaves the plate: the rail's `place`, m, mean of to and fro, and how late, s, the pictures come by
+    the difference of the two (`lag`, the play of the screw with it)."""
+
+    place: float
+    lag: float
+
+
 @dataclass(frozen=True, eq=False)
 class Witness:
     """The line on the plate with the rail at `rail` m: its column (height,) in px, NaN where it is not seen, and the
-    standard deviation `sigma` (height,) of each."""
+    standard deviation `sigma` (height,) of each; `edge` of the plate, where one was found."""
 
     rail: float
     columns: Array
     sigma: Array
+    edge: Edge | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
         rows = self.rows
         values = {"columns": self.columns[rows].tolist(), "sigma": self.sigma[rows].tolist()}
-        return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values}
+        edge = None if self.edge is None else vars(self.edge)
+        return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values, "edge": edge}
 
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> Witness | None:
@@ -54,7 +65,7 @@ class Witness:
         columns, sigma = np.full((2, int(data["height"])), np.nan)
         rows = np.array(data["rows"], dtype=np.intp)
         columns[rows], sigma[rows] = data["columns"], data["sigma"]
-        return cls(float(data["rail"]), columns, sigma)
+        return cls(float(data["rail"]), columns, sigma, read_edge(data.get("edge")))
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -136,6 +147,16 @@ class ConfirmedTurn:
             "plate_mrad": round(1e3 * self.plate, 4),
             "date": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made)),
         }
+
+
+def read_edge(data: dict[str, Any] | None) -> Edge | None:
+    """From storage; KeyError, TypeError or ValueError when it is none."""
+    if data is None:
+        return None
+    edge = Edge(float(data["place"]), float(data["lag"]))
+    if not np.isfinite([edge.place, edge.lag]).all():
+        raise ValueError(f"an edge of the witness at {edge.place} m, {edge.lag} s")
+    return edge
 
 
 def pointing(

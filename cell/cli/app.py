@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import calibrate, commission, devices, export, new_job, record, run, runs, setup, sim
+from cell.cli import calibrate, commission, console, devices, export, new_job, record, run, runs, setup, sim, watch
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
@@ -46,7 +46,7 @@ def _cell(
     console_log(verbose)
 
 
-for group in (run, runs, record, export, calibrate, devices, commission, setup, new_job):
+for group in (run, runs, record, export, calibrate, devices, commission, setup, new_job, console, watch):
     group.register(app)
 app.add_typer(sim.app, name="sim")
 

@@ -36,10 +36,13 @@ def register(app: typer.Typer) -> None:
 
 
 def jog(
-    device: Annotated[str, typer.Argument(help="rail, arm or vehicle.")],
+    device: Annotated[
+        str | None, typer.Argument(help="rail, arm or vehicle. Without it, a screen in this terminal, to jog by keys.")
+    ] = None,
     motion: Annotated[
-        list[str], typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg.")
-    ],
+        list[str] | None,
+        typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg."),
+    ] = None,
     config: ConfigOption = None,
     job: JobOption = "pot",
     lift: Annotated[
@@ -56,7 +59,12 @@ def jog(
     from cell.devices.jogging import needed_for, parse_jog
     from cell.supervisor import Cell
 
-    wish = parse_jog(device, motion)
+    if device is None:
+        from cell.cli.jog_screen import jog_by_keys
+
+        jog_by_keys(config, job, sim, seed, level, lift or [], reason, json)
+        return
+    wish = parse_jog(device, motion or [])
     lifted = lift or []
     with (
         Cell.open(config, sim=sim, seed=seed, level=level.value, job=job, only=needed_for(wish, lifted)) as cell,

@@ -13,10 +13,8 @@ from rich.table import Table
 
 from cell.cli.end_screen import duration, end_screen
 from cell.config import DEVICES
+from cell.report.figures import noise_rows
 from statemachine.runner import Event
-
-SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
-"""How a standard deviation in SI is shown to people, by its unit."""
 
 SAID = ("note", "paused", "going_on")
 """Kinds of events whose text is shown as it is."""
@@ -149,9 +147,8 @@ def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
     table.add_column("of")
     table.add_column("sigma", justify="right")
     table.add_column("unit")
-    for entry in noise.get("sigmas", {}).values():
-        factor, unit = SHOWN_UNITS.get(entry["unit"], (1.0, entry["unit"]))
-        table.add_row(str(entry["of"]), f"{factor * entry['sigma']:.4g}", str(unit))
+    for row in noise_rows(noise):
+        table.add_row(*row)
     console.print(table)
 
 

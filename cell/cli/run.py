@@ -85,6 +85,12 @@ def dry_run(
     until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
+    console: Annotated[
+        bool,
+        typer.Option("--console", help="Show it in a browser, until its page is closed; or, with --no-open, ended."),
+    ] = False,
+    no_open: Annotated[bool, typer.Option("--no-open", help="With --console: print the page's link only.")] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="With --console: where the page is.")] = 0,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     from cell.check.fit import require_fit
@@ -110,6 +116,11 @@ def dry_run(
         confirm=None if confirm is None else confirm.value,
         clock=clock.value,
     )
+    if console:
+        from cell.cli.console import run_shown
+
+        watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
+        _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
 
 

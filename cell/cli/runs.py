@@ -125,14 +125,37 @@ def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 
 def report(
-    name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False, noise: NoiseOption = False
+    name: RunArgument = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+    noise: NoiseOption = False,
+    html: Annotated[
+        bool, typer.Option("--html", help="Write one HTML file instead, to look at in a browser or to print.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The HTML file. Without it, report.html in the run's folder.")
+    ] = None,
 ) -> None:
     """Show the report of a run."""
     from cell.cli.display import print_report
     from cell.run.folder import find_run
     from cell.run.reading import read_report
+    from drivers.errors import ConfigError
 
+    if out is not None and not html:
+        raise ConfigError("--out names the file of --html; give both")
     folder = find_run(folder_of_runs(config), name)
+    if html:
+        # Drawing is slow to load; whoever reads a report on the screen does not wait for it.
+        from cell.report.page.make import write_page
+
+        path = out or folder / "report.html"
+        size = write_page(folder, path)
+        if json:
+            print_json({"run": folder.name, "file": str(path), "bytes": size})
+        else:
+            typer.echo(f"{path}: {size / 1e6:.2f} MB; open it in a browser, or print it")
+        return
     data = read_report(folder)
     if json:
         print_json(data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,6 +14,7 @@ from cell.commission.desk import Desk
 from cell.commission.measuring import measure
 from cell.commission.mounting import RoughMounting, against_drawing
 from cell.commission.seeing import Eye, eye_of, find_view
+from cell.vision import BoardSpec
 from drivers.interfaces import Image
 
 PITCH_OFF = 0.025
@@ -115,15 +116,13 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
         )  # fmt: skip
         return
     if abs(across - 1.0) > PITCH_OFF:
-        key, name = f"{eye.key}.board", eye.plate.board
-        pitch = _round_pitch(eye.board.pitch * across)
-        named = re.sub(r":[0-9.]+\s*mm$", f":{1e3 * pitch:g}mm", name)
+        key, named = f"{eye.key}.board", renamed(eye.board, across)
         result.find(
             Finding(
                 key, "the board has another pitch than its name says, by the ways of the arm",
                 f"{1e3 * eye.board.pitch:g} mm", f"{1e3 * eye.board.pitch * across:.2f} mm",
                 "Measure from the first to the last point with a ruler, and name the board so.",
-                {key: f'"{named}"'} if named != name else {},
+                {key: f'"{named}"'} if named != eye.board.name else {},
             )
         )  # fmt: skip
         return
@@ -139,6 +138,12 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
                 {key: pose_toml(found.base_from_board)},
             )
         )  # fmt: skip
+
+
+def renamed(board: BoardSpec, times: float) -> str:
+    """The name of a board that is so many times as large as its name says."""
+    pitch = _round_pitch(board.pitch * times)
+    return replace(board, pitch=pitch, marker=board.marker * pitch / board.pitch).name
 
 
 def _round_pitch(pitch: float) -> float:

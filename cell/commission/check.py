@@ -33,8 +33,8 @@ class Finding:
     """Something that is not as the configuration has it.
 
     `name` is its keys in cell.toml; `told` what stands there, `found` what was measured, both in words with units.
-    `write` are the keys and the values, as TOML, that would be right; empty where a person has to act. `remedy` is what
-    to do.
+    `write` are the keys and the values, as TOML, that would be right; empty where a person has to act. `write_job` are
+    the same of the job's file. `remedy` is what to do.
     """
 
     name: str
@@ -43,6 +43,7 @@ class Finding:
     found: str
     remedy: str
     write: dict[str, str] = field(default_factory=dict)
+    write_job: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.name}: {self.what}; configured {self.told}, measured {self.found}. {self.remedy}"

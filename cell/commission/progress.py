@@ -29,7 +29,7 @@ class Progress:
         """Read what is there; `ConfigError` when that is none. `job` is the key "job" of checks."""
         self.folder = folder
         self.cell = cell
-        self._job = job.model_dump(mode="json")
+        self.work_for(job)
         self._file = folder / FILE
         self._data: dict[str, Any] = {"version": VERSION, "results": {}, "mended": []}
         if self._file.exists():
@@ -41,6 +41,10 @@ class Progress:
                 raise ConfigError(
                     f"{self._file} is no record of a commissioning: {error}; move it away to begin anew"
                 ) from error
+
+    def work_for(self, job: Job) -> None:
+        """The job as its file has it now: what rests on another text of it is stale."""
+        self._job = job.model_dump(mode="json")
 
     def result(self, name: str) -> dict[str, Any] | None:
         """The stored result of a check, whether it still counts or not."""

@@ -176,6 +176,10 @@ def _switches(desk: Desk, result: Result, speed: float) -> None:
     if not _nudged(desk):
         result.notes.append("this rail moves only within its travel: press its limit switches by hand")
         return
+    registers = getattr(desk.config.rail, "registers", None)
+    if registers is not None and None in (registers.left_switch, registers.right_switch):
+        result.notes.append("rail.registers does not say where the drive tells its limit switches: press them by hand")
+        return
     desk.confirm(
         "rail, beyond its travel", "the carriage, until a limit switch stops it", f"at most {1e3 * BEYOND:.0f} mm",
         f"{1e3 * SPEED:.0f} mm/s",

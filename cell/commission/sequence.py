@@ -24,6 +24,7 @@ from cell.commission.check import Check, Result, Verdict
 from cell.commission.desk import Declined, Desk, told
 from cell.commission.progress import Progress, done_well
 from cell.commission.toml_edit import write_changes
+from cell.job import job_path
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
 from drivers.interfaces import Frame
@@ -131,23 +132,31 @@ class Commissioning:
     def _mend(self, check: Check, result: Result) -> bool:
         """Write what was found into the configuration, if a person agrees; True when something was written."""
         changes: dict[str, str] = {}
+        in_job: dict[str, str] = {}
         for finding in result.findings:
             changes |= finding.write
-        if not changes:
+            in_job |= finding.write_job
+        job = job_path(self.desk.job_file)
+        wanted = [(path, keys) for path, keys in ((self.path, changes), (job, in_job)) if keys]
+        shown = ", and ".join(
+            f"into {path.name}: " + "; ".join(f"{key} = {value}" for key, value in keys.items())
+            for path, keys in wanted
+        )
+        if not wanted or not self.desk.person.sees(f"Write {shown}? The old file is kept."):
             return False
-        shown = "; ".join(f"{key} = {value}" for key, value in changes.items())
-        if not self.desk.person.sees(f"Write into {self.path.name}: {shown}? The old file is kept."):
-            return False
-        backup = write_changes(self.path, changes)
+        backups = [write_changes(path, keys) for path, keys in wanted]
         for finding in result.findings:
-            if finding.write:
-                self.progress.keep_mended(check, asdict(finding), backup.name)
+            if finding.write or finding.write_job:
+                self.progress.keep_mended(check, asdict(finding), ", ".join(backup.name for backup in backups))
         self.desk.close()
         try:
+            self.progress.work_for(self.desk.job)
             self.desk.connect()
         except ConfigError as error:
             self.desk.close()
-            backup.replace(self.path)
+            for (path, _), backup in zip(wanted, backups, strict=True):
+                backup.replace(path)
+            self.progress.work_for(self.desk.job)
             raise ConfigError(
                 f"what was measured does not fit the configuration, which is as it was: {error}"
             ) from error

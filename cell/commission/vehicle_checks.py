@@ -9,14 +9,15 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.store import nominal_camera
-from cell.commission.camera_checks import PITCH_OFF
+from cell.commission.camera_checks import PITCH_OFF, renamed
 from cell.commission.check import Check, Finding, Result
 from cell.commission.desk import Desk
 from cell.commission.mounting import axes_from_shifts
 from cell.geometry.poses import from_parts, from_ur
+from cell.job import job_path, ships
 from cell.steps.approach import Planar, RelativeOdometry, drive_line
 from cell.steps.camera_poses import look_pose
-from cell.vision import board_pose, find_board, parse_board
+from cell.vision import BoardSpec, board_pose, find_board, parse_board
 from drivers.errors import CellError, DeviceFault, RefusedError
 
 WAY, SPEED = 0.050, 0.050
@@ -167,16 +168,30 @@ def _pitch(desk: Desk, result: Result, look: pin.SE3) -> None:
         result.notes.append(f"the station's board could not be measured from here: {refused}")
         return
     result.measure("station's board by the arm's measure over its name", across, "")
-    if abs(across - 1.0) > PITCH_OFF:
-        result.find(
-            Finding(
-                "board.spec of the job",
-                "the station's board has another pitch than its name says, by the ways of the arm",
-                f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm",
-                "Measure from the first to the last point with a ruler, and name the board so in the job's file: the "
-                "vehicle drives by it.",
-            )
-        )  # fmt: skip
+    judge_board(desk.job_file, board, across, result)
+
+
+def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> None:
+    """What a station's board says that is `across` times as large as `board`, its name in the file of `job`."""
+    if abs(across - 1.0) <= PITCH_OFF:
+        return
+    path, right = job_path(job), renamed(board, across)
+    remedy = "Measure from the first to the last point with a ruler; the vehicle drives by this board. "
+    if ships(path):
+        remedy += (
+            f"This job ships with the program: `cell init FOLDER --job {path.stem}` writes {path.name} for you to "
+            f'change. Below [board] in it write spec = "{right}", and go on with '
+            f"`cell commission --job FOLDER/{path.name}`."
+        )
+    else:
+        remedy += f'Below [board] in {path} it has to read spec = "{right}".'
+    result.find(
+        Finding(
+            "board.spec of the job", "the station's board has another pitch than its name says, by the ways of the arm",
+            f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm", remedy,
+            write_job={} if ships(path) else {"board.spec": f'"{right}"'},
+        )
+    )  # fmt: skip
 
 
 def _look(desk: Desk) -> Callable[[], None]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cell.check.fit import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, RailConfig, VehicleConfig
+from cell.device_config import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
@@ -98,6 +98,7 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
         wires=_vehicle(config.vehicle)
         | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
+        obstacles=_boxes({o.name: (o.base_from_centre, o.size) for o in config.obstacle}),
     )
 
 
@@ -171,7 +172,14 @@ def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
         flange_from_part=_matrix(job.grasp.flange_from_part.se3()),
         surface_from_part=_matrix(job.place.surface_from_part.se3()),
         part_size=job.grasp.size,
+        obstacles=_boxes({o.name: (o.place_from_centre, o.size) for o in job.obstacle}),
     )
+
+
+def _boxes(obstacles: dict[str, tuple[Pose, tuple[float, float, float]]]) -> dict[str, drawn.Box]:
+    return {
+        name: {"pose": _matrix(middle.se3()).tolist(), "size": list(size)} for name, (middle, size) in obstacles.items()
+    }
 
 
 def _camera(camera: CameraConfig, focus: float) -> drawn.CameraDrawing:

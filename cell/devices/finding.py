@@ -23,6 +23,7 @@ from cell.devices.make import Surroundings
 from cell.devices.makes import make_of
 from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import OnBoard
+from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.run.lock import who_holds
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
@@ -133,6 +134,8 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
         return problem or "there, and this user may open it", not problem
     if getattr(record, "interface", "") == "socketcan":
         there = (root / "sys/class/net" / place).exists()
+        if there and isinstance(record, CanopenVehicleConfig):
+            return _look_at_nodes(record)
         return ("there" if there else f"no interface {place}: see `ip link`"), there
     host, port = _host_and_port(place)
     if not host:
@@ -150,10 +153,18 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
         )
     if port is None:
         return "nothing to ask at such an address; `cell diag` connects to it", True
+    if isinstance(record, CanopenVehicleConfig):
+        return _look_at_nodes(record)
     problem = _try_port(host, port)
     if problem and DEVICES[name] == "camera" and (answer := gige_camera(host)):
         return f'{problem}; but {answer}: driver = "gige", address = "{host}"', False
     return problem or "answers", not problem
+
+
+def _look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
+    from cell.devices.canopen_nodes import look_at_nodes
+
+    return look_at_nodes(record)
 
 
 def _look_at_arm(host: str) -> tuple[str, bool]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,7 @@ import pinocchio as pin
 from cell.motion.bodies import Body
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
-from drivers.interfaces import Arm, ArmMotion, Claw, Laser, Vector, Vehicle
+from drivers.interfaces import Arm, ArmMotion, Claw, Laser, TriesOutputs, Vector, Vehicle
 
 PURPOSES = ("sweep", "calibration", "test")
 """What the laser may be lit for."""
@@ -132,10 +132,15 @@ class Interlocks:
 
     @contextmanager
     def tried(self, output: int) -> Iterator[None]:
-        """Inside this context nobody knows what hangs on this output of the arm: it counts as a laser's."""
+        """Inside this context nobody knows what hangs on this output of the arm: it counts as a laser's.
+
+        An arm that can is told so as well: should this process be killed, the output still goes off.
+        """
+        arm = self.situation.arm
         self._tried.append(output)
         try:
-            yield
+            with arm.trying(output) if isinstance(arm, TriesOutputs) else nullcontext():
+                yield
         finally:
             self._tried.remove(output)
 

@@ -81,16 +81,21 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
     loaded, _ = load_job(job)
 
     def work(hands: Hands) -> dict[str, str]:
-        match wish.device:
-            case "rail":
-                return _jog_rail(cell, wish)
-            case "arm":
-                return _jog_arm(cell, wish)
-            case _:
-                _name_look(cell, loaded)
-                return _jog_vehicle(cell, wish, hands.check)
+        return moved(cell, wish, loaded, hands)
 
     return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()}, stops=stops)
+
+
+def moved(cell: Cell, wish: Jog, job: Job, hands: Hands) -> dict[str, str]:
+    """The same as part of a run that goes on."""
+    match wish.device:
+        case "rail":
+            return _jog_rail(cell, wish)
+        case "arm":
+            return _jog_arm(cell, wish)
+        case _:
+            _name_look(cell, job)
+            return _jog_vehicle(cell, wish, hands.check)
 
 
 def _name_look(cell: Cell, job: Job) -> None:

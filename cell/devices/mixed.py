@@ -8,10 +8,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from cell.config import CellConfig
-from cell.devices.assembly import connect
+from cell.config import DEVICES, CellConfig
+from cell.devices.assembly import connect, connect_one
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
 from cell.devices.described import Described
+from cell.devices.followed_camera import FollowedCamera
 from cell.devices.following import Following
 from cell.devices.gated import GatedArm
 from cell.devices.mix import beware, followed, require_possible
@@ -61,7 +62,11 @@ class MixedCell:
         link = self.world.link
 
         def otherwise(name: str, clock: Clock) -> Any | None:
-            return _switched(self.config, name, link, clock) if name in simulated and "arm" not in simulated else None
+            if name not in simulated:
+                return None
+            if link is not None and DEVICES[name] == "camera":
+                return FollowedCamera(connect_one(self.config, name, clock))
+            return None if "arm" in simulated else _switched(self.config, name, link, clock)
 
         self.devices = connect(self.config, needed, otherwise)
         undo.callback(self.devices.close)

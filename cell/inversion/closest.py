@@ -6,8 +6,8 @@ A look-up and a few triangles replace a tree search for every point. The grid al
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from cell.compiled import compiled
 
@@ -35,7 +35,7 @@ class Grid:
         inside = np.minimum(((samples - low) / self.cell).astype(np.intp), shape - 1)
         nearest = np.full(shape, -1, dtype=np.int32)
         nearest[inside[:, 0], inside[:, 1], inside[:, 2]] = np.arange(len(samples))
-        where = ndimage.distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
+        where = scipy.ndimage.distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
         nearest = nearest[where[0], where[1], where[2]]
         middles = [low[k] + self.cell * (np.arange(shape[k]) + 0.5) for k in range(3)]
         squared = sum(
@@ -82,7 +82,7 @@ def closest(
         best = int(owner[at[0], at[1], at[2]])
         distance = to_triangle(points[n], corners, best, foot, weights)
         for _ in range(100):
-            if weights.min() > 0.0:
+            if min(weights[0], weights[1], weights[2]) > 0.0:
                 break
             pivot = corner_of[best, np.argmax(weights)]
             left = best
@@ -93,10 +93,14 @@ def closest(
                 other = to_triangle(points[n], corners, triangle, better, better_weights)
                 if other < distance:
                     distance, best = other, triangle
-                    foot[:], weights[:] = better, better_weights
+                    # One by one: for slices numba compiles the text of an error, which takes 3 s.
+                    for i in range(3):
+                        foot[i], weights[i] = better[i], better_weights[i]
             if best == left:
                 break
-        feet[n], hit[n] = foot, best
+        hit[n] = best
+        for i in range(3):
+            feet[n, i] = foot[i]
     return feet, hit
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from cell.inversion.closest import Array, Grid, Indices, Walk, closest
 from drivers.errors import ConfigError
@@ -66,7 +66,7 @@ class NominalSurface:
         self._walk = Walk(self._corners)
         self._rim = rim
         border = _border_points(self.vertices, self.triangles)
-        self._border = cKDTree(border) if len(border) else None
+        self._border = scipy.spatial.cKDTree(border) if len(border) else None
         self._maybe_rim = self._touching_rim()
         self.centre: Array = np.average(self.samples, axis=0, weights=self._sample_weights())
         self.radius = float(np.sqrt(np.mean(np.sum((self.samples - self.centre) ** 2, axis=1))))
@@ -119,7 +119,7 @@ class NominalSurface:
         """Share of the surface's area, 0 … 1, that has one of the points (n, 3), surface frame, within `within` m."""
         weights = self._sample_weights()
         step = max(1, len(self.samples) // 5000)
-        seen = cKDTree(points).query(self.samples[::step], distance_upper_bound=within)[0] <= within
+        seen = scipy.spatial.cKDTree(points).query(self.samples[::step], distance_upper_bound=within)[0] <= within
         return float(np.sum(weights[::step] * seen) / np.sum(weights[::step]))
 
     def _touching_rim(self) -> NDArray[np.bool_]:

@@ -15,9 +15,11 @@ from cell.inversion.closest import Array
 from cell.inversion.correspondences import Scan
 from cell.inversion.demands import Demands, fit_figures, require_agreement, require_board, require_fit, require_whole
 from cell.inversion.dissent import dissent
+from cell.inversion.elsewhere import require_alone
 from cell.inversion.nominal import NominalSurface
 from cell.inversion.observability import Tolerance, Verdict, determined, judge
 from cell.inversion.registration import Prior, register
+from cell.inversion.shared import shared_by_patches
 from cell.inversion.sweeps import balance
 from cell.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
@@ -29,7 +31,7 @@ class PlacePose:
 
     base_from_surface: the pose. random, systematic, covariance (their sum): 6×6 of (translation, rotation) in base axes
     about the surface's origin, m² and rad²; random from the stripe, the rail and the prior, systematic from what the
-    caller said of the calibration.
+    caller said of the calibration and from what neighbouring points share.
     verdict: is every direction known well enough; its words are in the surface frame.
     rms: of the accepted points' distances, m; chi2_per_dof: the same in units of their noise; n_points: accepted;
     share: accepted among those over the surface; coverage: share of the surface that was seen.
@@ -122,10 +124,12 @@ def invert_pose(
     explained = np.concatenate(displaced, axis=2) if displaced else None
     with _shown(pose, *numbers):
         parts_differ = require_agreement(dissent(scan, pose, nominal, tolerance, explained), tolerance, demands)
+    _, by_patches = shared_by_patches(found)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
+    shared = shared + by_patches
     correction = difference(pose, prior.base_from_surface)
     with _shown(pose, *numbers):
         disagreement = require_board(shared, prior, correction)
@@ -133,6 +137,8 @@ def invert_pose(
     ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
     told, pull = determined(ways / found.sigmas[:, None], nominal.radius)
     board = turn @ prior.information() @ turn.T
+    with _shown(pose, *numbers):
+        require_alone(scan, pose, nominal, prior, told)
     # Where only a few points tell a motion, the scan counts as if it told nothing: the pose goes back to the board's.
     known = np.linalg.inv(board + told)
     pose = perturbed(pose, -turn.T @ known @ (np.eye(6) - pull) @ board @ turn @ correction)

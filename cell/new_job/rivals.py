@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import perturbed
 from cell.inversion import NominalSurface
-from cell.inversion.observability import FREE
+from cell.inversion.elsewhere import settled, told
 from cell.inversion.search import MOST_SHIFT, candidates
 from cell.job import Job
 from cell.new_job.rays import Array
@@ -26,9 +25,7 @@ FITS, ON = 0.98, 1e-4
 """Share of the points that lie this near, m, to the surface at a place that cannot be told from the true one."""
 OVER = 0.6
 """Share of the points that has to lie over the surface there at all, as a job demands it."""
-LEAST_TOLD = 3 * FREE
-"""Least information of a motion, in those of a point along its normal, for it to lead to another place."""
-STEPS, GATE = 12, 0.002
+GATE = 0.002
 
 
 def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tuple[Array, float]]:
@@ -45,41 +42,14 @@ def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tupl
     information = sum((each.information(each.solid) for each in seen), np.zeros((6, 6)))
     found: list[tuple[Array, float]] = []
     for start in candidates(pin.SE3.Identity(), points, nominal, shift, turn, MOST_PLACES):
-        where = _settled(start, points, nominal)
+        where = settled(start, points, nominal)
         turned = float(np.linalg.norm(pin.log3(where.rotation)))
         middle = where.act(nominal.centre) - nominal.centre
         same = np.linalg.norm(middle) < job.place.tolerance and turned < job.place.tolerance_angle
         near = np.linalg.norm(middle) <= np.sqrt(2) * shift and turned <= turn
-        if near and not same and _told(where, information, nominal.radius) and _fit(where, points, nominal) > FITS:
+        if near and not same and told(where, information, nominal.radius) and _fit(where, points, nominal) > FITS:
             found.append((np.asarray(middle), turned))
     return sorted(found, key=lambda each: float(np.linalg.norm(each[0])))
-
-
-def _told(where: pin.SE3, information: Array, radius: float) -> bool:
-    """Whether the scan tells this motion at all: along one that it leaves to the board there are no separate places."""
-    length = np.array([1.0] * 3 + [radius] * 3)
-    motion = np.concatenate([where.translation, pin.log3(where.rotation)]) * length
-    scaled = information / np.outer(length, length)
-    return bool(motion @ scaled @ motion > LEAST_TOLD * float(motion @ motion) * np.trace(scaled[:3, :3]))
-
-
-def _settled(pose: pin.SE3, points: Array, nominal: NominalSurface) -> pin.SE3:
-    """Point to plane, a few steps; motions that the points leave open stay where they are."""
-    for _ in range(STEPS):
-        local = (points - pose.translation) @ pose.rotation
-        index, feet = nominal.feet(local, GATE)
-        keep = feet.inner
-        normals = feet.normals[keep] @ pose.rotation.T
-        arms = points[index[keep]] - pose.translation
-        rows = -np.concatenate([normals, np.cross(arms, normals)], axis=1)
-        if len(rows) < POINTS // 8:
-            return pose
-        damping = 1e-3 * len(rows) * np.diag([1.0] * 3 + [nominal.radius**2] * 3)
-        step = -np.linalg.solve(rows.T @ rows + damping, rows.T @ feet.heights[keep])
-        pose = perturbed(pose, step)
-        if np.abs(step[:3]).max() < 1e-6:
-            break
-    return pose
 
 
 def _fit(pose: pin.SE3, points: Array, nominal: NominalSurface) -> float:

@@ -97,6 +97,14 @@ class ProfileBuilder:
         spread = rail[:, 1:] * self.sweep_direction(base_from_flange)
         return self.place(order, flanges, rail[:, 0], spread).require(least_points)
 
+    def seen(self, since: int) -> Array:
+        """The profiles from number `since` on, (lines, rows, 3) m in the camera's frame; NaN where no point is."""
+        return np.asarray(self._points[since : self._lines])
+
+    def centres(self, line: int) -> Array:
+        """Columns (rows,) in px at which the stripe was found in a profile; NaN where it was not."""
+        return np.asarray(self._centres[line])
+
     def sweep_direction(self, base_from_flange: pin.SE3) -> Array:
         """Metres (3,) that the camera moves in the arm base, per metre of rail reading."""
         mount = self.geometry.flange_from_camera.rotation

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from cell.compiled import compiled
 from cell.reconstruction.cloud import Array, Cloud, Filled, Indices
@@ -79,10 +79,10 @@ def _step(ways: Array) -> float:
 
 def _cells(measured: NDArray[np.bool_], steps: tuple[float, float], largest: float) -> Indices:
     """(n, 4) line and row of each place to fill, and the half sizes of its window in lines and rows."""
-    labels, _ = ndimage.label(~measured, structure=np.ones((3, 3)))
+    labels, _ = scipy.ndimage.label(~measured, structure=np.ones((3, 3)))
     lines, rows = np.nonzero(labels)
     label = labels[lines, rows]
-    boxes = ndimage.find_objects(labels)
+    boxes = scipy.ndimage.find_objects(labels)
     extents = np.array([[box[0].stop - box[0].start, box[1].stop - box[1].start] for box in boxes]).reshape(-1, 2)
     gaps = (extents + 1) * np.array(steps)
     width = gaps.min(axis=1)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from cell.compiled import compiled
 
@@ -51,7 +51,7 @@ def find_outliers(depth: NDArray[np.floating], sigma: NDArray[np.floating]) -> N
     level = _level(values, noise)
     first, settled = _pass(values, values, noise, level, np.zeros(values.shape, dtype=np.bool_))
     # A point that its neighbours supported stays supported unless one of them was found to be an outlier.
-    settled &= ~ndimage.maximum_filter(first, size=5)
+    settled &= ~scipy.ndimage.maximum_filter(first, size=5)
     return _pass(values, np.where(first, np.nan, values), noise, level, settled)[0]
 
 

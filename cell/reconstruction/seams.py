@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from cell.reconstruction.cloud import Array, Cloud, Indices, Mask
 
@@ -59,7 +59,7 @@ def find_seams(cloud: Cloud, motions: Motions) -> list[Seam]:
     them: (n, 3, m) in m, base axes, as `sensitivity` makes them. What moves both sweeps alike cancels.
     """
     parts = [_points(cloud, lines) for lines in cloud.each_sweep()]
-    trees = [cKDTree(cloud.points[lines, rows]) for lines, rows in parts]
+    trees = [scipy.spatial.cKDTree(cloud.points[lines, rows]) for lines, rows in parts]
     found = []
     for a, b in itertools.combinations(range(len(parts)), 2):
         if min(len(parts[a][0]), len(parts[b][0])) < LEAST_POINTS:
@@ -79,7 +79,7 @@ def _seam(
     cloud: Cloud,
     pair: tuple[int, int],
     parts: list[tuple[Indices, Indices]],
-    tree: cKDTree,
+    tree: scipy.spatial.cKDTree,
     motions: Motions,
 ) -> Seam | None:
     (lines_a, rows_a), (lines_b, rows_b) = parts[pair[0]], parts[pair[1]]

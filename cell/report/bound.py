@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial import cKDTree
+import scipy
 
 from cell.geometry.poses import composition_jacobians, transform
 from cell.inversion import NominalSurface, PlacePose
@@ -34,7 +34,7 @@ def part_points(nominal: NominalSurface) -> Vector:
     across = np.tile(
         np.linspace(0.9 * low[1] + 0.1 * high[1], 0.1 * low[1] + 0.9 * high[1], POINTS_PER_SEGMENT), SEGMENTS
     )
-    _, nearest = cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
+    _, nearest = scipy.spatial.cKDTree(nominal.samples[:, :2]).query(np.column_stack([along, across]))
     points: Vector = nominal.samples[nearest]
     points.flags.writeable = False
     return points

@@ -31,6 +31,19 @@ def _digits(value: float | None) -> str:
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
+SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}
+"""How a standard deviation in SI is shown to people, by its unit."""
+
+
+def noise_rows(noise: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """`assumed_noise` of a report for people: of what, one standard deviation, its unit."""
+    rows = []
+    for entry in (noise.get("sigmas") or {}).values():
+        factor, unit = SHOWN_UNITS.get(entry["unit"], (1.0, entry["unit"]))
+        rows.append((str(entry["of"]), f"{factor * entry['sigma']:.4g}", str(unit)))
+    return rows
+
+
 def following_words(following: Mapping[str, Any]) -> str:
     """How late real devices' readings reached a simulated world, as `following` in a report has it, for people."""
     if "devices" not in following:

@@ -84,7 +84,7 @@ def draw_surface(
     """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
     ±`span_mm`, or their height where no place of the surface was found."""
     points = 1e3 * surface.points
-    _frame_map(axes, points)
+    frame_map(axes, points)
     if surface.deviation is None:
         _title(axes, [f"{len(points)} points of the sweep; the surface was not found in them"])
         if len(points):
@@ -101,7 +101,8 @@ def draw_surface(
     _title(axes, [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)])
 
 
-def _frame_map(axes: Axes, points: Vector) -> None:
+def frame_map(axes: Axes, points: Vector) -> None:
+    """Axes in mm around points (n, 3) in mm, seen from above; what carries no data is grey."""
     low, high = (points[:, :2].min(axis=0), points[:, :2].max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
     room = np.maximum(1.0, 0.5 * (LEAST_MAP_MM - (high - low)))
     axes.set_xlim(low[0] - room[0], high[0] + room[0])
@@ -114,13 +115,18 @@ def _frame_map(axes: Axes, points: Vector) -> None:
 
 def _map(axes: Axes, points: Vector, values: Vector, **look: Any) -> Any:
     """Means of `values` (n,) over squares of the plane, drawn; squares without a point stay clear."""
+    edges, mean = square_means(axes, points, values)
+    return axes.pcolormesh(*edges, np.ma.masked_invalid(mean.T), **look)
+
+
+def square_means(axes: Axes, points: Vector, values: Vector) -> tuple[list[Vector], Vector]:
+    """Edges of the map's squares along x and y, in mm, and means of `values` (n,) in them, NaN where no point is."""
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     square = max(LEAST_SQUARE_MM, max(x1 - x0, y1 - y0) / MOST_SQUARES)
     edges = [np.arange(low, high + square, square) for low, high in ((x0, x1), (y0, y1))]
     count, _, _ = np.histogram2d(points[:, 0], points[:, 1], edges)
     total, _, _ = np.histogram2d(points[:, 0], points[:, 1], edges, weights=values)
-    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    return axes.pcolormesh(*edges, np.ma.masked_invalid(mean.T), **look)
+    return edges, np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
 
 
 def _title(axes: Axes, lines: Sequence[str]) -> None:

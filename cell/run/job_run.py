@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import pinocchio as pin
+
 from cell.calibration.store import CellCalibration, save_calibration
 from cell.config import CellConfig
 from cell.devices.devices import Devices
@@ -28,8 +30,10 @@ from cell.run.folder import new_run, write_json
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
+from cell.run.sweeping import Sweeping
 from cell.steps.kinds import Kind
 from cell.steps.stored_sweep import StoredSweep
+from cell.steps.swath import Collector
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import (
@@ -145,6 +149,7 @@ class JobRun:
         witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames", None if record is None else record.frame) as frames:
+            self.run.frames = frames
             here = Workplace(
                 self.config,
                 self.job,
@@ -156,6 +161,7 @@ class JobRun:
                 whereabouts,
                 self.earlier,
                 needs_part=self.kind.places,
+                sweeping=self._sweeping,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),
@@ -202,6 +208,9 @@ class JobRun:
             self.run.control,
             time.time() - started,
         )
+
+    def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
+        self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
 
     def _following(self, following: Following) -> dict[str, Any]:
         try:
@@ -286,7 +295,7 @@ def classify(error: BaseException) -> Failure:
 def _classify(error: BaseException) -> Failure:
     match error:
         case RefusedError() | CalibrationStale() | ConfigError():
-            return Failure(Outcome.REFUSED, str(error), type(error).__name__)
+            return Failure(Outcome.REFUSED, str(error), type(error).__name__, error=error)
         case Aborted():
             return Failure(Outcome.ABORTED, str(error), "aborted")
         case DeviceFault():

@@ -89,7 +89,7 @@ class RecordedWork:
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
         record = None if self.config is None else begin_record(folder, self.run, self.config, self.devices)
-        frames = FrameStore(folder / FRAMES, None if record is None else record.frame)
+        frames = self.run.frames = FrameStore(folder / FRAMES, None if record is None else record.frame)
         try:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,10 @@ from drivers.errors import DeadlineError
 from statemachine.control import RunControl
 from statemachine.step import Event, Observer
 from statemachine.watch import SignalInterrupt, SignalWatch, begin
+
+if TYPE_CHECKING:
+    from cell.run.frames import FrameStore
+    from cell.run.sweeping import Sweeping
 
 Result = TypeVar("Result")
 
@@ -35,12 +39,16 @@ class Run(Generic[Result]):
     """A run that was begun. Every method may be called from any thread.
 
     `kind` is job, calibration, verification, homing or jog. `folder` is where the run is recorded, None until then.
+    `frames` keeps what it looks at and `sweeping` its newest sweep, None before: whoever shows them
+    takes the newest from there.
     """
 
     def __init__(self, kind: str, work: Callable[[Run[Result]], Result], observer: Observer | None = None) -> None:
         """Begin `work(run)` in a thread of its own. `observer` is told every event, in a thread of its own."""
         self.kind = kind
         self.folder: Path | None = None
+        self.frames: FrameStore | None = None
+        self.sweeping: Sweeping | None = None
         self.control = RunControl()
         self.record: Observer | None = None
         """Told every event before the run goes on, progress as well; while the run is recorded."""

@@ -96,11 +96,19 @@ def invert_pose(
     return replace(registered(by_poses, kinematic + unknown), notes=(words(rocking),))
 
 
+def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
+    """What a scan head that has slipped since the calibration may move the place by, (6, 6), base axes."""
+    if sweep.slip is None:
+        return np.zeros((6, 6))
+    camera = sweep.base_from_flange.rotation @ here.calibration.scan.flange_from_camera.rotation
+    return sweep.slip.covariance(camera)
+
+
 def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:
     """`invert_pose` where a job is done."""
     taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse())
     try:
-        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic, taken)
+        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
     except NotObservable as refused:
         if not sweep.notes:
             raise

@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from cell.calibration import ScanCalibration
+from cell.calibration.collect.edge import require_edge
 from cell.calibration.collect.witness import require_witness
+from cell.calibration.slip import Slip, slip_since
 from cell.calibration.timing import Timing, changed, link_of
 from cell.calibration.witness import Pointing
 from cell.calibration.witness import pointing as pointing_since
@@ -47,10 +49,12 @@ def laser_sweep(
     keep_frame: Callable[[Frame], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
+    sweeping: Callable[[Collector], None] = lambda collector: None,
 ) -> SweepRecord:
     """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
 
-    `check` raises when the run is to end. Raises what `rail_sweep` and `arm_sweep` raise.
+    `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep`
+    and `arm_sweep` raise.
     """
     sweep = arm_sweep if scan.mode == "arm" else rail_sweep
     progress(0.01, "preparing")
@@ -64,7 +68,9 @@ def laser_sweep(
             progress((k + fraction) / len(plans), f"{name}: {text}" if len(plans) > 1 else text)
 
         tell(0.02, "arm to the scan pose")
-        swaths.append(sweep(plan, mover, devices, errors, Collector(geometry, scan, keep_frame, tell)))
+        collector = Collector(geometry, scan, keep_frame, tell)
+        sweeping(collector)
+        swaths.append(sweep(plan, mover, devices, errors, collector))
     return SweepRecord(tuple(swaths))
 
 
@@ -117,7 +123,8 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     if not devices.rail.state().homed_here:
         context.progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
-    head, pointing = here.calibration.scan, _pointing(here, context)
+    head = here.calibration.scan
+    pointing, slip = _seen_on_plate(here, context)
     timing, doubts = times_known(head, here.config)
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
@@ -138,8 +145,9 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         lambda frame: here.frames.keep("stripe", frame),
         context.check,
         context.progress,
+        lambda collector: here.sweeping(collector, base_from_surface),
     )
-    record = replace(record, pointing=pointing, doubts=(*doubts, *here.notes))
+    record = replace(record, pointing=pointing, slip=slip, doubts=(*doubts, *here.notes))
     for note in record.notes:
         context.note(text=note)
     return record
@@ -164,15 +172,23 @@ def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | Non
     return timing, tuple(doubts)
 
 
-def _pointing(here: Workplace, context: StepContext) -> Pointing | None:
-    """Where the laser points now; None where the calibration saw no witness. `RefusedError` when it was knocked."""
-    head = here.calibration.scan
-    if head.witness is None:
-        return None
+def _seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
+    """Where the laser points now, and how far the head has slipped; None where the calibration saw no plate, or no edge
+    of it. `RefusedError` when anything was knocked."""
+    head, config, devices, keep = here.calibration.scan, here.config, here.devices, here.frames.keep
+    before = head.witness
+    if before is None:
+        return None, None
     context.progress(0.0, "looking where the laser points")
-    seen = require_witness(here.config, here.devices, here.frames.keep)
-    exit_point = here.config.laser.exit_point
-    return pointing_since(head.witness, seen, head.camera, head.light_plane, exit_point, head.confirmed)
+    seen = require_witness(config, devices, keep)
+    pointing = pointing_since(before, seen, head.camera, head.light_plane, config.laser.exit_point, head.confirmed)
+    if before.edge is None:
+        return pointing, None
+    context.progress(0.005, "looking whether the scan head has slipped")
+    seen = require_edge(config, devices, keep, before, seen)
+    slip = slip_since(before, seen, head.camera, head.light_plane, head.rail_direction)
+    slip.require()
+    return pointing, slip
 
 
 STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _at, SweepRecord, needs=(BoardFix,))

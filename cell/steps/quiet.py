@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 import pinocchio as pin
-from scipy.special import chdtri
+import scipy
 
 from cell.inversion.rocking import require_firm
 from cell.vision import BoardView
@@ -42,7 +42,7 @@ def swing(views: Sequence[BoardView], metres_per_px: float) -> float:
         variances.append(float(np.mean(view.sigma[here] ** 2)) / len(shared))
     squares = float(np.sum((np.array(means) - np.mean(means, axis=0)) ** 2))
     free = len(views) - 1
-    if squares < float(np.mean(variances)) * chdtri(2 * free, CHANCE):
+    if squares < float(np.mean(variances)) * scipy.special.chdtri(2 * free, CHANCE):
         return 0.0
     # Of a sine along a line the mean square is half that of its height.
     found = float(np.sqrt(2.0 * squares / free)) * metres_per_px

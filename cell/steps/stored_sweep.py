@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration import ScanCalibration
+from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
 from cell.geometry.poses import difference, from_matrix
 from cell.job import ScanSection
@@ -49,6 +50,10 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
     }
     if sweep.pointing is not None:
         data["pointing"] = np.array([sweep.pointing.turn, sweep.pointing.sigma, sweep.pointing.confirmed])
+    if sweep.slip is not None:
+        data["slip"] = np.array(
+            [*sweep.slip.shift, sweep.slip.lag, sweep.slip.depth, sweep.slip.hidden], dtype=np.float64
+        )
     for k, swath in enumerate(sweep.swaths):
         data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
         data[f"figures_{k}"] = np.array([swath.lost, swath.residual, swath.shift])
@@ -75,6 +80,7 @@ class StoredSweep:
             if stored["format"] != FORMAT:
                 raise ValueError(f"format {stored['format']}, this program reads {FORMAT}")
             pointing = Pointing(*map(float, stored["pointing"])) if "pointing" in stored else None
+            slip = _slip(*map(float, stored["slip"])) if "slip" in stored else None
             geometry = (head if pointing is None else head.pointed(pointing, exit_point)).geometry()
             count = sum(name.startswith("frame_ids_") for name in stored)
             swaths = tuple(_swath(folder, stored, k, geometry, scan) for k in range(count))
@@ -83,7 +89,7 @@ class StoredSweep:
             base_from_board, covariance = from_matrix(stored["base_from_board"]), stored["board_covariance"]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise RefusedError(f"{path} cannot be read as a sweep: {error}") from error
-        return cls(folder, SweepRecord(swaths, pointing), base_from_board, covariance)
+        return cls(folder, SweepRecord(swaths, pointing, slip=slip), base_from_board, covariance)
 
     def confirmed_by(self, fix: BoardFix) -> SweepRecord:
         """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open.
@@ -118,6 +124,10 @@ def moved_by(fix: BoardFix, base_from_board: pin.SE3, covariance: Vector) -> str
     if float(moved @ np.linalg.solve(fix.covariance + covariance, moved)) <= MOVED:
         return None
     return f"{1e3 * np.linalg.norm(moved[:3]):.2f} mm and {np.degrees(np.linalg.norm(moved[3:])):.3f} deg"
+
+
+def _slip(along: float, across: float, lag: float, depth: float, hidden: float) -> Slip:
+    return Slip(along, across, lag, bool(hidden), depth)
 
 
 def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeometry, scan: ScanSection) -> Swath:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
 from cell.steps.swath import Swath
 from cell.vision import StripeProfile
@@ -15,13 +16,14 @@ from drivers.interfaces import Frame, Vector
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """What the sweeps brought, in their order; at least one. `pointing` of the laser, where a witness told it; `doubts`
-    for people: what of calibration and arm is not as one would have it. `earlier` names the run that swept, where it
-    was another one."""
+    """What the sweeps brought, in their order; at least one. `pointing` of the laser and `slip` of the head, where a
+    witness told them; `doubts` for people: what of calibration and arm is not as one would have it. `earlier` names the
+    run that swept, where it was another one."""
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
     doubts: tuple[str, ...] = ()
+    slip: Slip | None = None
     earlier: str = ""
 
     @property
@@ -48,7 +50,7 @@ class SweepRecord:
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
         turned = (self.pointing.words,) if self.pointing is not None and self.pointing.open else ()
-        return (*turned, *self.doubts)
+        return (*turned, *(() if self.slip is None else self.slip.notes), *self.doubts)
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -60,5 +62,7 @@ class SweepRecord:
             "residual_um": [round(1e6 * swath.residual, 2) for swath in self.swaths],
             "laser_turned_mrad": None if self.pointing is None else round(1e3 * self.pointing.turn, 4),
             "laser_confirmed_mrad": None if self.pointing is None else round(1e3 * self.pointing.confirmed, 4),
+            "head_slipped_um": None if self.slip is None else [round(1e6 * v, 1) for v in self.slip.shift],
+            "pictures_later_ms": None if self.slip is None else round(1e3 * self.slip.lag, 2),
             "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
         }

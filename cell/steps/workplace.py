@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pinocchio as pin
 
 from cell.calibration.store import CellCalibration
 from cell.config import CellConfig
@@ -19,6 +21,7 @@ from cell.steps.moves import Mover
 from cell.steps.part import PartProgress
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.quiet import APART_S
+from cell.steps.swath import Collector
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import BoardSpec, parse_board
 from drivers.interfaces import Vector
@@ -37,7 +40,8 @@ class Workplace:
     """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
 
     `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `whereabouts` is
-    kept over retries and runs: the vehicle may stand anywhere when a step is done again.
+    kept over retries and runs: the vehicle may stand anywhere when a step is done again. `sweeping` is told who takes
+    the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface).
     """
 
     config: CellConfig
@@ -50,6 +54,7 @@ class Workplace:
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
     needs_part: bool = True
+    sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
     _photographs: int = field(default=0, init=False)
 

@@ -22,6 +22,10 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
     ),
     "arm.safeguard_stop": ("the safeguard is open", False, "Close and acknowledge the safeguard, then go on."),
     "arm.safety_fault": ("the arm's safety system reports a fault", False, "Read the pendant's log; restart the arm."),
+    "arm.recovery_mode": (
+        "the arm is in recovery mode: it stands outside its safety limits", False,
+        "At the pendant, move it back by hand into the limits of its safety configuration, then recover().",
+    ),
     "arm.not_powered": (
         "the arm is not powered", False, "Power it on and release its brakes at the pendant, then recover().",
     ),
@@ -47,6 +51,15 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
 }  # fmt: skip
 
 
+_STATUS = (
+    ("EMERGENCY", "arm.emergency_stop"),
+    ("SAFEGUARD", "arm.safeguard_stop"),
+    ("THREE_POSITION", "arm.safeguard_stop"),
+    ("RECOVERY", "arm.recovery_mode"),
+)
+"""What words of the dashboard server's safety status mean."""
+
+
 def fault(device: str, code: str, text: str = "") -> DeviceFault:
     """The `DeviceFault` for a code of the child process, with its text added."""
     what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
@@ -70,8 +83,7 @@ def unlock(
     deadline = time.monotonic() + _UNLOCK_S
     while (status := dashboard.ask("safetystatus").rpartition(":")[2].strip()) not in ("NORMAL", "REDUCED"):
         if status != "PROTECTIVE_STOP":
-            code = "arm.emergency_stop" if "EMERGENCY" in status else "arm.safety_fault"
-            raise fault(device, "arm.safeguard_stop" if "SAFEGUARD" in status else code, status)
+            raise fault(device, next((code for word, code in _STATUS if word in status), "arm.safety_fault"), status)
         if not confirmed:
             raise fault(device, "arm.protective_stop", "nobody has confirmed that it may be unlocked")
         require_wanted()

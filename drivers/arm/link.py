@@ -19,7 +19,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from drivers.arm.messages import Ended, Lost, Reply, Request, Setup, Snapshot
+from drivers.arm.messages import UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
 
 _SILENCE_S = 2.0
@@ -110,6 +110,12 @@ class ArmLink:
         if pending.problem is not None and pending.problem[0] == "arm.link_lost":
             self._raise_if_lost()
         return pending.problem
+
+    def tell(self, name: str, *arguments: Any) -> None:
+        """Tell the child something that it does not answer; raises the link's `DeviceFault` when it is lost."""
+        self._raise_if_lost()
+        self._transmit(Request(UNANSWERED, name, arguments))
+        self._raise_if_lost()
 
     def close(self, deadline: float) -> None:
         """Let the child stop the arm, switch the safe outputs off and end; it is killed if it does not."""

@@ -34,11 +34,19 @@ class Setup:
 
 @dataclass(frozen=True)
 class Request:
-    """Do `name`: stop, close, output, payload, zero_force, move_joints, move_linear or follow, with `arguments`."""
+    """Do `name` with `arguments`.
+
+    Names: stop, close, output, safe_off, attend, payload, zero_force, move_joints, move_linear, follow. `attend` with
+    wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
+    """
 
     number: int
     name: str
     arguments: tuple[Any, ...] = ()
+
+
+UNANSWERED = -1
+"""The number of a request whose reply nobody waits for."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +91,28 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """How regularly the points of a trajectory went out: their number, their rate in Hz, and the time between two, in s
+    on the wall: median, 99 % and longest."""
+
+    points: int
+    rate: float
+    median: float
+    p99: float
+    longest: float
+
+
+@dataclass(frozen=True)
 class Ended:
-    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`."""
+    """The motion is over: `how` is arrived, contact, stopped, or the code of a fault with its `text`.
+
+    `pace` is that of a trajectory's points.
+    """
 
     motion: int
     how: str
     text: str = ""
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True)
@@ -111,7 +135,10 @@ _SAFETY_CODES = (
     (0b0000_1110_0000, "arm.emergency_stop"),
     (0b0011_0000_0000, "arm.safety_fault"),
     (0b0000_0000_0100, "arm.protective_stop"),
+    (0b0000_0000_1000, "arm.recovery_mode"),
     (0b0000_0001_0000, "arm.safeguard_stop"),
+    # Stopped for safety by none of these: a three-position switch that was let go.
+    (0b0100_0000_0000, "arm.safeguard_stop"),
 )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from drivers.arm.faults import fault
+from drivers.arm.messages import Pace
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceError
 
@@ -14,10 +15,14 @@ _WALL_MARGIN_S = 0.5
 
 
 class UrMotion:
-    """A motion that was started; `contact` tells whether it ended at its force limit."""
+    """A motion that was started; `contact` tells whether it ended at its force limit.
+
+    `pace` tells how regularly the points of a trajectory went out, once it has ended; None of other motions.
+    """
 
     def __init__(self, device: str, what: str, number: int, clock: Clock, stop: Callable[[], None]) -> None:
         self.contact = False
+        self.pace: Pace | None = None
         self.number = number
         self._device = device
         self._what = what

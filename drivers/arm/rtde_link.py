@@ -47,6 +47,8 @@ class RtdeLink:
         while True:
             head = self._take(_HEADER.size)
             size, got = _HEADER.unpack(head)
+            if size < _HEADER.size:
+                raise ConnectionAbortedError(f"a packet of {size} bytes came, which is none of RTDE")
             payload = self._take(size - _HEADER.size)
             self._traffic.received(head + payload)
             if chr(got) == kind:

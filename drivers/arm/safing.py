@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.link import see_safe
@@ -17,7 +18,9 @@ _DASHBOARD_S, _SEEN_S, _LEAST_S = 0.7, 1.9, 0.3
 class Safing:
     """One attempt at a time, shared by all who ask for it; each ends within 2.6 s, whatever the arm does."""
 
-    def __init__(self, name: str, address: str, outputs: tuple[int, ...], statistics: LinkStatistics) -> None:
+    def __init__(
+        self, name: str, address: str, outputs: Callable[[], tuple[int, ...]], statistics: LinkStatistics
+    ) -> None:
         self._name = name
         self._address = address
         self._outputs = outputs
@@ -51,15 +54,16 @@ class Safing:
         except DeviceError as error:
             self._statistics.count("emergency stop of the program failed")
             problems.append(f"its program was not ended: {error.message}")
-        if not self._seen_safe():
-            outputs = f" and outputs {', '.join(map(str, self._outputs))} off" if self._outputs else ""
+        safe_off = self._outputs()
+        if not self._seen_safe(safe_off):
+            outputs = f" and outputs {', '.join(map(str, safe_off))} off" if safe_off else ""
             problems.append(f"the arm was not seen at rest{outputs}")
         self._problem = "; ".join(problems)
 
-    def _seen_safe(self) -> bool:
+    def _seen_safe(self, outputs: tuple[int, ...]) -> bool:
         end = time.monotonic() + _SEEN_S
         while (left := end - time.monotonic()) > _LEAST_S:
-            if see_safe(self._address, self._outputs, deadline=left):
+            if see_safe(self._address, outputs, deadline=left):
                 return True
             self._statistics.count("emergency switching of outputs failed")
         return False

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import fault, require_remote, unlock
 from drivers.arm.feed import StateFeed
+from drivers.arm.first_look import look
 from drivers.arm.link import ArmLink
 from drivers.arm.messages import MODE_RUNNING, PLAYING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.safing import Safing
@@ -60,10 +62,11 @@ class ArmSession:
         self._connect_timeout = connect_timeout
         self._forward, self._unknown = forward, unknown
         self._on_ended, self._on_broken = on_ended, on_broken
-        self._safing = Safing(name, setup.address, setup.safe_off, self.statistics)
+        self._safing = Safing(name, setup.address, lambda: self.setup.safe_off, self.statistics)
         self._closed = False
         self._stops = 0
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
+        look(name, setup.address, clock, connect_timeout)
         if setup.control:
             self._require_remote()
         self.link = self._connect(lambda: True)
@@ -129,6 +132,24 @@ class ArmSession:
             if value or index not in self.setup.safe_off:
                 raise
             self._require_safe_without(error)
+
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """Inside the context this output counts as one of those that are switched off for safety."""
+        before = self.setup.safe_off
+        if index in before:
+            yield
+            return
+        self._keep_off((*before, index))
+        try:
+            yield
+        finally:
+            self._keep_off(before)
+
+    def _keep_off(self, outputs: tuple[int, ...]) -> None:
+        # Known here first: should the child be lost meanwhile, the other way takes them from here.
+        self.setup = replace(self.setup, safe_off=outputs)
+        self.ask("safe_off", outputs, deadline=_OUTPUT_S)
 
     def stop(self) -> None:
         """Bring the arm to rest, and a recovery to its end; without the link by the other way."""

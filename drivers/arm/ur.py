@@ -11,7 +11,7 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from drivers.arm.wrong_arm import Forward
 from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
-from drivers.interfaces import ArmSafety, ArmState, Identity, Reading, Vector
+from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, Reading, Vector
 from drivers.link_table import LinkTable
 from drivers.quantities import check_positive, shown
 
@@ -46,6 +46,7 @@ _SAFETY = {
     "arm.protective_stop": ArmSafety.PROTECTIVE_STOP,
     "arm.safeguard_stop": ArmSafety.SAFEGUARD_STOP,
     "arm.emergency_stop": ArmSafety.EMERGENCY_STOP,
+    "arm.recovery_mode": ArmSafety.FAULT,
     "arm.safety_fault": ArmSafety.FAULT,
 }
 
@@ -222,6 +223,19 @@ class UrArm:
         """
         self._session.stop()
 
+    @contextmanager
+    def attended(self) -> Iterator[Callable[[], None]]:
+        """While it is open, the child stops what moves once it hears nothing; see `drivers.interfaces.Attended`."""
+        self._session.require_control()
+        self._session.require_link()
+        link = self._session.link
+        link.tell("attend", ATTENDED_S)
+        try:
+            yield lambda: link.tell("attend", ATTENDED_S)
+        finally:
+            with suppress(DeviceError):
+                link.tell("attend", 0.0)
+
     # --- settings, inputs and outputs ---
 
     def zero_force(self) -> None:
@@ -237,6 +251,12 @@ class UrArm:
     def set_digital_output(self, index: int, value: bool) -> None:
         """Set a digital output (0-7 standard, 8-15 configurable, 16-17 tool) and return once the arm shows it."""
         self._session.set_output(_check_output(self.name, index), bool(value))
+
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """See `drivers.interfaces.TriesOutputs`."""
+        with self._session.trying(_check_output(self.name, index)):
+            yield
 
     def digital_input(self, index: int) -> bool:
         """Read a digital input (0-7 standard, 8-15 configurable, 16-17 tool) from the newest state."""
@@ -282,6 +302,7 @@ class UrArm:
     def _on_ended(self, ended: Ended) -> None:
         motion = self._motion
         if motion is not None and motion.number == ended.motion:
+            motion.pace = ended.pace
             motion.end(ended.how, ended.text)
 
     def _end_motion(self, error: Exception) -> None:

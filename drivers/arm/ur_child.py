@@ -7,6 +7,7 @@ switches outputs off and sees that the arm stands.
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import signal
@@ -25,7 +26,7 @@ from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.messages import MODE_RUNNING, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
 from drivers.arm.outbox import Message, Outbox
 from drivers.arm.ur_control import ControlThread
 from drivers.arm.ur_outputs import OFF_S, keep_low, make_safe, switch_output
@@ -48,6 +49,7 @@ class Child:
     def __init__(self, pipe: Connection, setup: Setup) -> None:
         self._pipe = pipe
         self._setup = setup
+        self._safe_off = setup.safe_off
         self._parent = os.getppid()
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
@@ -56,6 +58,7 @@ class Child:
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
         self._outbox = Outbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        self._attended_until = math.inf
         self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
 
@@ -111,6 +114,11 @@ class Child:
                     break
                 if request.name == "output":
                     self._send(Reply(request.number, self._switch(*request.arguments)))
+                elif request.name == "safe_off":
+                    self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
+                elif request.name == "attend":
+                    silence = request.arguments[0]
+                    self._attended_until = time.monotonic() + silence if silence > 0 else math.inf
                 else:
                     self._control.submit(request)
         self.shut_down(closing)
@@ -119,6 +127,18 @@ class Child:
         if switch_output(self._io, index, value):
             return None
         return "arm.refused", f"the controller did not accept a value for output {index}"
+
+    def _go_off_in_the_end(self, outputs: tuple[int, ...]) -> tuple[str, str] | None:
+        """From now on these go off when the owner is lost, and no others."""
+        freed = tuple(index for index in self._safe_off if index not in outputs)
+        # Both until the controller knows: one too many does no harm.
+        self._safe_off = (*outputs, *freed)
+        try:
+            keep_low(self._setup.address, outputs, freed)
+        except (RuntimeError, OSError) as error:
+            return "arm.refused", f"the controller did not take which outputs it keeps low: {error}"
+        self._safe_off = outputs
+        return None
 
     def shut_down(self, closing: int = 0) -> None:
         """Outputs off, motion stopped, then the end; bounded in time whatever the arm does."""
@@ -132,13 +152,13 @@ class Child:
         os._exit(0)
 
     def _leave_safe(self) -> None:
-        for index in self._setup.safe_off:
+        for index in self._safe_off:
             switch_output(self._io, index, False)
         self._control.submit(Request(0, "close"))
         if not self._control.finished.wait(3.0):
             with suppress(DeviceError):
                 Dashboard("arm", self._setup.address).ask("stop")
-        mask = sum(1 << index for index in self._setup.safe_off)
+        mask = sum(1 << index for index in self._safe_off)
         for _ in range(250):
             if not self._snapshot.outputs & mask:
                 break
@@ -152,6 +172,9 @@ class Child:
         while True:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
+            if time.monotonic() > self._attended_until:
+                self._attended_until = math.inf
+                self._control.submit(Request(UNANSWERED, "stop"))
             if not self._packets.connected:
                 self._lose("the arm closed the connection")
             if os.getppid() != self._parent:

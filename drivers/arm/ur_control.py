@@ -17,6 +17,7 @@ from typing import Any
 
 from drivers.arm.messages import (
     Ended,
+    Pace,
     Reply,
     Request,
     Setup,
@@ -146,10 +147,10 @@ class ControlThread:
         if problem is None:
             self._end(motion, *(self._watch(before) or self._program.settled(missed)))
 
-    def _end(self, motion: int, how: str, text: str) -> None:
+    def _end(self, motion: int, how: str, text: str, pace: Pace | None = None) -> None:
         if how not in ("arrived", "contact", "stopped") and (problem := self._program.end()) is not None:
             text = "; ".join(filter(None, (text, problem[1])))
-        self._send(Ended(motion, how, text))
+        self._send(Ended(motion, how, text, pace))
 
     def _watch(self, before: int) -> End | None:
         """Until the controller reports the end of the operation after `before`: None, or why it ended early."""
@@ -172,4 +173,5 @@ class ControlThread:
         problem = self._program.problem()
         self._send(Reply(request.number, problem))
         if problem is None:
-            self._end(motion, *self._streaming.stream(Trajectory(times, joints), force_limit))
+            how, text = self._streaming.stream(Trajectory(times, joints), force_limit)
+            self._end(motion, how, text, self._streaming.pace)

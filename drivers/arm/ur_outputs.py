@@ -21,7 +21,7 @@ _SAFE_S = 5.0
 _SECONDARY_PORT = 30002
 _GREETING = 79
 """Bytes that the maker wants read from that port before it is closed; else what was sent may be discarded."""
-_LOW_WHEN_NOT_RUNNING = 1
+_STAYS, _LOW_WHEN_NOT_RUNNING = 0, 1
 _NOT_SAFE = 4
 """Exit code of `--safe` when an output stays on or the arm does not come to rest."""
 
@@ -38,17 +38,18 @@ def switch_output(io: Any, index: int, value: bool) -> bool:
     return bool(getattr(io, f"set{kind.capitalize()}DigitalOut")(number, value))
 
 
-def keep_low(address: str, outputs: tuple[int, ...]) -> None:
-    """Have the controller keep outputs low whenever no program runs, whatever becomes of the link.
+def keep_low(address: str, outputs: tuple[int, ...], free: tuple[int, ...] = ()) -> None:
+    """Have the controller keep outputs low whenever no program runs, whatever becomes of the link; `free` stay as set.
 
     A secondary program runs beside the main one and leaves it alone. Source: the maker's script manual.
     """
-    if not outputs:
+    choices = [(index, _LOW_WHEN_NOT_RUNNING) for index in outputs] + [(index, _STAYS) for index in free]
+    if not choices:
         return
-    lines = [
-        f"  set_runstate_{kind}_digital_output_to_value({number}, {_LOW_WHEN_NOT_RUNNING})\n"
-        for kind, number in map(_terminal, outputs)
-    ]
+    lines = []
+    for index, choice in choices:
+        kind, number = _terminal(index)
+        lines.append(f"  set_runstate_{kind}_digital_output_to_value({number}, {choice})\n")
     with socket.create_connection((address, _SECONDARY_PORT), timeout=OFF_S) as connection:
         connection.sendall(f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
         read = 0

@@ -6,20 +6,15 @@ import time
 
 from rtde_receive import RTDEReceiveInterface
 
+from drivers.arm.first_look import VARIABLES
 from drivers.arm.messages import Snapshot
-
-_VARIABLES = [
-    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
-    "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
-    "payload", "payload_cog",
-]  # fmt: skip
 
 
 class Packets:
     """What the arm at `address` sends of itself; RuntimeError when it does not answer."""
 
     def __init__(self, address: str) -> None:
-        self._receive = RTDEReceiveInterface(address, 500.0, _VARIABLES)
+        self._receive = RTDEReceiveInterface(address, 500.0, list(VARIABLES))
         self._newest = 0.0
 
     @property

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
-from drivers.arm.messages import Setup, Six, Snapshot
+from drivers.arm.messages import Pace, Setup, Six, Snapshot
 from drivers.arm.trajectory import Trajectory
 from drivers.arm.ur_program import BLIND_S, BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.clock import Clock
@@ -32,6 +33,12 @@ class Streaming:
         self._program = program
         self._latest = latest
         self._clock = Clock()
+        self._sent: list[float] = []
+
+    @property
+    def pace(self) -> Pace | None:
+        """How regularly the points of the newest trajectory were sent."""
+        return pace_of(self._sent)
 
     # --- streaming ---
 
@@ -41,6 +48,7 @@ class Streaming:
         A stop slows time down to nothing, so that the arm brakes on its way: the controller's own stop takes all its
         time in one command, in which its watchdog would bark.
         """
+        self._sent = []
         force_before = self._mean_force() if force_limit is not None else ()
         allowed = BLIND_S if force_limit is None else _FEELING_S
         start = time.monotonic()
@@ -65,6 +73,7 @@ class Streaming:
                 start += PERIOD
                 self._program.kick()
             elif self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
+                self._sent.append(time.monotonic())
                 cycle += 1
                 lead += PERIOD
                 elapsed += PERIOD * self._setup.rate * pace
@@ -106,3 +115,14 @@ class Streaming:
 
 def _missed(snapshot: Snapshot, trajectory: Trajectory) -> str:
     return joints_off(snapshot, trajectory.end, "the trajectory's end")
+
+
+def pace_of(times: list[float]) -> Pace | None:
+    """The pace of points that were sent at these times, s on the wall; None of less than three."""
+    if len(times) < 3:
+        return None
+    gaps = sorted(after - before for before, after in pairwise(times))
+    count = len(gaps)
+    return Pace(
+        len(times), count / (times[-1] - times[0]), gaps[count // 2], gaps[min(count - 1, count * 99 // 100)], gaps[-1]
+    )

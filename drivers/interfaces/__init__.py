@@ -10,20 +10,32 @@ leaves the device safe and is idempotent.
 """
 
 from drivers.clock_map import Latch
-from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, why_untold
+from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, TriesOutputs, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
-from drivers.interfaces.device import Device, Examined, Identity, LinkStatistics, Motion, Reading, Vector
+from drivers.interfaces.device import (
+    ATTENDED_S,
+    Attended,
+    Device,
+    Examined,
+    Identity,
+    LinkStatistics,
+    Motion,
+    Reading,
+    Vector,
+)
 from drivers.interfaces.rail import LONGEST_NUDGE_M, Nudged, Rail, RailState, Sweep
 from drivers.interfaces.switches import Claw, Laser, SaysHowKnown
 from drivers.interfaces.vehicle import Vehicle, VehicleState
 from drivers.link_table import LinkTable
 
 __all__ = [
+    "ATTENDED_S",
     "LONGEST_NUDGE_M",
     "Arm",
     "ArmMotion",
     "ArmSafety",
     "ArmState",
+    "Attended",
     "Camera",
     "Claw",
     "Device",
@@ -44,6 +56,7 @@ __all__ = [
     "SaysHowKnown",
     "SaysWhyUntold",
     "Sweep",
+    "TriesOutputs",
     "Vector",
     "Vehicle",
     "VehicleState",

@@ -106,6 +106,14 @@ class Arm(Device, Protocol):
 
 
 @runtime_checkable
+class TriesOutputs(Protocol):
+    """What an arm may offer besides `Arm` when the laser hangs on its outputs and may hang on another than is told."""
+
+    def trying(self, index: int) -> AbstractContextManager[None]:
+        """Inside the context this output goes off as the laser's does when link, driver or this process are lost."""
+
+
+@runtime_checkable
 class SaysWhyUntold(Protocol):
     """What an arm may offer besides `Arm`: a reason beside a link table that it did not tell."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -12,6 +14,10 @@ from drivers.traffic import Traffic
 
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""
+
+ATTENDED_S = 0.16
+"""Wall seconds of silence after which a motion that somebody attends is stopped: two beats of 80 ms that do not come.
+With what it takes to brake a slow motion the device stands within 250 ms."""
 
 
 @dataclass(frozen=True)
@@ -104,4 +110,16 @@ class Motion(Protocol):
 
         Raises `DeadlineError` after `timeout` seconds (the device is then stopped), `DeviceFault` when the device
         failed, `Aborted` when `stop()` ended the motion early. Never returns for a motion that did not arrive.
+        """
+
+
+@runtime_checkable
+class Attended(Protocol):
+    """What a device may offer besides: motions that go on only as long as somebody says so again and again."""
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """While it is open, what moves is stopped once the function that it gives was not called for `ATTENDED_S`.
+
+        A process beside this one sees to that, also when this one hangs, is frozen or was killed. `InterlockError` when
+        there is none; the function raises it, or a `DeviceFault`, when it is lost.
         """

@@ -9,11 +9,12 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
-from drivers.interfaces import LinkStatistics
+from drivers.interfaces import LONGEST_NUDGE_M, LinkStatistics
 from drivers.quantities import check_positive, check_range, shown
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
@@ -34,6 +35,9 @@ class Link(Protocol):
     @property
     def closed(self) -> bool:
         """True once `close` was called."""
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
 
     def stop(self) -> None:
         """Stop whatever the drive does; commands issued earlier are refused."""
@@ -103,8 +107,11 @@ class RailAxis(ABC):
         """Send it to `position` m at `speed` m/s."""
 
     @abstractmethod
-    def _arrival(self, position: float, issued: int, samples: Samples) -> Callable[[], bool]:
-        """What is asked again and again whether it has arrived; appends its readings to `samples`."""
+    def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> Callable[[], bool]:
+        """What is asked again and again whether it has arrived; appends its readings to `samples`.
+
+        Where it was not begun `homed`, the zero is neither asked for nor given up.
+        """
 
     # --- motions ---
 
@@ -135,12 +142,31 @@ class RailAxis(ABC):
         with self._starting:
             issued = self._free()
             duration = self._start(position, speed, issued)
+            readings: Samples = []
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=self._arrival(position, issued, []),
+                arrived=self._arrival(position, issued, readings),
                 halt=self._halt(issued),
                 duration=duration,
+                readings=readings,
+            )
+            return self._motion
+
+    def nudge(self, distance: float, speed: float) -> RailMotion:
+        """Move by `distance` m, whether homed or not; see `drivers.interfaces.Nudged`."""
+        check_range(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
+        speed = self._checked_speed("speed", speed)
+        with self._starting:
+            issued = self._free()
+            goal = self._position() + distance
+            self._send(goal, speed, issued)
+            self._motion = RailMotion(
+                self.name,
+                self._clock,
+                arrived=self._arrival(goal, issued, [], homed=False),
+                halt=self._halt(issued),
+                duration=move_duration(distance, speed, self._acceleration),
             )
             return self._motion
 
@@ -183,6 +209,11 @@ class RailAxis(ABC):
         self._require_control()
         self._homing = False
         self._link.stop()
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """While it is open, a helper stops the motor once it hears nothing; see `drivers.interfaces.Attended`."""
+        self._require_control()
+        return self._link.attended()
 
     def close(self) -> None:
         """Stop the motor, unless it is only looked at, and close the port."""

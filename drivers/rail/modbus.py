@@ -165,7 +165,7 @@ class ModbusRail(RailAxis):
         self._drive.set(self.registers.target, round(position * self._counts), issued)
         self._link.do(self.registers.start, issued=issued, moves=True)
 
-    def _arrival(self, position: float, issued: int, samples: Samples) -> DriveArrival:
+    def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> DriveArrival:
         return DriveArrival(
             self._drive,
             self._clock,
@@ -173,7 +173,7 @@ class ModbusRail(RailAxis):
             near=self._in_position,
             issued=issued,
             samples=samples,
-            zero=self._zero,
+            zero=self._zero if homed else None,
         )
 
     def _at_start(self) -> float:

@@ -16,8 +16,8 @@ class DriveArrival:
     """Watches one positioning to `target` counts, appending readings to `samples`; it may settle `near` counts off it.
 
     `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
-    it does not. Called again and again: True at the target; raises `Aborted` after a stop and `DeviceFault` for
-    rail.reset, rail.alarm, rail.limit_switch, rail.missed_target and rail.stalled.
+    it does not; None where it does not matter. Called again and again: True at the target; raises `Aborted` after a
+    stop and `DeviceFault` for rail.reset, rail.alarm, rail.limit_switch, rail.missed_target and rail.stalled.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class DriveArrival:
         near: int,
         issued: int,
         samples: Samples,
-        zero: DriveZero,
+        zero: DriveZero | None,
     ) -> None:
         self._drive = drive
         self._target = target
@@ -51,7 +51,7 @@ class DriveArrival:
         there = abs(round(position * drive.counts) - self._target) <= self._near
         if there and not drive.says(drive.registers.moving):
             # A drive that was reset stands at its target, too, if that is 0.
-            self._zero.require("in its motion")
+            self._require_zero()
             return True
         if position != self._last:
             self._last, self._moved = position, stamp
@@ -61,7 +61,7 @@ class DriveArrival:
 
     def _failure(self, position: float) -> DeviceFault:
         drive, registers = self._drive, self._drive.registers
-        self._zero.require("in its motion")
+        self._require_zero()
         goal = self._target / drive.counts
         short = f"stands at {shown(position, 'm')}, its target is {shown(goal, 'm')}"
         if not drive.says(registers.fault) and drive.read(registers.target) != self._target:
@@ -70,7 +70,8 @@ class DriveArrival:
                 f"{short}: somebody else changed the drive's target",
                 "See what else commands this drive.",
             )
-        self._zero.forget()
+        if self._zero is not None:
+            self._zero.forget()
         if drive.says(registers.fault):
             return drive.alarmed("in its motion")
         side, switch = ("right", registers.right_switch) if goal > position else ("left", registers.left_switch)
@@ -86,3 +87,7 @@ class DriveArrival:
             "See whether the carriage is blocked, the drive is enabled and rail.registers.start is right, then home "
             "again.",
         )
+
+    def _require_zero(self) -> None:
+        if self._zero is not None:
+            self._zero.require("in its motion")

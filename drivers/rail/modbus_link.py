@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, descriptor_of
+from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.rail.registers import Action
 from drivers.serial_port import FAILURES, open_port
 
@@ -36,6 +37,8 @@ _SILENCE_BYTES = 3.5
 _LEAST_SILENCE_S = 0.00175
 """The standard's, above 19200 baud."""
 _QUIET_S = 0.05
+_IN_STEP_S = 0.25
+"""Wall seconds for the reply to a question that is asked to be in step again."""
 _ATTEMPTS = 2
 _LONGEST_BYTES = 16
 """Of a request or a reply."""
@@ -94,6 +97,7 @@ class ModbusLink:
         self._stops = 0
         self._closed = False
         self._echoes: bool | None = None
+        self._in_step = True
         self._quiet_since = 0.0
         self._last_words: LastWords | None = None
         self._port: Any = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
@@ -157,7 +161,11 @@ class ModbusLink:
                 self._last_words.close()
             self._port.close()
 
-    def _stop_after_death(self) -> None:
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
+        return attended_by(self.name, self._stop_after_death())
+
+    def _stop_after_death(self) -> LastWords | None:
         """From the first motion on: who never moved it has nothing to end."""
         port = descriptor_of(self._port)
         if self._last_words is None and port is not None:
@@ -165,6 +173,7 @@ class ModbusLink:
             words = [_frame(self._unit, WRITE_ONE, *_words(action.address, value)) for value in action.writes]
             # Twice: the owner may have died in the middle of a frame of its own, which spoils the first one.
             self._last_words = LastWords(self.name, port, words * 2)
+        return self._last_words
 
     def _exchange(self, request: bytes, length: int, what: str, issued: int | None) -> tuple[bytes, float, float]:
         """The choke point: send `request`, give its reply of `length` bytes, the middle of the round trip, its length.
@@ -186,7 +195,7 @@ class ModbusLink:
                 except FrameError as error:
                     failure = error
                     self._statistics.count("bad_replies")
-                    self._rest()
+                    self._in_step = False
                 except ModbusRefused as refused:
                     if refused.number not in _BUSY or attempt + 1 == _ATTEMPTS:
                         raise
@@ -211,6 +220,12 @@ class ModbusLink:
         if self._port.in_waiting:
             self._statistics.count("stale_input")
             self._rest()
+        if not self._in_step:
+            self._in_step = self._got_in_step(request)
+        if not self._in_step:
+            # Sent all the same: it may be a stop, and a drive that cannot be heard may hear.
+            self._port.write(request)
+            raise FrameError("no reply came to the question after the one before it")
         left = self._quiet_since + self._silence_s - time.monotonic()
         if left > 0:
             time.sleep(left)
@@ -237,6 +252,29 @@ class ModbusLink:
             raise FrameError(f"a frame of {len(data)} bytes came instead of {length}, {data.hex(' ')}")
         self._statistics.add_round_trip(self._clock.wall(after - before))
         return data, 0.5 * (before + after), after - before
+
+    def _got_in_step(self, request: bytes) -> bool:
+        """Whether the next reply will be that to `request`: after one that was missing or wrong it may still come.
+
+        A reply names neither register nor question. So one register is read where several were, or two where one was:
+        once that reply is there, whatever it says, none to an earlier question can follow. False when it does not come.
+        """
+        self._rest()
+        reads = request[1] in (READ, READ_INPUT)
+        count = 2 if reads and request[4:6] == _words(1) else 1
+        function = request[1] if reads else READ
+        fence = _frame(self._unit, function, *request[2:4], *_words(count))
+        time.sleep(self._silence_s)
+        self._port.write(fence)
+        came, end = b"", time.monotonic() + _IN_STEP_S
+        while time.monotonic() < end:
+            came += self._rest()
+            for length, code in ((5 + 2 * count, function), (5, function | 0x80)):
+                reply = came[-length:]
+                if len(reply) == length and reply[:2] == bytes([self._unit, code]) and _crc(reply[:-2]) == reply[-2:]:
+                    self._quiet_since = time.monotonic()
+                    return True
+        return False
 
     def _learn_echo(self, request: bytes) -> bytes:
         """The first reply, and whether this line repeats what is sent: many adapters to two wires hear themselves."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from drivers.clock import Clock
@@ -20,6 +20,9 @@ POLL_S = 0.010
 POLL_WALL_S = 0.004
 WALL_FLOOR_S = 0.5
 """No patience with the device is shorter than this on the wall, however fast the clock runs."""
+
+
+Readings = Sequence[tuple[float, float, float]]
 
 
 def run_up_distance(speed: float, acceleration: float) -> float:
@@ -44,7 +47,8 @@ class RailMotion:
     """A running motion of the rail `name`.
 
     `arrived` is asked again and again: True ends the motion well, a `CellError` ends it with that error. `halt` stops
-    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s.
+    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s. `readings`
+    are those of its way so far, as far as it is told: host time in s, position in m, round trip in s.
     """
 
     def __init__(
@@ -55,7 +59,9 @@ class RailMotion:
         arrived: Callable[[], bool],
         halt: Callable[[], None],
         duration: float,
+        readings: Readings = (),
     ) -> None:
+        self.readings = readings
         self._name = name
         self._clock = clock
         self._arrived = arrived

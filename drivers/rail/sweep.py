@@ -47,7 +47,7 @@ class RailSweep(RailMotion):
         self._resolution = resolution
         self._record = record
         self._motion: EvenMotion | None = None
-        super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration)
+        super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration, readings=record)
 
     @property
     def samples(self) -> Vector:

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError
-from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Reading
-from drivers.quantities import check_range
+from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail import health
 from drivers.rail.arrival import Arrival
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
-from drivers.rail.motion import RailMotion, move_duration
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import ZeroMark
@@ -129,27 +127,6 @@ class TmclRail(RailAxis):
     def _require_zero(self) -> None:
         self._zero.require()
 
-    def nudge(self, distance: float, speed: float) -> RailMotion:
-        """Move by `distance` m, whether homed or not; see `drivers.interfaces.Nudged`."""
-        check_range(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
-        speed = self._checked_speed("speed", speed)
-        with self._starting:
-            issued = self._free()
-            here = self._link.get(Axis.POSITION)
-            target = here + round(distance * self._counts)
-            set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
-            self._link.move_to(target, issued=issued)
-            self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=Arrival(
-                    self._link, self._clock, target=target, counts=self._counts, issued=issued, samples=[], zero=None
-                ),
-                halt=self._halt(issued),
-                duration=move_duration(distance, speed, self._acceleration),
-            )
-            return self._motion
-
     def _begin_homing(self, issued: int) -> None:
         self._zero.searching(issued=issued)
         self._set_up()
@@ -168,7 +145,7 @@ class TmclRail(RailAxis):
         set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
         self._link.move_to(round(position * self._counts), issued=issued)
 
-    def _arrival(self, position: float, issued: int, samples: Samples) -> Arrival:
+    def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> Arrival:
         return Arrival(
             self._link,
             self._clock,
@@ -176,7 +153,7 @@ class TmclRail(RailAxis):
             counts=self._counts,
             issued=issued,
             samples=samples,
-            zero=self._zero,
+            zero=self._zero if homed else None,
         )
 
     def _set_up(self) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from typing import TypeVar
 
 import serial
@@ -16,7 +17,7 @@ import serial
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, descriptor_of
+from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.rail.tmcl_codec import (
     STATUS_OK,
     STATUS_TEXT,
@@ -39,7 +40,11 @@ WRONG_CHECKSUM, NO_SUCH_TYPE, WRONG_VALUE = 1, 3, 4
 """Some of the status codes of a reply."""
 _QUIET_S = 0.05
 _ATTEMPTS = 2
+_IN_STEP_S = 0.25
+"""Wall seconds for the reply to a question that is asked to be in step again."""
 _USER_BANK = 2
+_FENCE_TYPE = 1
+"""Axis parameter 1 is the position; that a module has no such global parameter does not matter."""
 
 Answer = TypeVar("Answer")
 
@@ -76,6 +81,7 @@ class TmclLink:
         self._statistics = statistics
         self._lock = threading.Lock()
         self._stops = 0
+        self._in_step = True
         self._closed = False
         try:
             self._port = serial.serial_for_url(
@@ -157,11 +163,16 @@ class TmclLink:
                 self._last_words.close()
             self._port.close()
 
-    def _stop_after_death(self) -> None:
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
+        return attended_by(self.name, self._stop_after_death())
+
+    def _stop_after_death(self) -> LastWords | None:
         """From the first motion on: who never moved it has nothing to end."""
         port = descriptor_of(self._port)
         if self._last_words is None and port is not None:
             self._last_words = LastWords(self.name, port, self._stop_words)
+        return self._last_words
 
     def _command(self, command: Command, kind: int, value: int = 0, *, issued: int | None = None) -> Reply:
         request = Request(self._address, command, kind, self._motor, value)
@@ -198,7 +209,7 @@ class TmclLink:
                     return self._once(request, decode)
                 except TelegramError as error:
                     failure = error
-                    self._drain()
+                    self._in_step = False
                 except (serial.SerialException, OSError) as error:
                     self._statistics.count("link_lost")
                     raise DeviceFault(
@@ -221,6 +232,12 @@ class TmclLink:
         if self._port.in_waiting:
             self._statistics.count("stale_input")
             self._drain()
+        if not self._in_step:
+            self._in_step = self._got_in_step(request)
+        if not self._in_step:
+            # Sent all the same: it may be a stop, and a module that cannot be heard may hear.
+            self._port.write(request.encode())
+            raise TelegramError("no reply came to the question after the one before it")
         before = self._clock.now()
         sent = request.encode()
         traffic = self._statistics.traffic
@@ -247,6 +264,30 @@ class TmclLink:
             raise
         self._statistics.add_round_trip(self._clock.wall(after - before))
         return answer, 0.5 * (before + after), after - before
+
+    def _got_in_step(self, request: Request) -> bool:
+        """Whether the next reply will be that to `request`: after one that was missing or wrong it may still come.
+
+        A reply names its command alone. So a harmless question of another command is asked: once its reply is there,
+        none to an earlier one can follow. False when it does not come.
+        """
+        self._drain()
+        question = Command.GET_AXIS if request.command == Command.GET_GLOBAL else Command.GET_GLOBAL
+        fence = Request(self._address, question, _FENCE_TYPE, 0)
+        sent = fence.encode()
+        self._port.write(sent)
+        end = time.monotonic() + _IN_STEP_S
+        self._port.timeout = _IN_STEP_S
+        try:
+            while time.monotonic() < end and len(data := self._port.read(TELEGRAM_BYTES)) == TELEGRAM_BYTES:
+                # A refusal is a reply as well; an adapter's echo of the question is none.
+                if data != sent:
+                    with suppress(TelegramError):
+                        decode_reply(data, fence)
+                        return True
+        finally:
+            self._port.timeout = REPLY_TIMEOUT_S
+        return False
 
     def _drain(self) -> None:
         """Throw away what still comes in, until the line was quiet, so that a late reply answers nothing else."""

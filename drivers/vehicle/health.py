@@ -40,7 +40,7 @@ def readings(
     Without `judge_times`, on a clock that is not the wall's, times and load have no limits.
     """
     own = database.get_message_by_name(EVEN).frame_id
-    arrived = [stamp for stamp, frame in heard if frame.arbitration_id == own and not frame.is_error_frame]
+    arrived = [stamp for stamp, frame in heard if frame.arbitration_id == own and _of_the_vehicle(frame)]
     period = float(np.percentile(np.diff(arrived), 99)) if len(arrived) > 1 else np.nan
     bits = sum(most_bits(frame) for _, frame in heard)
     found = [
@@ -72,7 +72,7 @@ def bus_readings(heard: Sequence[can.Message], interface: CanInterface | None) -
 
 def _told(heard: Heard, database: Database) -> list[Reading]:
     """Of the newest frames of each kind; a vehicle that does not send them tells nothing."""
-    newest = {frame.arbitration_id: frame for _, frame in heard if not frame.is_error_frame}
+    newest = {frame.arbitration_id: frame for _, frame in heard if _of_the_vehicle(frame)}
     told: dict[str, dict[str, float]] = {}
     for message in database.messages:
         frame = newest.get(message.frame_id)
@@ -95,6 +95,11 @@ def _told(heard: Heard, database: Database) -> list[Reading]:
             Reading("hottest motor or its driver", hottest, "°C", most=HOTTEST_DEG_C, remedy="Let the vehicle stand.")
         )
     return found
+
+
+def _of_the_vehicle(frame: can.Message) -> bool:
+    """Whether it may be the vehicle's: data with a short identifier. A long one of the same number is another's."""
+    return not (frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame)
 
 
 def most_bits(frame: can.Message) -> int:

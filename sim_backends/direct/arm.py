@@ -51,6 +51,7 @@ class DirectArm:
         """By how many seconds each state comes later than the controller measured it."""
         self._recorded: list[ArmState] | None = None
         self._stops = 0
+        self._tried: list[int] = []
 
     def identity(self) -> Identity:
         """The model's own plate."""
@@ -143,6 +144,16 @@ class DirectArm:
         self.model.write_digital_outputs(1 << index, int(value) << index)
         self.clock.sleep(TICK_S)
 
+    @contextmanager
+    def trying(self, index: int) -> Iterator[None]:
+        """See `drivers.interfaces.TriesOutputs`."""
+        within(self.name, "digital output", index, 0, _OUTPUTS - 1, "")
+        self._tried.append(index)
+        try:
+            yield
+        finally:
+            self._tried.remove(index)
+
     def digital_input(self, index: int) -> bool:
         """What is wired to input `index`."""
         within(self.name, "digital input", index, 0, _OUTPUTS - 1, "")
@@ -154,7 +165,7 @@ class DirectArm:
         Ended by `stop()`, with `Aborted`.
         """
         stops = self._stops
-        for index in self._setup.safe_off:
+        for index in (*self._setup.safe_off, *self._tried):
             self.set_digital_output(index, False)
         if self.model.safety is Safety.PROTECTIVE_STOP:
             if not confirmed:
@@ -178,7 +189,7 @@ class DirectArm:
     def close(self) -> None:
         """Stop; the safe outputs go off."""
         self.stop()
-        for index in self._setup.safe_off:
+        for index in (*self._setup.safe_off, *self._tried):
             self.set_digital_output(index, False)
 
     def fault(self, code: str, text: str) -> DeviceFault:

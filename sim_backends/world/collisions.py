@@ -1,8 +1,8 @@
 """What is solid in the world and must not meet: vehicle, arm and tool, table, board and its post, floor.
 
 Coarse on purpose, and never larger than the real thing: points with a radius along the arm and at the tool's corners,
-boxes for what stands. The part's and the fingertips' contact with the ground is `contact`'s business. The plates on the
-deck are left out.
+boxes for what stands, obstacles of configuration and job among them. The part's and the fingertips' contact with the
+ground is `contact`'s business. The plates on the deck are left out.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from sim_backends.optics.scene import Board
 from sim_backends.world import nominal
 from sim_backends.world.arm_points import BODIES, ArmPoints
 from sim_backends.world.contact import PartContact
+from sim_backends.world.drawing import Box
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Scene
 
@@ -37,6 +39,10 @@ _FAR = 1.5
 """From further away, m, no corner of the stock vehicle reaches the station at the world's origin."""
 _POST = np.array([[0.0, -0.015], [0.04, -0.015], [0.04, 0.015], [0.0, 0.015]])
 """Corners (4, 2) of the board's post, m, from the board's middle along the place frame's axes."""
+
+
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+"""Of a box of half edges 1."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,20 @@ class Collisions:
             "board": (inverse(board), half),
             "board post": (inverse(post_pose), np.array([*(0.5 * np.ptp(post, axis=0)), middle])),
         }
+        self._on_vehicle = {f"obstacle {name}": _box(box) for name, box in scene.drawing.cell.obstacles.items()}
+        top = float(base[2, 3] + DECK[1, 2])
+        for name, drawn in scene.drawing.station.obstacles.items():
+            centred, size = _box(drawn)
+            pose = scene.world_from_place @ inverse(centred)
+            self._boxes[f"station obstacle {name}"] = inverse(pose), size
+            corners = _moved(size * _CORNERS, pose)
+            if corners[:, 2].min() < top:
+                # As seen from above: the corners of its top and bottom together.
+                outline = ConvexHull(corners[:, :2])
+                self._standing[f"station obstacle {name}"] = corners[outline.vertices, :2]
+                self._far = max(
+                    self._far, float(np.hypot(*self._footprint.T).max() + np.hypot(*corners[:, :2].T).max())
+                )
         self._lock = threading.Lock()
         self._found: list[Collision] = list(found)
         self._touching: dict[tuple[str, str], float] = {}
@@ -126,8 +146,10 @@ class Collisions:
 
         The part touches only what is not the ground here.
         """
-        vehicle = _moved(_moved(points, inverse(world_from_vehicle)), self._base_from_vehicle) - DECK.mean(axis=0)
+        in_base = _moved(_moved(points, inverse(world_from_vehicle)), self._base_from_vehicle)
+        vehicle = in_base - DECK.mean(axis=0)
         depths = {name: _inside(_moved(points, pose), half) for name, (pose, half) in self._boxes.items()}
+        depths |= {name: _inside(_moved(in_base, pose), half) for name, (pose, half) in self._on_vehicle.items()}
         depths["vehicle"] = _inside(vehicle, 0.5 * np.ptp(DECK, axis=0))
         below, on_table = self._ground.below(points)
         held = self._arm.body == BODIES.index("part")
@@ -153,6 +175,11 @@ def _inside(points: Vector, half: Vector) -> Vector:
     outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
     depth: Vector = -np.where(outside > 0.0, outside, beyond.max(axis=1))
     return depth
+
+
+def _box(drawn: Box) -> tuple[Pose, Vector]:
+    """box_from_frame (4, 4) and half edges (3,) of an obstacle that is drawn in some frame."""
+    return inverse(np.array(drawn["pose"], dtype=np.float64)), 0.5 * np.array(drawn["size"], dtype=np.float64)
 
 
 def _lifted(corners: Vector, pose: Pose) -> Vector:

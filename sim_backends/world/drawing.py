@@ -21,6 +21,10 @@ TEXT_M, TEXT_RAD = 5e-6, 1e-9
 """A pose written in hundredths of a millimetre and in degrees is this near to the one that was meant, m and rad."""
 
 
+Box = dict[str, list[Any]]
+"""Something solid: "pose" of its middle, four rows of four, and the "size" of its edges, m."""
+
+
 @dataclass(frozen=True, eq=False)
 class CameraDrawing:
     """A camera: `size` (width, height) in px, `pixel`, `focal_length` and `focus` (the distance of its sharpest
@@ -76,6 +80,8 @@ class CellDrawing:
     deck_board: str
     base_from_deck_board: Pose
     wires: dict[str, dict[str, Any]] = field(default_factory=dict)
+    obstacles: dict[str, Box] = field(default_factory=dict)
+    """On the vehicle, in the arm's base."""
 
     @property
     def fixed(self) -> bool:
@@ -102,6 +108,8 @@ class StationDrawing:
     flange_from_part: Pose
     surface_from_part: Pose
     part_size: tuple[float, float, float]
+    obstacles: dict[str, Box] = field(default_factory=dict)
+    """In the place frame."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,12 +69,16 @@ class Cable:
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._peers[end] = peer
 
+    def _passed(self, end: socket.socket, data: bytes) -> bytes:
+        """What becomes of bytes that came from `end`."""
+        return data
+
     def _move(self, end: socket.socket) -> None:
         peer = self._peers[end]
         try:
             data = end.recv(65536)
             if data:
-                peer.sendall(data)
+                peer.sendall(self._passed(end, data))
                 return
         except OSError:
             pass

@@ -20,7 +20,9 @@ WAVER = (3, -3, 1, -2, 3, 0, -3, 2)
 
 class OtherVehicle:
     """Attributes change how it behaves: `lost` identifiers are not sent, `short` ones with a byte less; `mode`, `state`
-    and `errors` are what 0x211 reports; `noisy` wavers at rest; `versions` is how it answers for its version.
+    and `errors` are what 0x211 reports; `noisy` wavers at rest; `versions` is how it answers for its version. With
+    `crowded` other nodes are on the bus: long identifiers of its own numbers that say it is fast, hot and in emergency
+    stop, remote requests, error frames, numbers that nobody knows; and the count in 0x211 jumps.
     """
 
     interface = "virtual"
@@ -31,7 +33,7 @@ class OtherVehicle:
         self.lost: set[int] = set()
         self.short: set[int] = set()
         self.mode, self.state, self.errors, self.noisy = 0, 0, 0, True
-        self.under_remote_control = False
+        self.under_remote_control = self.crowded = False
         self.speed = self.yaw_rate = 0.0
         self.left = self.right = 0.0
         self.braked: bool | None = None
@@ -52,6 +54,16 @@ class OtherVehicle:
         if identifier not in self.lost:
             data = data[:-1] if identifier in self.short else data
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def _crowd(self) -> None:
+        wild = {0x211: bytes([1, 3, 0, 1, 255, 255, 0, 9]), 0x221: b"\x7f\xff" * 4, 0x311: b"\x7f\xff\xff\xff" * 2}
+        wild |= {0x251: b"\x7f\xff" * 4, 0x261: b"\x7f" * 8, 0x361: b"\x7f" * 8, 0x111: b"\x01\xf4" * 4, 0x131: b"\x00"}
+        for identifier, data in wild.items():
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=True))
+            self._bus.send(can.Message(arbitration_id=identifier, dlc=8, is_remote_frame=True, is_extended_id=False))
+        self._bus.send(can.Message(arbitration_id=0x20000004, dlc=8, data=b"\x00\x04" * 4, is_error_frame=True))
+        self._bus.send(can.Message(arbitration_id=0x7FF, data=b"", is_extended_id=False))
+        self._bus.send(can.Message(arbitration_id=0x1FFFFFFF, data=b"\xff" * 8, is_extended_id=True))
 
     def _listen(self) -> None:
         while not self._ending.is_set():
@@ -89,8 +101,11 @@ class OtherVehicle:
             shown = (round(1000 * self.speed) + noise, round(1000 * self.yaw_rate) - noise, 0, 0)
             self._send(0x221, struct.pack(">4h", *shown))
             self._send(0x311, struct.pack(">2i", round(self.left), round(self.right)))
+            if self.crowded:
+                self._crowd()
             if count % 5 == 0:
-                system = struct.pack(">BBHHBB", self.state, self.mode, 245, self.errors, 0, count % 256)
+                jumped = count * 37 if self.crowded else count
+                system = struct.pack(">BBHHBB", self.state, self.mode, 245, self.errors, 0, jumped % 256)
                 self._send(0x211, system)
             if count % 25 == 0:
                 self._send(0x361, struct.pack(">BBhhh", 12, 98, 245, -15, 253))

@@ -435,7 +435,11 @@ def test_no_arm_and_a_silent_arm_at_the_start_are_not_connected():
 def keep_outputs(bench):
     """Have the controller keep the laser's output when no program runs, so that only the driver can switch it off."""
     with socket.create_connection((bench.address, 30002), timeout=5.0) as connection:
-        connection.sendall(b"sec keep():\n  set_runstate_standard_digital_output_to_value(0, 0)\nend\n")
+        connection.sendall(
+            b"sec keep():\n"
+            + b"".join(b"  set_runstate_standard_digital_output_to_value(%d, 0)\n" % k for k in (0, 2))
+            + b"end\n"
+        )
         connection.recv(4096)
         Clock().sleep(0.05)
 
@@ -446,7 +450,12 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 arm = UrArm("arm", sys.argv[1], safe_off_outputs=(0,), clock=Clock())
 arm.set_digital_output(0, True)
+with arm.trying(1):
+    pass
 arm.set_digital_output(1, True)
+trial = arm.trying(2)
+trial.__enter__()
+arm.set_digital_output(2, True)
 joints = arm.state().joints
 joints[0] += 2.0
 arm.move_joints(joints, 0.5, 2.0)
@@ -457,11 +466,29 @@ threading.Event().wait(60)
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGTERM])
 def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends(way):
-    with ArmBench() as bench:
-        owner_dies(bench, way)
+    with ArmBench() as bench, owned(bench) as (owner, child):
+        keep_outputs(bench)
+        owner.send_signal(way)
+        assert soon(lambda: not bench.ask("show")["moving"])
+        laser_and_tried_off_claw_closed(bench)
+        assert soon(lambda: gone(child))
 
 
-def owner_dies(bench, way):
+def test_when_the_owner_and_its_child_die_the_controller_switches_off_what_was_tried():
+    with ArmBench() as bench, owned(bench) as (owner, child):
+        owner.send_signal(signal.SIGSTOP)
+        os.kill(child, signal.SIGKILL)
+        owner.kill()
+        laser_and_tried_off_claw_closed(bench)
+
+
+def laser_and_tried_off_claw_closed(bench):
+    assert soon(lambda: bench.ask("show")["outputs"] & 0b111 == 0b010), "the trial of the claw's output is over"
+
+
+@contextmanager
+def owned(bench):
+    """A process that moves the arm with its laser on, its claw closed and a third output tried; and its child's id."""
     owner = subprocess.Popen(
         [sys.executable, "-c", OWNER, bench.address],
         stdout=subprocess.PIPE,
@@ -469,13 +496,9 @@ def owner_dies(bench, way):
     )
     assert owner.stdout is not None
     child = json.loads(owner.stdout.readline())["child"]
-    assert bench.ask("show")["outputs"] & 0b11 == 0b11
-    keep_outputs(bench)
+    assert bench.ask("show")["outputs"] & 0b111 == 0b111
     assert soon(lambda: bench.ask("show")["moving"])
-    owner.send_signal(way)
-    assert soon(lambda: bench.ask("show")["outputs"] & 0b11 == 0b10), "the laser is off, the claw stays closed"
-    assert soon(lambda: not bench.ask("show")["moving"])
-    assert soon(lambda: gone(child))
+    yield owner, child
     owner.communicate(timeout=10)
 
 

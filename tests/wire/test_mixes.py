@@ -6,19 +6,23 @@ What is real is known to the cell by its measured states alone, as on hardware: 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cell import Cell
+from cell.devices.followed_camera import FollowedCamera
+from cell.job import job_path
 from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.tmcl import TmclPeer
-from tests.described_cells import described, pose
+from tests.described_cells import changed, described, pose
+from tests.wire.cells import SPEED, served
 from tests.wire.cells import cell as command
-from tests.wire.cells import served
+from tests.wire.gige_bench import require_aravis
 
 pytestmark = pytest.mark.wire
 
@@ -60,11 +64,13 @@ def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where
             camera.grab()
             told = world.truth()["rail"]
             assert told["carriage"] == pytest.approx(0.02 * told["scale"], abs=5e-5)
+            assert isinstance(camera, FollowedCamera)
             moving = rail.move_to(0.06)
             with pytest.raises(DeadlineError):
-                camera.grab(0.4)
-            moving.wait(10.0)
+                camera.bare.grab(0.4)
             camera.grab()
+            assert camera.statistics.errors["picture asked for again"] >= 1, "into the gap once more, then after it"
+            moving.wait(10.0)
             figures = cell.devices.following.figures()
             assert figures["not_made"] >= 1
             assert "the rail" in figures["why_not"]
@@ -85,15 +91,34 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.campaign
 @pytest.mark.parametrize("sim", MIXES)
 def test_the_job_ends_placed_with_any_mix_that_physics_allows(folder: Path, sim: str) -> None:
+    placed(folder, sim)
+
+
+@pytest.mark.campaign
+def test_the_job_ends_placed_when_a_real_arm_sweeps_a_simulated_scan_head(folder: Path) -> None:
+    text = changed(job_path("pot").read_text(encoding="utf-8"), {"scan": {"mode": '"arm"'}})
+    (folder / "arm.toml").write_text(text, encoding="utf-8")
+    placed(folder, "scan_camera,laser", "arm.toml")
+
+
+@pytest.mark.campaign
+def test_the_job_ends_placed_when_the_simulated_scan_camera_is_on_gige_vision(tmp_path: Path) -> None:
+    require_aravis()
+    described(tmp_path, {"scan_camera": {"driver": '"gige"', "address": '"192.0.2.20"'}}, AIR)
+    placed(tmp_path, "scan_camera,laser")
+
+
+def placed(folder: Path, sim: str, job: str = "pot") -> None:
     """With a simulated scan camera the real station is out of the way; beside a real one it is where the job has it."""
     station = ("-j", "own.toml") if "scan_camera" in sim else ()
-    with served(folder, "--seed", "11", *station), Cell.open(folder / "sim.toml", sim=sim, seed=3) as cell:
+    at = ("--seed", "11", "--speed", os.environ.get("CELL_MIX_SPEED", SPEED))
+    with served(folder, *at, *station), Cell.open(folder / "sim.toml", sim=sim, seed=3) as cell:
         try:
             cell.calibration()
         except CalibrationStale:
             cell.calibrate()
         serials = cell.calibration().identities
-        outcome = cell.run("pot", at_start=True)
+        outcome = cell.run(folder / job if job.endswith(".toml") else job, at_start=True)
     report = json.loads((outcome.folder / "report.json").read_text(encoding="utf-8"))
     print(sim, outcome, json.dumps({key: report[key] for key in ("following", "truth")}))
     assert outcome.outcome == "placed", outcome.reason

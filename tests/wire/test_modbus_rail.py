@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 from pymodbus.client import ModbusSerialClient
+from pymodbus.framer import FramerRTU
 
 from cell.devices.contracts import Bench, Faults
 from cell.devices.contracts.rail import RailContract
 from cell.devices.rail_makes import ModbusRailConfig, register_map
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
-from drivers.interfaces import Rail
+from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.modbus import ModbusRail
-from drivers.rail.modbus_link import ModbusRefused
+from drivers.rail.modbus_link import ModbusLink, ModbusRefused
+from drivers.rail.registers import Action
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.modbus_drive import ModbusDrive, ModbusPeer
@@ -146,6 +153,38 @@ def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to
     rail.close()
     with pytest.raises(DeadlineError, match=r"rail\.unit.*rail\.baud, rail\.parity, rail\.stop_bits"):
         drive.rail(unit=UNIT + 1)
+
+
+@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
+def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
+    listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(8):
+                address, count = struct.unpack(">HH", request[2:6])
+                if ready.is_set() and next(asked) < 2:
+                    time.sleep(late)
+                body = bytes([UNIT, 3, 2 * count]) + struct.pack(">H", address) * count
+                connection.sendall(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+
+    threading.Thread(target=serve, daemon=True).start()
+    link = ModbusLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
+        stop_action=Action(1, 1), clock=Clock(), statistics=LinkStatistics(),
+    )  # fmt: skip
+    assert link.read(7, 2) == [7, 7]
+    ready.set()
+    right = 0
+    for address in (16, 32, 48, 64, 80, 96):
+        with suppress(DeadlineError):
+            assert link.read(address, 2) == [address, address]
+            right += 1
+    assert right >= 3
+    link.close()
+    listener.close()
 
 
 def test_a_register_that_the_drive_does_not_have_is_named() -> None:

@@ -6,15 +6,19 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
+import can
 import pytest
 from other_drives import OtherDrives
 
+from cell.devices.canopen_nodes import look_at_nodes
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
+from tests.test_canopen_parts import config
 
 pytestmark = pytest.mark.wire
 
@@ -39,6 +43,33 @@ def bench() -> Iterator[Bench]:
     yield made
     made.vehicle.close()
     made.drives.close()
+
+
+def test_the_nodes_of_a_bus_are_found_by_one_question_each_and_the_others_only_heard(tmp_path: Path) -> None:
+    """Neither a network command nor anything for a node that the configuration does not name is sent."""
+    channel = next(CHANNELS)
+    record = config(tmp_path, left_node="5", right_node="6").model_copy(
+        update={"interface": "virtual", "channel": channel}
+    )
+    drives = OtherDrives(channel)
+    with can.Bus(channel=channel, interface="virtual") as bus:
+        try:
+            bus.send(can.Message(arbitration_id=0x700 + 9, data=b"\x05", is_extended_id=False))
+            text, ok = look_at_nodes(record)
+            missing, found = look_at_nodes(record.model_copy(update={"right_node": 7}))
+            taken = look_at_nodes(record.model_copy(update={"own_node": 5, "left_node": 6, "right_node": 5}))
+        finally:
+            drives.close()
+        sent = {frame.arbitration_id for frame in iter(lambda: bus.recv(0.0), None)}
+    assert ok
+    assert text.startswith("node 5 answers: profile 402 (vendor 0x26c, product 0x9); node 6 answers: profile 402")
+    assert not found and "node 7 does not answer: see its number" in missing
+    assert not taken[1] and "node 5, which is to be this program's, is taken" in taken[0]
+    assert not {
+        identifier
+        for identifier in sent
+        if identifier in (0x000, 0x080) or (identifier > 0x600 + 7 and identifier < 0x700)
+    }
 
 
 def drive_for(vehicle: CanopenVehicle, seconds: float, speed: float, yaw_rate: float = 0.0) -> None:

@@ -125,6 +125,25 @@ def test_frames_of_another_length_are_not_read_and_are_told(peer: OtherVehicle) 
         connect(peer)
 
 
+def test_what_other_nodes_send_is_not_the_vehicles(peer: OtherVehicle, driver: AgilexVehicle) -> None:
+    peer.crowded = True
+    driver.enable()
+    for _ in range(40):
+        driver.drive(0.2, 0.0)
+        time.sleep(0.02)
+    state = driver.state()
+    assert state.speed == pytest.approx(0.2, abs=0.004)
+    assert 0.02 < state.x < 0.3 and abs(state.y) < 0.01
+    assert state.interruptions == 0 and not state.emergency_stop
+    readings = {row.what: row for row in driver.examine(0.5)}
+    assert readings["charge"].value == 12 and readings["battery's temperature"].value == pytest.approx(25.3)
+    assert "hottest motor or its driver" not in readings
+    assert not readings["error frames"].ok
+    driver.stop()
+    driver.brake()
+    driver.check()
+
+
 @pytest.mark.parametrize("mode", [0, 2, 3])
 def test_a_person_at_the_remote_control_is_in_charge_whatever_mode_the_model_reports(
     peer: OtherVehicle, driver: AgilexVehicle, mode: int

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -20,10 +22,12 @@ from drivers.errors import (
     LimitError,
     NotConnectedError,
 )
-from drivers.interfaces import Rail
+from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.motion import move_duration, run_up_distance
 from drivers.rail.timing import fit_line
 from drivers.rail.tmcl import TmclRail
+from drivers.rail.tmcl_codec import Axis
+from drivers.rail.tmcl_link import TmclLink
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.tmcl import TmclPeer
@@ -581,6 +585,44 @@ def test_a_left_over_answer_is_never_taken_for_the_next_ones(module: Callable[..
     assert [rail.state().position for _ in range(3)] == [0.0, 0.0, 0.0]
     assert rail.statistics.errors["stale_input"] >= 3
     rail.close()
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("late", [0.2, 0.6, 0.9])
+def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+    """Two replies are late, those behind them come at once after them: a position is that of its time, or an error."""
+    listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(9):
+                value = 1 if request[1] == 6 and request[2] == 255 else round(25_600 * time.monotonic()) % 2**30
+                if ready.is_set() and next(asked) < 2:
+                    time.sleep(late)
+                connection.sendall(reply(request, value if request[1] == 6 else 0))
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    link = TmclLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", address=1, motor=0, baud=9600, clock=Clock(),
+        statistics=LinkStatistics(),
+    )  # fmt: skip
+    before, clock = time.monotonic(), link._clock
+    offset = clock.now() - before
+    ready.set()
+    right = 0
+    for _ in range(8):
+        try:
+            value, stamp, round_trip = link.get_stamped(Axis.POSITION)
+        except DeadlineError:
+            continue
+        true = (stamp - offset) % (2**30 / 25_600)
+        assert abs(value / 25_600 - true) <= 0.5 * round_trip + 0.01
+        right += 1
+    assert right >= 4
+    link.close()
+    listener.close()
 
 
 @pytest.mark.wire

@@ -25,6 +25,8 @@ REWEIGHTINGS = 25
 SCALE_SIGMAS, SCALE_WRONG = 4.0, 0.4
 # Boards further off than so many times the median, and than this share of their distance, have no say in it.
 FAR_RATIO, FAR_SHARE = 10.0, 0.1
+# A camera so near to the base's origin, as a share of the board's distance, and so much along its axes is the base.
+OWN_SHARE, OWN_TURN = 0.05, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,8 @@ class Fit:
     """How well flange poses agree with the pictures: medians in rad and m, and their sum as a share of the distance.
 
     `reach` is the board's distance from the camera in m. `scale` is by how much the flange's way would have to be
-    longer to go with the board's size, with its σ; `shift_scaled` is the median in m that this would leave.
+    longer to go with the board's size, with its σ; `shift_scaled` is the median in m that this would leave, `hand` the
+    flange_from_camera that it would give, of a camera that stands base_from_camera, and `stands` base_from_board.
     """
 
     series: Series
@@ -46,6 +49,20 @@ class Fit:
     scale_sigma: float
     shift_scaled: float
     reach: float
+    hand: pin.SE3
+    stands: pin.SE3
+
+    @property
+    def boards_own(self) -> bool:
+        """True for poses of the board as the camera sees it, not of a flange.
+
+        The camera would sit in the base's origin; or, turned round, be the flange itself, and the board the base.
+        """
+        if not _axes(self.hand.rotation) or np.linalg.norm(self.hand.translation) > OWN_SHARE * self.reach:
+            return False
+        if self.setup == "eye_to_hand":
+            return True
+        return _axes(self.stands.rotation) and float(np.linalg.norm(self.stands.translation)) < self.reach / 2
 
     @property
     def text(self) -> str:
@@ -84,7 +101,7 @@ def fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], set
         # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
         off = min(tried, key=lambda t: t[0])[3]
         near = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
-        off, scale, sigma = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
+        off, scale, sigma, hand = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
         # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
         shift, unit, size, _ = min(tried, key=lambda t: t[0])
         if scale > 4 * sigma > 0:
@@ -93,7 +110,15 @@ def fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], set
         if abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma:
             # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
             score += 1.0
-        found.append(Fit(one, reading, side, unit, turn, shift, score, scale / size, sigma / size, best, reach))
+        flange_from_camera = from_parts(hand, rotation)
+        stands = from_parts(scale * flanges[near[0]].translation, flanges[near[0]].rotation)
+        stands = stands * flange_from_camera * seen[near[0]]
+        found.append(
+            Fit(
+                one, reading, side, unit, turn, shift, score, scale / size, sigma / size, best, reach,
+                flange_from_camera, stands,
+            )
+        )  # fmt: skip
     return found
 
 
@@ -116,6 +141,11 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     return rotation, turn, kept
 
 
+def _axes(rotation: Array) -> bool:
+    """True for a rotation (3, 3) that only exchanges axes, or none."""
+    return bool(np.all((np.abs(rotation) < OWN_TURN) | (np.abs(rotation) > 1 - OWN_TURN)))
+
+
 def angle(a: Array, b: Array) -> float:
     """Angle in rad between two rotations (3, 3)."""
     return math.acos(max(-1.0, min(1.0, 0.5 * (float(np.sum(a * b)) - 1))))
@@ -123,8 +153,10 @@ def angle(a: Array, b: Array) -> float:
 
 def _shifts(
     flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], rotation: Array, size: float | None
-) -> tuple[Array, float, float]:
-    """Distances (n,) in m of the boards' origins from one place, and the size of the poses' unit in m with its σ.
+) -> tuple[Array, float, float, Array]:
+    """Distances (n,) in m of the boards' origins from one place, the size of the poses' unit in m with its σ, …
+
+    … and the camera's place (3,) in m in the flange.
 
     By least sum of distances; `size` None lets the unit's size be found with the rest.
     """
@@ -144,10 +176,10 @@ def _shifts(
         solution = np.linalg.lstsq(a, -(right * root).ravel(), rcond=None)[0]
         off = np.linalg.norm(whole / norms @ solution + right, axis=1)
     if size is not None:
-        return off, size, 0.0
+        return off, size, 0.0, solution[:3] / norms[:3]
     left = float(np.sum((a @ solution + (right * root).ravel()) ** 2)) / max(1, a.shape[0] - a.shape[1])
     sigma = math.sqrt(left * float(np.linalg.pinv(a.T @ a)[-1, -1]))
-    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1])
+    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1]), solution[:3] / norms[:3]
 
 
 def scaled(pose: pin.SE3, unit: str) -> pin.SE3:

@@ -72,7 +72,7 @@ def attach_poses(
         _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
-    in_order = [other for one in series if (other := _in_order(one, frames)) is not None]
+    in_order = [other for one in series for other in (_in_order(one, frames), _as_words(one, frames)) if other]
     boards = {}
     for k, frame in enumerate(frames):
         if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
@@ -115,12 +115,21 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
             "shift_mm": 1e3 * best.shift,
         },
     )
-    if decision.by_name is not None:
+    if decision.by_name is not None and one.by == "order as words":
+        understood.notes.append(
+            f"the poses of {one.name} belong to the pictures sorted as words (1, 10, 2), which leaves {best.left}; in "
+            f"the order of their numbers they leave {decision.by_name.left}"
+        )
+    elif decision.by_name is not None:
         decision.by_name.series.alone = []
         understood.notes.append(
             f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
             f"leaves {best.left}; by name they leave {decision.by_name.left}"
         )
+    understood.notes += [
+        f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
+        for name in decision.boards_own
+    ]
     problem, refused = scale_problem(best, pitch)
     if problem and refused:
         understood.refused = f"no hand-eye: {problem}"
@@ -169,6 +178,15 @@ def _in_order(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
     records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
     of = dict(zip(places, records, strict=True))
     return None if all(one.of.get(k) is r for k, r in of.items()) else Series(one.name, records, of, "order")
+
+
+def _as_words(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
+    """Rows in the order in which the pictures' names are sorted as words: 1, 10, 2; None where that is no other."""
+    places = [k for k, f in enumerate(frames) if f.shows is None]
+    words = sorted(places, key=lambda k: frames[k].name)
+    if one.by != "order" or words == places or len(places) != len(one.records):
+        return None
+    return Series(one.name, one.records, dict(zip(words, one.records, strict=True)), "order as words")
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

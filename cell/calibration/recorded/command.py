@@ -6,6 +6,7 @@ with pairs of poses only gives the hand-eye.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,10 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     if not listing.pictures and listing.texts:
         return _of_pairs(pairs, options) if pairs else _from_tables(listing, options)
     if spec is None:
-        raise ConfigError(f"{folder}: name the board in the pictures with --board, such as chessboard:7x6:10mm")
+        raise ConfigError(
+            f"{folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
+            f"chessboard:7x6:10mm{_folders(listing)}"
+        )
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     frames, channel = read_frames(listing, spec, links, options.laser)
@@ -73,6 +77,15 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
     del result["frames_rms"]
     return result
+
+
+def _folders(listing: Listing) -> str:
+    """The sub-folders that hold pictures, each with how many."""
+    count = Counter(path.parent for path in listing.pictures)
+    if set(count) <= {listing.folder}:
+        return ""
+    held = ", ".join(f"{listing.name(f)} ({n})" for f, n in count.items() if f != listing.folder)
+    return f"; pictures are in {held}: --from can name one of these, too"
 
 
 def _of_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]], options: Options) -> dict[str, Any]:
@@ -107,7 +120,7 @@ def _from_frames(
     try:
         found = camera_of(frames, options.camera)
     except RefusedError as error:
-        notes.append(f"no intrinsics: {error}")
+        result["refused"]["intrinsics"] = f"no intrinsics: {error}"
     understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
     result["poses"] = understood.about
     notes += understood.notes

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
+import scipy
 
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_matrix, from_parts, from_quaternion
@@ -39,9 +39,9 @@ def _quaternion(numbers: Array, first: bool, wxyz: bool) -> pin.SE3:
 def _angles(numbers: Array, first: bool, kind: str, degrees: bool) -> pin.SE3:
     turn, place = (numbers[:3], numbers[3:]) if first else (numbers[3:], numbers[:3])
     if kind == "rotvec":
-        rotation = Rotation.from_rotvec(turn, degrees=degrees)
+        rotation = scipy.spatial.transform.Rotation.from_rotvec(turn, degrees=degrees)
     else:
-        rotation = Rotation.from_euler(kind, turn, degrees=degrees)
+        rotation = scipy.spatial.transform.Rotation.from_euler(kind, turn, degrees=degrees)
     return from_parts(place, rotation.as_matrix())
 
 

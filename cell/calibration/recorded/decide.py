@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.agreement import SCALE_SIGMAS, Fit, angle, fits_of
+from cell.calibration.recorded.agreement import SCALE_SIGMAS, UNITS, Fit, angle, fits_of
 from cell.calibration.recorded.conventions import readings_of, why_not
 from cell.calibration.recorded.series import Series
 from cell.calibration.solve.consistency import turns_apart
+from cell.geometry.poses import from_parts
 from drivers.errors import RefusedError
 
 # The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
@@ -24,6 +25,8 @@ CLEAR, AGREES = 2.5, 0.06
 AS_MUCH, CLEAR_SHIFT, LEAST_SHIFT = 0.95, 5.0, 0.002
 # Poses that are shifted by one picture are named when they then agree so much better, in so many frames.
 SHIFTED, LEAST_SHIFTED = 0.5, 6
+# What a mirror in the camera, or a left-handed base, does.
+MIRROR = np.diag([-1.0, 1.0, 1.0])
 QUICK_LOOK, ALIKE = 24, 0.2
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
@@ -31,16 +34,22 @@ SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
 SCALE_BETTER, SCALE_CLEARLY = 0.7, 0.35
 
 
+# Poses that were written with few digits, or in two files, are the same to this.
+SAME_RAD, SAME_M = 1e-3, 2e-4
+
+
 @dataclass(frozen=True, eq=False)
 class Decision:
     """The reading taken, the next best one that means something else, and what to say about both.
 
-    `by_name`: what the poses leave that have the pictures' names, where they were taken in order instead.
+    `by_name`: what the poses leave that have the pictures' names, where they were taken in order instead. `boards_own`:
+    series that hold the board's poses as the camera sees it.
     """
 
     best: Fit
     rival: Fit | None
     by_name: Fit | None = None
+    boards_own: Sequence[str] = ()
 
     @property
     def evidence(self) -> str:
@@ -69,6 +78,12 @@ def decide(
     Raises RefusedError when none does, or when two do that mean different things; its text names the option to give.
     """
     fits, problems = _all_fits(series, boards, wanted, setup)
+    own = {f.series.name: f for f in fits if f.boards_own and f.turn + f.shift_scaled / f.reach < AGREES}
+    fits = [f for f in fits if f.series.name not in own]
+    series = [one for one in series if one.name not in own]
+    in_order = [one for one in in_order if one.name not in own]
+    if own and not series:
+        raise RefusedError(_boards_own(next(iter(own.values()))))
     ordered, _ = _all_fits(in_order, boards, wanted, setup)
     by_name = None
     if ordered and fits and ordered[0].score < AGREES and CLEAR * ordered[0].score < fits[0].score:
@@ -90,7 +105,7 @@ def decide(
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
     if rival is not None and not clearly_worse(rival, best):
         raise RefusedError(_question(best, rival))
-    return Decision(best, rival, by_name)
+    return Decision(best, rival, by_name, sorted(own))
 
 
 def clearly_worse(rival: Fit, best: Fit) -> bool:
@@ -122,7 +137,7 @@ def _shifted(
     setup: str | None,
     shifts: Sequence[int],
 ) -> str:
-    """The question that poses ask which agree with no picture: do they agree with the pictures before or after?"""
+    """The question that poses ask which agree with no picture: do they with the one before or after, or in a mirror?"""
     for step in shifts:
         moved = []
         for one in series:
@@ -137,6 +152,15 @@ def _shifted(
                 f"with the pose of the {'next' if step > 0 else 'previous'} picture, {fits[0].text}, they leave "
                 f"{fits[0].left}: are poses and pictures shifted by one, and one of either missing? Number them anew"
             )
+    mirrored = {
+        k: [from_parts(MIRROR @ b.translation, MIRROR @ b.rotation @ MIRROR) for b in boards[k]] for k in boards
+    }
+    fits, _ = _all_fits(series, mirrored, wanted, setup) if _turn_alike(series, boards, wanted) else ([], [])
+    if fits and fits[0].score < SHIFTED * AGREES and len(boards) >= LEAST_SHIFTED:
+        return (
+            f"as mirror images they agree, {fits[0].text}, and leave {fits[0].left}: are the pictures flipped, or are "
+            "the poses from a left-handed system? Save the pictures as the sensor has them, or turn one axis round"
+        )
     angles = any(one.count == 6 for one in series)
     return (
         f"are they the poses of these pictures, of the flange{' (and not joint angles)' if angles else ''}, and is the "
@@ -170,16 +194,24 @@ def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:
 
 
 def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
-    """True where both readings give the same poses."""
-    if a.setup != b.setup or a.unit != b.unit:
+    """True where both readings give the same poses, from another file in another unit maybe."""
+    if a.setup != b.setup:
         return False
     first, second = a.series.poses(a.reading), b.series.poses(b.reading)
     both = [k for k in first if k in second and k in boards]
     return len(both) >= 3 and all(
-        angle(first[k].rotation, second[k].rotation) < 1e-3
-        and np.linalg.norm(first[k].translation - second[k].translation)
-        < 1e-6 * (1 + np.linalg.norm(first[k].translation))
+        angle(first[k].rotation, second[k].rotation) < SAME_RAD
+        and np.linalg.norm(UNITS[a.unit] * first[k].translation - UNITS[b.unit] * second[k].translation) < SAME_M
         for k in both
+    )
+
+
+def _boards_own(fit: Fit) -> str:
+    turned = "" if fit.setup == "eye_to_hand" else ", or of the camera as the board sees it"
+    return (
+        f"the poses of {fit.series.name} are those of the board as the camera sees it{turned}, not of the flange: read "
+        f"as {fit.text} they put the camera {1e3 * float(np.linalg.norm(fit.hand.translation)):.1f} mm from the origin "
+        "and along its axes; give the poses that the arm's controller told"
     )
 
 

@@ -13,9 +13,18 @@ from pathlib import Path
 from drivers.errors import ConfigError
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".npy", ".npz")
+TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz")
 ARCHIVES = (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz")
 BAGS = (".bag", ".db3", ".mcap")
+OTHERS = {
+    ".xlsx": "a spreadsheet: save it as CSV",
+    ".xls": "a spreadsheet: save it as CSV",
+    ".ods": "a spreadsheet: save it as CSV",
+    ".mat": "a file of MATLAB: save its poses with writematrix as CSV",
+    ".pkl": "a pickle, which may run code when it is read: save its arrays with numpy.savez",
+    ".pickle": "a pickle, which may run code when it is read: save its arrays with numpy.savez",
+}
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 LARGEST_TEXT = 50_000_000
 
 
@@ -85,7 +94,9 @@ def _sort_in(listing: Listing, path: Path) -> None:
         reason = "an archive: unpack it"
     elif suffix in BAGS:
         reason = "a ROS bag: export its pictures and poses to files"
+    elif suffix in VIDEOS:
+        reason = "a film: save its pictures to files"
     else:
-        reason = "neither a picture nor a table that is known"
+        reason = OTHERS.get(suffix, "neither a picture nor a table that is known")
     if reason:
         listing.unread.append((listing.name(path), reason))

@@ -1,4 +1,4 @@
-"""From the text of a file to its records of numbers: JSON, YAML, Python tuples, numpy arrays; tables by `tables.py`.
+"""From a file to its records of numbers: JSON, YAML, XML, Python tuples, numpy arrays; tables by `tables.py`.
 
 Which numbers mean what is not decided here (`conventions.py`); only names that say it themselves are kept.
 """
@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from cell.calibration.recorded.halves import Half, half_of
 from cell.calibration.recorded.listing import PICTURES
 from cell.calibration.recorded.records import COUNTS, Content, Record, file_like, named_numbers
 from cell.calibration.recorded.tables import read_table
+from cell.calibration.recorded.xml_files import read_xml
 from cell.calibration.recorded.yaml_subset import read_yaml
 from cell.geometry.camera import Array
 
@@ -57,7 +59,7 @@ def _decoded(data: bytes) -> str:
 
 
 def _structured(path: Path, text: str) -> Any:
-    """The object of a JSON, YAML or Python text; None for a plain table."""
+    """The object of a JSON, YAML, XML or Python text; None for a plain table."""
     suffix, start = path.suffix.lower(), text.lstrip()[:1]
     if suffix == ".json":
         try:
@@ -66,6 +68,8 @@ def _structured(path: Path, text: str) -> Any:
             raise ValueError(f"it is no JSON: {error}") from error
     if suffix in (".yaml", ".yml") or text.startswith("%YAML"):
         return read_yaml(text)
+    if suffix == ".xml":
+        return read_xml(text)
     if start and start in "([{":
         for read in (ast.literal_eval, json.loads):
             try:
@@ -92,6 +96,10 @@ def _walk(path: Path, data: Any, place: list[str], label: str | None, content: C
         if sum(file_like(v) for v in strings.values()) > 1:
             content.links.append(strings)
         label = next((v for v in strings.values() if Path(v).suffix.lower() in PICTURES), label)
+        matrix = _stored_matrix(data)
+        if matrix is not None:
+            _take(path, matrix, place, label, content)
+            return
         found, named = _by_names(data)
         if found is not None:
             content.records.append(Record(path, _pattern(place), label or _number_in(place), found, named))
@@ -106,6 +114,11 @@ def _walk(path: Path, data: Any, place: list[str], label: str | None, content: C
         for k, value in enumerate(data):
             _walk(path, value, [*place, f"[{k}]"], label, content)
         return
+    _take(path, array, place, label, content)
+
+
+def _take(path: Path, array: Array, place: list[str], label: str | None, content: Content) -> None:
+    """Add the pose, the poses or the halves of poses that an array holds."""
     pose = _one(array)
     if pose is not None:
         content.records.append(_record(path, _pattern(place), label or _number_in(place), pose))
@@ -114,6 +127,8 @@ def _walk(path: Path, data: Any, place: list[str], label: str | None, content: C
             one = _one(part)
             assert one is not None
             content.records.append(_record(path, _pattern([*place, f"[{k}]"]), f"[{k}]", one))
+    elif (rows := half_of(array)) is not None:
+        content.halves.append(Half(path, "/".join(place), rows))
 
 
 def _array(data: Any) -> Array | None:
@@ -145,11 +160,6 @@ def _record(path: Path, field_name: str, label: str | None, numbers: Array) -> R
 def _by_names(data: dict[Any, Any]) -> tuple[Array | None, str]:
     """A pose of a map whose keys say what is what."""
     low = {re.sub(r"[^a-z0-9]", "", str(k).lower()): v for k, v in data.items()}
-    if {"rows", "cols", "data"} <= set(low):
-        array, shape = _array(low["data"]), (low["rows"], low["cols"])
-        if array is not None and all(isinstance(n, int) for n in shape) and array.size == shape[0] * shape[1]:
-            return _one(array.reshape(shape)), ""
-        return None, ""
     position = _part(low, ("position", "translation", "t", "trans", "tvec", "pos", "xyz"))
     turn = _part(low, ("orientation", "rotation", "quaternion", "quat", "q", "r", "rot", "rvec", "rpy"))
     if position is not None and turn is not None and len(position[0]) == 3:
@@ -160,9 +170,21 @@ def _by_names(data: dict[Any, Any]) -> tuple[Array | None, str]:
             return np.concatenate([position[0], numbers]), ""
         if len(numbers) == 9:
             return np.column_stack([numbers.reshape(3, 3), position[0]]).ravel(), ""
-    if all(isinstance(v, (int, float)) for v in low.values()):
-        return named_numbers(list(low), list(low.values()))
-    return None, ""
+    values = {k: v for k, v in low.items() if isinstance(v, (int, float))}
+    return named_numbers(list(values), list(values.values()))
+
+
+def _stored_matrix(data: dict[Any, Any]) -> Array | None:
+    """The matrix of a map of rows, cols and data, as OpenCV stores it; its elements may have several channels."""
+    if not {"rows", "cols", "data"} <= set(data):
+        return None
+    array, shape = _array(data["data"]), (data["rows"], data["cols"])
+    if array is None or not all(isinstance(n, (int, float)) and n >= 1 and n == int(n) for n in shape):
+        return None
+    rows, columns = int(shape[0]), int(shape[1])
+    if array.size % (rows * columns):
+        return None
+    return array.reshape((rows, columns) if array.size == rows * columns else (rows, columns, -1))
 
 
 def _part(low: dict[str, Any], keys: tuple[str, ...]) -> tuple[Array, str] | None:

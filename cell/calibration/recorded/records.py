@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cell.geometry.camera import Array
+
+if TYPE_CHECKING:
+    from cell.calibration.recorded.halves import Half
 
 # Numbers of a pose: 6, 7, 3×4, 4×4; one more in front is a time or a number.
 COUNTS = (6, 7, 12, 16)
@@ -41,10 +44,11 @@ class Record:
 
 @dataclass
 class Content:
-    """What a text holds: records, and links between files that it names (picture, role or name of the other, file)."""
+    """What a text holds: records, halves of them, and links between files (picture, or name of the other, file)."""
 
     records: list[Record] = field(default_factory=list)
     links: list[dict[str, str]] = field(default_factory=list)
+    halves: list[Half] = field(default_factory=list)
 
 
 def named_numbers(names: list[str], values: list[Any]) -> tuple[Array | None, str]:
@@ -58,6 +62,10 @@ def named_numbers(names: list[str], values: list[Any]) -> tuple[Array | None, st
             where = [clean.index(t) if t in clean else -1 for t in turn]
             if min(where) >= 0 and not (turn[0] == "x" and prefix == ""):
                 return np.array([values[k] for k in (*place, *where)], dtype=np.float64), kind
+    numbered = [re.sub(r"[^a-z0-9]", "", n.lower()) for n in names]
+    six = [numbered.index(f"pose{k}") if f"pose{k}" in numbered else -1 for k in range(1, 7)]
+    if min(six) >= 0 and "pose7" not in numbered:
+        return np.array([values[k] for k in six], dtype=np.float64), ""
     return None, ""
 
 

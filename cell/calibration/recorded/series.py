@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.conventions import Reading
+from cell.calibration.recorded.halves import join_halves
 from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
 from cell.calibration.recorded.numbers import read_content
@@ -70,9 +71,13 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
             unread.append((name, f"it cannot be read ({type(error).__name__}): {error}"))
             continue
-        if not contents[name].records and not contents[name].links:
-            unread.append((name, "no pose is in it (6, 7, 12 or 16 numbers that belong together)"))
+    joined = join_halves([half for content in contents.values() for half in content.halves])
+    for name, content in contents.items():
+        if not content.records and not content.links and not any(h.path in _paths(joined) for h in content.halves):
+            unread.append((name, _why_none(content)))
     groups: dict[tuple[str, str, int], list[Record]] = {}
+    for record in joined:
+        groups.setdefault((listing.name(record.path), record.field, len(record.numbers)), []).append(record)
     for content in contents.values():
         for record in content.records:
             alone = sum(r.field == record.field for r in content.records) == 1
@@ -159,3 +164,22 @@ def _others(series: Sequence[Series], listing: Listing) -> list[Path]:
             f"{', '.join(sorted(map(listing.name, owners)))}; give one of these folders with --from"
         )
     return sorted(owners - {listing.folder}) if len(owners) > 1 else []
+
+
+def _paths(records: Sequence[Record]) -> set[Path]:
+    """The files of records of which each was joined from two halves: of the rotations, and those it says it is with."""
+    return {r.path for r in records} | {
+        r.path.parent / r.field.removeprefix("with ") for r in records if r.field.startswith("with ")
+    }
+
+
+def _why_none(content: Content) -> str:
+    """Why a text that could be read gives no pose."""
+    half = next((h for h in content.halves if h.called), None)
+    if half is None:
+        return "no pose is in it (6, 7, 12 or 16 numbers that belong together)"
+    here, there = ("rotations", "positions") if half.turns else ("positions", "rotations")
+    return (
+        f"it holds {len(half.rows)} {here} only; name it and the file of the {there} alike, such as "
+        "R_gripper2base.txt and t_gripper2base.txt, with as many rows"
+    )

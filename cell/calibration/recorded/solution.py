@@ -17,7 +17,7 @@ from cell.calibration.recorded.stops import by_stop, counted, merged
 from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.checks import Check, Part, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
-from cell.calibration.solve.foreign import FOREIGN, foreign_view
+from cell.calibration.solve.foreign import FOREIGN, foreign_view, parted_at
 from cell.calibration.solve.given_camera import against_pictures
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
 from cell.calibration.solve.plane_checks import (
@@ -39,6 +39,8 @@ from drivers.errors import RefusedError
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
 OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
+CHANGED_SIGMAS, CHANGED_SHARE = 4.0, 0.005
+"""Two parts of the pictures are of two cameras where their focal lengths differ by more than both."""
 LIKELY_LASER = 0.5
 """Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
@@ -56,6 +58,7 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
         apart = _views([merged(s) for s in stops])
         if given is None:
             chosen, plain = (_of_all(c, views) for c in choose_lens(apart))
+            _refuse_change(chosen, apart, [s[0].name for s in stops])
         else:
             chosen, plain = (given_camera(given, views),) * 2
         worst = int(np.argmax(chosen.view_rms))
@@ -88,6 +91,20 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
                 )
         if not oblique:
             return chosen, plain
+
+
+def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:
+    """RefusedError where the pictures from one on are of another camera than those before, by the cameras of both."""
+    roomy = replace(found, model=replace(found.model, k1=True, k2=True, one_focal=False))
+    for at in parted_at(roomy, views):
+        before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
+        focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
+        if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
+            raise RefusedError(
+                f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from {names[at]} "
+                f"on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; give both parts "
+                "by themselves, each in a folder of its own"
+            )
 
 
 def _of_all(found: Intrinsics, views: Sequence[BoardView]) -> Intrinsics:

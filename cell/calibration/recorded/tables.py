@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cell.calibration.recorded.halves import Half, half_of
 from cell.calibration.recorded.listing import PICTURES
 from cell.calibration.recorded.records import COUNTS, Content, Record, file_like, named_numbers
 from cell.calibration.recorded.several_lines import read_several_lines
@@ -24,6 +25,8 @@ def read_table(path: Path, text: str, content: Content) -> None:
     cells = [_cells(line) for line in lines]
     rows = [[c for c in row if c] for row in cells]
     if _blocks(path, rows, content) or read_several_lines(path, [_apart(row) for row in rows], content):
+        return
+    if _halves(path, rows, content):
         return
     header = None
     if len(rows) > 1 and not any(_number(c) is not None for c in rows[0]):
@@ -76,6 +79,19 @@ def _blocks(path: Path, rows: list[list[str]], content: Content) -> bool:
         Record(path, "matrix" if len(p) > 7 else "row", t, np.array(p)) for t, p in zip(titles, poses, strict=True)
     ]
     return True
+
+
+def _halves(path: Path, rows: list[list[str]], content: Content) -> bool:
+    """Add rows that are rotations only, or positions only; False for a table that is none of these, or one pose."""
+    numbers = [[_number(c) for c in row] for row in rows]
+    widths = {len(row) for row in numbers}
+    if len(widths) != 1 or not widths <= {3, 4, 9} or any(v is None for row in numbers for v in row):
+        return False
+    array = np.array(numbers, dtype=np.float64)
+    found = None if array.size in COUNTS else half_of(array)
+    if found is not None:
+        content.halves.append(Half(path, "", found))
+    return found is not None
 
 
 def _one_pose(path: Path, rows: list[list[str]], numbers: list[list[float]], content: Content) -> bool:
@@ -138,9 +154,9 @@ def _counts(found: list[float], label: str) -> bool:
 def _cells(line: str) -> list[str]:
     """The cells of a row, some empty; commas between digits are decimal commas where something else separates.
 
-    As the arm's own script has it, p[x, y, z, rx, ry, rz] is a pose.
+    As the arm's own script has it, p[x, y, z, rx, ry, rz] is a pose; some print it as p(…).
     """
-    line = re.sub(r"\bp\s*\[", " [", line).strip(" ")
+    line = re.sub(r"\bp\s*([\[(])", r" \1", line).strip(" ")
     if ";" in line or "\t" in line:
         return [c.strip().strip("\"'") for c in re.split(r"[;\t]", line)]
     bare = re.split(r"\s+", re.sub(r"[()\[\]]", " ", line).strip())

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
-from scipy.special import fdtrc
+import scipy
 
 from cell.calibration.solve.adjustment import Adjusted
 from cell.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
@@ -108,7 +108,7 @@ def refuse_bent(board: str, adjusted: Adjusted, views: Sequence[ViewData]) -> No
     test = float(bend @ np.linalg.solve(covariance[8:, 8:] * variance, bend)) / 3
     heights = surface_shapes((whole - middle) / half) @ bend
     size, allowed = float(np.ptp(heights)), LARGEST_BEND * 2 * half
-    if size > allowed and fdtrc(3, freedom, test) < CHANCE:
+    if size > allowed and scipy.special.fdtrc(3, freedom, test) < CHANCE:
         across = [
             np.ptp(surface_shapes((whole - middle) * axis / half) @ bend) for axis in (np.eye(3)[0], np.eye(3)[1])
         ]
@@ -159,7 +159,7 @@ def refuse_slipped(
             best = float(test), first, solution[:6]
     test, first, moved = best
     shift, turn = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
-    if fdtrc(6, freedom, test) * count < CHANCE and (shift > LARGEST_SLIP_M or turn > LARGEST_SLIP_RAD):
+    if scipy.special.fdtrc(6, freedom, test) * count < CHANCE and (shift > LARGEST_SLIP_M or turn > LARGEST_SLIP_RAD):
         raise RefusedError(
             f"the {camera} camera's mount slipped on the flange before {names[first]}: from there on the camera sits "
             f"{1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from where it was, allowed {1e3 * LARGEST_SLIP_M:g} mm "

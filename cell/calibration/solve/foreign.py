@@ -1,8 +1,9 @@
-"""Does one picture want another camera than all others: one of another camera, zoom, focus or crop, of the same size?
+"""Does one picture, or do all from one on, want another camera: another zoom, focus or crop, of the same size?
 
 Its own pose takes up most of what a wrong focal length does to a board, so that its points miss their places by
 little, and it pulls the camera of all. What tells is by how much less the points miss when that picture alone has
-focal lengths and a principal point of its own, over what the points scatter by: an F-test for each picture.
+focal lengths and a principal point of its own, over what the points scatter by: an F-test for each picture, and for
+those from each on.
 """
 
 from __future__ import annotations
@@ -21,6 +22,12 @@ LEAST_OTHERS = 5
 """Pictures that a picture has to disagree with: of fewer, any may be the foreign one."""
 FOREIGN = 10.0
 """F from which a picture may be foreign. Chance brings 2 among ten pictures, 7 once in 10⁵ of them."""
+AT_ONCE = 2.5
+"""So many times the F of two mixtures of pictures from before and after."""
+ABOUT = 0.8
+"""Splits of so much of the largest F are looked at, too."""
+LEAST_PART = 3
+"""Pictures before and after a change of the camera that may tell one."""
 ALONE = 4.0
 """So many times the F of any other, once it is left out: bent boards and lenses of another kind make many large."""
 ROUNDS = 3
@@ -45,10 +52,28 @@ def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, fl
     return (odd, float(wants[odd])) if wants[odd] > ALONE * others.max() else None
 
 
-def own_cameras(found: Intrinsics, views: Sequence[BoardView]) -> Array:
+def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
+    """Views from each of which on all may want another camera than those before; empty where none is. By the test alone.
+
+    Where any half of the views wants one, board or lens are not what the model has, and nothing was changed in between.
+    """
+    count = len(views)
+    if count < 2 * LEAST_PART:
+        return []
+    splits = [np.arange(count) >= k for k in range(LEAST_PART, count - LEAST_PART + 1)]
+    mixed = [np.arange(count) % step < step // 2 for step in (2, 4)]
+    wants = own_cameras(found, views, [*splits, *mixed])
+    split, rest = wants[: len(splits)], wants[len(splits) :]
+    if split.max() < max(FOREIGN, AT_ONCE * rest.max()):
+        return []
+    return [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
+
+
+def own_cameras(found: Intrinsics, views: Sequence[BoardView], groups: Sequence[Array] | None = None) -> Array:
     """For each view (n,) the F of focal lengths and a principal point of its own, with the lens that all share.
 
-    The gain is that of one step from the adjustment of all views, as in a score test.
+    Or for each of the groups, masks (n,) of views. The gain is that of one step from the adjustment of all views, as in
+    a score test.
     """
     adjustment, start = adjustment_of(found.model, found.camera, views)
     state = adjustment.solve(start, ROUNDS).state
@@ -67,7 +92,14 @@ def own_cameras(found: Intrinsics, views: Sequence[BoardView]) -> Array:
     information = lens[:, free].T @ lens[:, free] + np.sum([h for h, _ in parts], axis=0)
     scale = np.sqrt(np.diag(information))
     inverse = np.linalg.pinv(information / scale[:, None] / scale) / scale[:, None] / scale
-    return np.array([_gain(h, g, inverse, squares, freedom) for h, g in parts])
+    if groups is None:
+        return np.array([_gain(h, g, inverse, squares, freedom) for h, g in parts])
+    gains = []
+    for group in groups:
+        some = [part for part, inside in zip(parts, group, strict=True) if inside]
+        h, g = np.sum([h for h, _ in some], axis=0), np.sum([g for _, g in some], axis=0)
+        gains.append(_gain(h, g, inverse, squares, freedom))
+    return np.array(gains)
 
 
 def _gain(information: Array, gradient: Array, inverse: Array, squares: float, freedom: int) -> float:

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.blocks import (
@@ -111,7 +111,9 @@ def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evide
     shared = information[:SHARED, :SHARED]
     # Dots may be anywhere that a camera's move or lens puts them, the stripe on any plane.
     dots = _misfit(kinds["dots"], np.r_[CAMERA, SHARED:size])
-    stripe = _misfit(kinds["stripe"], np.r_[BOARD], block_diag(*along) * SWEEP_PICTURE_M if along else None)
+    stripe = _misfit(
+        kinds["stripe"], np.r_[BOARD], scipy.linalg.block_diag(*along) * SWEEP_PICTURE_M if along else None
+    )
     return Evidence(score[:SHARED], 0.5 * (shared + shared.T), dots, stripe)
 
 

@@ -8,7 +8,7 @@ import pytest
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
-from drivers.interfaces import Rail
+from drivers.interfaces import LONGEST_NUDGE_M, Nudged, Rail
 
 FAR_M, SPEED = 0.03, 0.02
 """Way in m and speed in m/s of the suite's motions at full motion; its rail takes ten times the speed."""
@@ -44,6 +44,22 @@ class RailContract(DeviceContract):
         with pytest.raises(InterlockError):
             rail.move_to(0.0)
         assert rail.state().position == before
+
+    def test_a_little_may_be_moved_before_its_zero_is_known(self, bench: Bench[Rail]) -> None:
+        """Where a rail offers it: by that way, no farther than 10 mm, and it is no more homed than before."""
+        rail = bench.device
+        if not isinstance(rail, Nudged):
+            pytest.skip("it moves only when it is homed")
+        if rail.state().homed:
+            pytest.skip("it remembers an earlier homing")
+        before = rail.state()
+        way = 0.002 if before.right_switch <= before.left_switch else -0.002
+        rail.nudge(way, 0.005).wait(PATIENCE_S)
+        assert rail.state().position == pytest.approx(before.position + way, abs=EXACT_M)
+        assert not rail.state().homed
+        with pytest.raises(LimitError):
+            rail.nudge(1.1 * LONGEST_NUDGE_M, 0.005)
+        rail.nudge(-way, 0.005).wait(PATIENCE_S)
 
     def test_homing_ends_at_zero_at_rest(self, bench: Bench[Rail]) -> None:
         """Position 0 is at the switch."""

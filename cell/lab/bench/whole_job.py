@@ -14,6 +14,7 @@ import numpy as np
 
 from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import collect_scan, collect_target
+from cell.calibration.collect.edge import with_edge
 from cell.calibration.collect.timing import look_at_shutter
 from cell.calibration.collect.witness import look_at_witness
 from cell.calibration.sessions import arm_table
@@ -173,7 +174,8 @@ class _WholeJob:
         identities = {device.name: device.identity().serial for device in named}
         known = identities, self.config, arm_table(self.config, self.cell.devices), witness
         made = CellCalibration.solve(scan, target, *known)
-        return look_at_shutter(self.config, devices, mover, made, hands.check, keep)
+        made = look_at_shutter(self.config, devices, mover, made, hands.check, keep)
+        return with_edge(self.config, devices, keep, made)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""

@@ -16,6 +16,8 @@ from cell.lab.cli import (
     bench_inversion,
     bench_realism,
     bench_reconstruction,
+    bench_servo,
+    bench_soak,
     bench_stripe,
     bench_verify,
     paper,
@@ -36,6 +38,8 @@ def register(app: typer.Typer) -> None:
         bench_inversion,
         bench_realism,
         bench_reconstruction,
+        bench_servo,
+        bench_soak,
         bench_stripe,
         bench_verify,
     ):

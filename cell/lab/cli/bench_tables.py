@@ -8,8 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from cell.cli.display import SHOWN_UNITS
 from cell.lab.cli.paper_tables import print_acceptance
+from cell.report.figures import noise_rows
 from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 
 _ROWS = (
@@ -79,9 +79,8 @@ def _noise(console: Console, level: str, noise: Mapping[str, Any]) -> None:
     table.add_column("of")
     table.add_column("sigma", justify="right")
     table.add_column("unit")
-    for entry in noise.values():
-        factor, unit = SHOWN_UNITS.get(entry["unit"], (1.0, entry["unit"]))
-        table.add_row(str(entry["of"]), f"{factor * entry['sigma']:.4g}", str(unit))
+    for row in noise_rows({"sigmas": noise}):
+        table.add_row(*row)
     console.print(table)
 
 

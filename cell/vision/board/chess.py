@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cell.geometry.camera import Array
 from cell.vision.board.corner_fit import fit_corners
@@ -118,7 +118,7 @@ def _check_none_beyond(image: Image, spec: BoardSpec, plane: PlaneMap, contrast:
 
 def _extended(corners: Corners, index: NDArray[np.intp], places: Places, name: str) -> tuple[NDArray[np.intp], Places]:
     """The lattice with the corners beyond a gap, such as a cable, that fit it."""
-    tree = cKDTree(corners.places)
+    tree = scipy.spatial.cKDTree(corners.places)
     for _ in range(3):
         pixels = corners.places[index]
         plane = PlaneMap.fit(places, pixels, _tolerance(places, pixels), name)

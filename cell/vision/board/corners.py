@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cell.geometry.camera import Array
 from cell.vision.board.lattice import Places, grow
@@ -95,7 +95,7 @@ def corner_lattices(corners: Corners, least: int) -> Iterator[tuple[NDArray[np.i
     if n < least:
         return
     free = np.ones(n, dtype=np.bool_)
-    tree = cKDTree(corners.places)
+    tree = scipy.spatial.cKDTree(corners.places)
     near, neighbours = tree.query(corners.places, k=min(n, 13))
     distances, who = np.asarray(near), np.asarray(neighbours)
 

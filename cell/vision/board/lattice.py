@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cell.geometry.camera import Array
 
@@ -46,7 +46,7 @@ def dot_lattices(blobs: Blobs, least: int) -> Iterator[tuple[NDArray[np.intp], P
     n = len(blobs.centres)
     if n < least:
         return
-    tree = cKDTree(blobs.centres)
+    tree = scipy.spatial.cKDTree(blobs.centres)
     distances, neighbours = tree.query(blobs.centres, k=min(n, 9))
     near, who = np.asarray(distances), np.asarray(neighbours)
     # Seeds: dots whose neighbours are about as big as they are, the most regular surroundings first.
@@ -87,7 +87,11 @@ def _basis(centres: Array, seed: int, neighbours: list[int]) -> tuple[Array, Arr
 
 
 def grow(
-    centres: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], alike: Callable[[int, int], bool]
+    centres: Array,
+    tree: scipy.spatial.cKDTree,
+    seed: int,
+    basis: tuple[Array, Array],
+    alike: Callable[[int, int], bool],
 ) -> dict[tuple[int, int], int]:
     """Place → point, from the seed outwards; each hands its own local steps to its neighbours.
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cell.geometry.camera import Array
 from cell.vision.pictures import PictureRefused, Reason
@@ -39,7 +39,7 @@ class PlaneMap:
         mapped = np.column_stack([places, np.ones(len(places))]) @ self.homography.T
         pixels = mapped[:, :2] / mapped[:, 2:]
         if len(self.places) >= NEAREST:
-            distance, who = cKDTree(self.places).query(places, k=NEAREST)
+            distance, who = scipy.spatial.cKDTree(self.places).query(places, k=NEAREST)
             weight = 1.0 / (np.asarray(distance) + 0.1)
             weight /= weight.sum(axis=1, keepdims=True)
             pixels = pixels + np.einsum("mk,mkd->md", weight, self.residuals[np.asarray(who)])

@@ -178,7 +178,9 @@ def find_line(
     if top < least_peak:
         return False
     place = first_at(seen, r, top)
-    found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
+    # As written, 0 and 1 would be two types, and each compiled by itself.
+    first, second = np.intp(0), np.intp(1)
+    found = _measure(image, dark, r, place, saturation, least_peak, window, start, first)
     low = high = place
     for _ in range(TRIES - 1):
         if found:
@@ -187,7 +189,7 @@ def find_line(
         place = _prominent(row, low, high, rises)
         if place < 0:
             return False
-        found = _measure(image, dark, r, place, saturation, least_peak, window, start, 0)
+        found = _measure(image, dark, r, place, saturation, least_peak, window, start, first)
     if not found:
         return False
     reach = reach_of(start[r, 0, WIDTH], int(start[r, 0, CORE]))
@@ -195,7 +197,7 @@ def find_line(
     if largest_outside(seen, r, low, high) < rival_limit(start[r, 0, BACKGROUND], start[r, 0, HEIGHT], least_peak):
         return False
     place = _prominent(row, low, high, rises)
-    if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, 1):
+    if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, second):
         return False
     if start[r, 1, ENERGY] > start[r, 0, ENERGY]:
         for k in range(START):

@@ -125,7 +125,7 @@ def follow(found: Candidates, spacing: float = 1.0) -> Chain:
     share = light / np.maximum(light.max(axis=1, keepdims=True), 1e-9)
     gain = np.minimum(found.clear, MOST) * (1 - BY_LIGHT * (1 - share)) - LEAST * (found.clear > 0)
     best, back_row, back_which, opens = _chain(
-        found.rows.astype(np.float64), found.place, gain, found.clear > 0, found.scale, spacing
+        found.rows.astype(np.float64), found.place, gain, found.clear > 0, found.scale, float(spacing)
     )
     rows, which, fresh = [], [], []
     end = int(best.argmax())

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.linalg import solveh_banded
 
 Array = NDArray[np.float64]
 
@@ -74,7 +73,7 @@ def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> 
     inside = np.abs(x) < count * spacing
     x, value, weight = x[inside], value[inside], weight[inside]
     base = np.exp(-0.5 * (x / width) ** 2)
-    design: Any = BSpline.design_matrix(x, knots, 3)
+    design: Any = scipy.interpolate.BSpline.design_matrix(x, knots, 3)
     normal: Any = design.T @ design.multiply(weight[:, None]).tocsr()
     right = np.asarray(design.T @ (weight * (value - base)))
     # Splines that lie farther than 3 apart do not overlap: the matrix is a band.
@@ -90,8 +89,8 @@ def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> 
     penalty = typical * (SMOOTHING * rough.T @ rough + RIDGE * np.eye(size))
     for k in range(4):
         band[3 - k, k:] += np.diagonal(penalty, k)
-    coefficients = solveh_banded(band, right)
-    spline = BSpline(knots, coefficients, 3)
+    coefficients = scipy.linalg.solveh_banded(band, right)
+    spline = scipy.interpolate.BSpline(knots, coefficients, 3)
     step = spacing / FINE
     grid: Array = np.arange(-count * FINE, count * FINE + 1) * np.float64(step)
     table = spline(grid) + np.exp(-0.5 * (grid / width) ** 2)

@@ -1,0 +1,156 @@
+"""A look at the edge of the plate on the claw: the rail takes the laser's line over it, to and fro."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cell.calibration.store import CellCalibration
+from cell.calibration.witness import Edge, Witness
+from cell.config import CellConfig
+from cell.devices.devices import Devices
+from cell.geometry.camera import Array
+from drivers.errors import LimitError, RefusedError
+from drivers.interfaces import Frame
+
+SPEED = 3e-3
+SEARCH_SPEED = 15e-3
+RATES_HZ = 60.0, 30.0, 15.0
+"""The first that the camera can."""
+ROOM_M = 1e-3
+"""To an end of the rail's travel, beyond what it takes to gain speed."""
+REACH_M = 10e-3
+"""So far from the witness an edge is searched."""
+BESIDE_M = 0.75e-3
+"""To either side of where the edge is expected."""
+INNER_PX, OUTER_PX = 8, 14
+"""Half widths of the line as it shows on the plate, and of its surroundings."""
+LEAST_FRAMES = 8
+BRIGHTEST, LEAST_LIGHT_DN = 3, 2.0
+"""So many pictures say how bright a row of the line is; with less than that over its surroundings it is none."""
+ALL, NONE = 0.85, 0.15
+"""Share of the rows that show the line on the plate, and beside it."""
+
+
+def with_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], calibration: CellCalibration
+) -> CellCalibration:
+    """A new `calibration` whose witness has the plate's edge, where there is one to find."""
+    scan = calibration.scan
+    if scan.witness is None:
+        return calibration
+    devices.interlocks.work_with(calibration.configuration)
+    edge = look_at_edge(config, devices, keep, scan.witness, None)
+    return replace(calibration, scan=replace(scan, witness=replace(scan.witness, edge=edge)))
+
+
+def require_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], before: Witness, now: Witness
+) -> Witness:
+    """`now` with the edge that the calibration saw `before`; `RefusedError` where it is not about there."""
+    assert before.edge is not None
+    edge = look_at_edge(config, devices, keep, now, before.edge.place)
+    if edge is None:
+        raise RefusedError(
+            f"the edge of the plate on the claw is not within {1e3 * BESIDE_M:g} mm of where the calibration saw it, "
+            f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, or the plate "
+            "is covered. Look at the screws of both, clean the plate, then run `cell calibrate`"
+        )
+    return replace(now, edge=edge)
+
+
+def look_at_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], witness: Witness, near: float | None
+) -> Edge | None:
+    """The plate's edge by the rail, m, as both ways over it show it; it is searched where no place `near` is given.
+
+    None where the plate shows no edge there: it may be larger than the camera sees, or covered.
+    """
+    low, high = config.rail.travel
+    room = SEARCH_SPEED**2 / (2 * config.rail.acceleration) + ROOM_M
+    low, high = low + room, high - room
+    # Away from the nearer end of the travel.
+    way = 1.0 if high - witness.rail > witness.rail - low else -1.0
+    if near is None:
+        begin, end = (float(np.clip(witness.rail + way * far, low, high)) for far in (0.0, REACH_M))
+        near = _crossing(*_passed(config, devices, keep, witness, (begin, end), SEARCH_SPEED), way)
+        if near is None:
+            return None
+    begin, end = (float(np.clip(near + way * beside, low, high)) for beside in (-BESIDE_M, BESIDE_M))
+    fro = _crossing(*_passed(config, devices, keep, witness, (begin, end), SPEED), way)
+    to = _crossing(*_passed(config, devices, keep, witness, (end, begin), SPEED), way)
+    if fro is None or to is None:
+        return None
+    return Edge(0.5 * (fro + to), way * (fro - to) / (2.0 * SPEED))
+
+
+def _passed(
+    config: CellConfig,
+    devices: Devices,
+    keep: Callable[[str, Frame], None],
+    witness: Witness,
+    ends: tuple[float, float],
+    speed: float,
+) -> tuple[Array, Array]:
+    """Places (n,) of the rail, m, rising, and the share (n,) of the witness's rows that show the line there."""
+    rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
+    rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
+    _configure(devices, config.calibration.stripe_exposure)
+    times, light = [], []
+    with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
+        sweep, over = rail.sweep(*ends, speed), np.inf
+        for frame in frames:
+            laser.renew()
+            if sweep.done and over == np.inf:
+                sweep.wait(1.0)
+                over = sweep.window[1]
+            if frame.mid_exposure > over:
+                break
+            keep("witness-edge", frame)
+            times.append(frame.mid_exposure)
+            light.append(_light(frame.image, witness))
+    begin, end = sweep.window
+    inside = np.flatnonzero((np.array(times) >= begin) & (np.array(times) <= end))
+    if len(inside) < LEAST_FRAMES:
+        return np.zeros(0), np.zeros(0)
+    places = np.array([sweep.position_at(times[k]) for k in inside])
+    lit = np.array(light)[inside]
+    # Each row against its own brightest pictures: the plate's colour and the laser's profile fall out.
+    lit = lit > np.maximum(0.5 * np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0), LEAST_LIGHT_DN)
+    order = np.argsort(places)
+    return places[order], np.asarray(lit.mean(axis=1))[order]
+
+
+def _configure(devices: Devices, exposure: float) -> None:
+    for rate in RATES_HZ:
+        try:
+            devices.scan_camera.configure(exposure, rate)
+        except LimitError:
+            if rate == RATES_HZ[-1]:
+                raise
+        else:
+            return
+
+
+def _light(image: NDArray[np.generic], witness: Witness) -> Array:
+    """The line's light (rows,) where the witness has it, over what is beside it."""
+    rows = witness.rows
+    offsets = np.arange(-OUTER_PX, OUTER_PX + 1)
+    columns = np.round(witness.columns[rows]).astype(np.intp)[:, None] + offsets
+    window = image[rows[:, None], np.clip(columns, 0, image.shape[1] - 1)].astype(np.float64)
+    inner = np.abs(offsets) <= INNER_PX
+    return np.asarray(window[:, inner].mean(axis=1) - window[:, ~inner].mean(axis=1))
+
+
+def _crossing(places: Array, shares: Array, way: float) -> float | None:
+    """Where by `places` the line leaves the plate, in direction `way`, by the area under its `shares`."""
+    if len(places) < LEAST_FRAMES:
+        return None
+    on, off = (shares[:2], shares[-2:]) if way > 0 else (shares[-2:], shares[:2])
+    if on.min() < ALL or off.max() > NONE:
+        return None
+    shown = float(np.sum(0.5 * (shares[1:] + shares[:-1]) * np.diff(places)))
+    return float(places[0] + shown) if way > 0 else float(places[-1] - shown)

@@ -1,0 +1,114 @@
+"""Has the scan head slipped since the calibration, and do its pictures still go with the rail's readings?
+
+The plate on the claw that shows where the laser points (`witness`) has edges. The rail takes the line over one of them,
+to and fro: where the line leaves the plate tells the head's place along the rail, and the difference between the two
+ways how late the pictures come. Where the line on the plate ends, above and below, tells the head's place across.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.calibration.witness import Witness
+from cell.geometry.camera import Array, CameraModel
+from cell.geometry.light_plane import LightPlane, triangulate
+from drivers.errors import Measured, RefusedError
+
+NOTED_M = 0.05e-3
+"""A shift that people are told of: plate, rail and picture that nobody touched give 0.02 mm."""
+LARGEST_M = 0.15e-3
+LARGEST_LAG_S = 8e-3
+"""Pictures that come so much later than at the calibration are paired with the wrong places of the rail."""
+PLATE_DEPTH_M = 0.085
+LEVER = 1.5
+"""What a head that has turned on its mount does at the surface, of what it does at the nearer plate."""
+ENDS_DIFFER = 3.0
+"""By so many rows more at one end than at the other the line is covered, not shifted."""
+
+
+@dataclass(frozen=True)
+class Slip:
+    """How far the head has moved against the plate since the calibration: `along` the rail's way and `across` it, m, in
+    the camera's frame (across: 0 where a covered end hides it, which `hidden` says), and how much later, s, its
+    pictures come (`lag`). `depth` is how far the plate is from the camera, m."""
+
+    along: float
+    across: float
+    lag: float
+    hidden: bool = False
+    depth: float = PLATE_DEPTH_M
+
+    @property
+    def shift(self) -> tuple[float, float]:
+        """Along and across, m."""
+        return self.along, self.across
+
+    @property
+    def size(self) -> float:
+        """The whole shift, m."""
+        return float(np.hypot(self.along, self.across))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people, what is not as usual."""
+        made = []
+        if self.size > NOTED_M:
+            made.append(
+                f"the scan head, or the plate on the claw, has slipped by {1e3 * self.along:+.3f} mm along and "
+                f"{1e3 * self.across:+.3f} mm across the rail since the calibration; the stated uncertainty allows for "
+                "it. Look at the head's screws, then run `cell calibrate`"
+            )
+        if self.hidden:
+            made.append(
+                "whether the scan head has slipped across the rail is not seen: an end of the laser's line on the "
+                "plate on the claw is covered. Clean the plate"
+            )
+        return tuple(made)
+
+    def covariance(self, axes: Array) -> Array:
+        """What a place may be off by because of it, (6, 6), m² and rad², base axes; `axes` (3, 3) are the camera's."""
+        made = np.zeros((6, 6))
+        if self.size > NOTED_M:
+            shift = LEVER * (axes @ np.array([self.along, self.across, 0.0]))
+            made[:3, :3] = np.outer(shift, shift)
+            # A turn on its mount that shifts the plate by as much.
+            made[3:, 3:] = (self.size / self.depth) ** 2 * np.eye(3)
+        return made
+
+    def require(self) -> None:
+        """Raise `RefusedError` for a head that has slipped too far, or pictures that come too late."""
+        if self.size > LARGEST_M:
+            raise RefusedError(
+                f"the scan head has slipped by {1e3 * self.along:+.3f} mm along and {1e3 * self.across:+.3f} mm across "
+                f"the rail since the calibration, allowed are {1e3 * LARGEST_M:g} mm, or the plate on the claw that "
+                "shows it has moved: look at the screws of head and plate, then run `cell calibrate`",
+                Measured("scan head slipped by", 1e3 * self.size, "mm", most=1e3 * LARGEST_M),
+            )
+        if abs(self.lag) > LARGEST_LAG_S:
+            raise RefusedError(
+                f"the scan camera's pictures come {1e3 * self.lag:+.1f} ms later against the rail's readings than at "
+                f"the calibration, allowed are ±{1e3 * LARGEST_LAG_S:g} ms: a sweep would lie elsewhere as a whole. "
+                "See whether frames are lost or stamped otherwise (cable, packets, trigger), then run `cell calibrate`",
+                Measured("pictures come later by", 1e3 * self.lag, "ms", most=1e3 * LARGEST_LAG_S),
+            )
+
+
+def slip_since(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, rail_direction: Array) -> Slip:
+    """Between two looks at the plate that both saw its edge, by the calibrated `camera`, light `plane` and the camera's
+    motion (3,) per metre of the rail."""
+    assert before.edge is not None and now.edge is not None
+    both = np.flatnonzero(np.isfinite(before.columns) & np.isfinite(now.columns))
+    at = np.column_stack([before.columns[both], both.astype(np.float64)])
+    points, _ = triangulate(camera, plane, at)
+    depth = float(np.median(points[:, 2]))
+    per_px = depth / camera.fx
+    # A laser that points elsewhere meets the plate elsewhere, and its edge at another place of the rail.
+    by_line = per_px * float(np.median(now.columns[both] - before.columns[both]))
+    along = (now.edge.place - before.edge.place) * float(rail_direction[0]) + by_line
+    ends = now.rows[[0, -1]] - before.rows[[0, -1]]
+    hidden = bool(abs(ends[1] - ends[0]) > ENDS_DIFFER)
+    # The plate is seen to move against the head; the head has moved the other way.
+    across = 0.0 if hidden else -per_px * camera.fx / camera.fy * float(ends.mean())
+    return Slip(-along, across, now.edge.lag - before.edge.lag, hidden, depth)

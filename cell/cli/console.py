@@ -1,0 +1,121 @@
+"""`cell console`: the operator's screen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cell.cli.options import ConfigOption, JobOption, Level, LevelOption, SeedOption, SimOption
+
+if TYPE_CHECKING:
+    from cell.console.console import Address
+    from cell.run.job_run import Observer, RunOutcome
+    from cell.supervisor import Cell
+
+NoOpenOption = Annotated[bool, typer.Option("--no-open", help="Do not open the page; its link is printed.")]
+PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Where the page is; 0 is any that is free.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(console)
+
+
+def console(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    speed: Annotated[
+        float | None,
+        typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall a simulated cell runs."),
+    ] = None,
+    port: PortOption = 0,
+    no_open: NoOpenOption = False,
+    host: Annotated[
+        str, typer.Option("--host", help="Another address than this computer's own; needs the four options below.")
+    ] = "127.0.0.1",
+    name: Annotated[list[str] | None, typer.Option("--name", help="What browsers call this computer there.")] = None,
+    token_file: Annotated[
+        Path | None, typer.Option("--token-file", help="A file with the token that opens it.")
+    ] = None,
+    certificate: Annotated[Path | None, typer.Option("--certificate", help="Certificate for TLS, PEM.")] = None,
+    key: Annotated[Path | None, typer.Option("--key", help="Its key, PEM.")] = None,
+) -> None:
+    """Open the cell and show it in a browser: see it, run jobs, jog by holding a button, stop it.
+
+    It is held until Ctrl-C. One page holds it at a time, any page stops it. STOP there is not an emergency stop.
+    """
+    from cell.config import DEVICES
+    from cell.console.console import Address
+    from cell.devices.mix import simulated_of
+    from cell.supervisor import Cell
+
+    address = Address(host, port, tuple(name or ()), token_file, certificate, key)
+    address.checked()
+    # At the wall's pace unless told otherwise: a person holds the buttons.
+    pace = speed if speed is not None else 1.0 if set(simulated_of(sim, config)) == set(DEVICES) else None
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job, speed=pace) as cell:
+        ended = shown(cell, job, address, open_page=not no_open)
+    raise typer.Exit(ended)
+
+
+def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
+    """Show a cell until Ctrl-C, or until the server ends: then it is stopped, and the exit code is 1."""
+    import threading
+
+    from cell.console.console import Console
+    from statemachine.watch import SignalWatch
+
+    gone = threading.Event()
+    with SignalWatch() as signals, Console(cell, job, address, page_teller(open_page), gone.set):
+        while signals.reason is None and not gone.wait(0.2):
+            pass
+        if gone.is_set():
+            typer.echo("the page's server has ended, so nobody sees the cell any more: it is stopped", err=True)
+            cell.stop()
+            return 1
+    return 0
+
+
+def run_shown(
+    cell: Cell, display: Observer, *, job: str, inject: Sequence[str], until: str | None, port: int, open_page: bool
+) -> RunOutcome:
+    """Run a job and show it, and until its pages are closed what it was; on the virtual clock computed first."""
+    import time
+
+    from cell.console.console import Address, Console
+    from statemachine.watch import SignalWatch
+
+    virtual = cell.simulated is not None and cell.simulated.facts["clock"] == "virtual"
+    with Console(cell, job, Address(port=port), page_teller(open_page)) as console:
+        with console.computing(job) if virtual else nullcontext() as done:
+            outcome = cell.run(job, display, inject, until=until, script=console.script(job))
+            if done is not None:
+                done(outcome)
+        with SignalWatch() as signals:
+            while signals.reason is None and console.seen:
+                time.sleep(0.2)
+    return outcome
+
+
+def page_teller(open_page: bool) -> Callable[[str], None]:
+    """What is done with each new link: printed, and the first one opened."""
+    import webbrowser
+
+    told: list[str] = []
+
+    def tell(link: str) -> None:
+        typer.echo(
+            f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}", err=True
+        )
+        if not told and open_page:
+            webbrowser.open(link)
+        told.append(link)
+
+    return tell

@@ -1,0 +1,116 @@
+"""Who may talk to the server: exact lists of hosts and origins, a token that works once, a cookie, rates.
+
+A page of anybody else in the same browser must reach nothing, whatever name it gives this computer; nor may another
+user of this computer who does not know the token.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+
+COOKIE = "cell_console"
+POLICY = "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'"
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+MOST_SESSIONS = 64
+MOST_COOKIE_BYTES = 4096
+
+
+@dataclass
+class Bucket:
+    """So many a second, and `room` at once."""
+
+    per_s: float
+    room: float
+    _left: float = field(init=False)
+    _seen: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._left, self._seen = self.room, time.monotonic()
+
+    def take(self) -> bool:
+        """Whether there is still one."""
+        now = time.monotonic()
+        self._left, self._seen = min(self.room, self._left + (now - self._seen) * self.per_s), now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+class Access:
+    """Of a server at `port`, that browsers reach by `hosts`. `secure` with TLS. `lasting` is a token that works again
+    and again, for a server that is reached from elsewhere; without it each link works once."""
+
+    def __init__(self, hosts: tuple[str, ...], port: int, *, secure: bool, lasting: str | None = None) -> None:
+        scheme = "https" if secure else "http"
+        standard = 443 if secure else 80
+        self.hosts = frozenset(f"{host}:{port}" for host in hosts) | (frozenset(hosts) if port == standard else set())
+        self.origins = frozenset(f"{scheme}://{host}" for host in self.hosts)
+        self.cookie = f"{COOKIE}_{port}"
+        self._secure = secure
+        self._lasting = lasting
+        self._links: list[str] = []
+        self._sessions: list[str] = []
+
+    def link(self) -> str:
+        """A new token, which works once; those before it that nobody used work no more."""
+        self._links = [secrets.token_urlsafe(32)]
+        return self._links[0]
+
+    def enter(self, token: str) -> str | None:
+        """The cookie's value for whoever has the token, None for anybody else."""
+        once = [known for known in self._links if _same(known, token)]
+        if not once and not (self._lasting is not None and _same(self._lasting, token)):
+            return None
+        self._links = [known for known in self._links if known not in once]
+        session = secrets.token_urlsafe(32)
+        self._sessions = [*self._sessions[-MOST_SESSIONS + 1 :], session]
+        return session
+
+    def set_cookie(self, session: str) -> str:
+        """The header that gives it to the browser."""
+        secure = "; Secure" if self._secure else ""
+        return f"{self.cookie}={session}; HttpOnly; SameSite=Strict; Path=/{secure}"
+
+    def refusal(self, headers: Mapping[str, str], hosts: int, *, changes: bool, enters: bool) -> tuple[int, str] | None:
+        """Status and words when a request is refused, by its headers (names in lower case); `hosts` is how many Host
+        headers it has. `changes` for whatever is no plain GET, and for the WebSocket; `enters` needs no cookie yet."""
+        if hosts != 1 or headers.get("host", "").lower() not in self.hosts:
+            return 421, "this server is not reached by that name; use the link that `cell console` printed"
+        origin = headers.get("origin")
+        if origin is None and changes:
+            return 403, "a page says where it comes from (Origin); this request did not"
+        if origin is not None and origin not in self.origins:
+            return 403, "another page may not talk to the cell"
+        site = headers.get("sec-fetch-site")
+        allowed = ("same-origin",) if changes else ("same-origin", "none")
+        # The link is opened from elsewhere: a terminal, a mail.
+        if site is not None and site not in allowed and not enters:
+            return 403, "another page may not talk to the cell"
+        if not enters and not self._knows(headers.get("cookie", "")):
+            return 401, "open the link that `cell console` printed in its terminal; it works once"
+        return None
+
+    def _knows(self, cookie: str) -> bool:
+        if len(cookie) > MOST_COOKIE_BYTES:
+            return False
+        try:
+            morsel = SimpleCookie(cookie).get(self.cookie)
+        except CookieError:
+            return False
+        return morsel is not None and any(_same(known, morsel.value) for known in self._sessions)
+
+
+def _same(known: str, given: str) -> bool:
+    return secrets.compare_digest(known.encode(), given.encode("utf-8", "surrogatepass"))

@@ -1,0 +1,199 @@
+"""What the server answers: the page, its data, commands and the live link, to those who may."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from cell.console.access import HEADERS, Access, Bucket
+from cell.console.archive import Archive
+from cell.console.pages import Pages
+
+MOST_BODY = 4096
+PAGE = Path(__file__).with_name("page")
+ENTER = "/enter"
+
+Ask = Callable[[str, Mapping[str, Any]], Awaitable[tuple[int, Mapping[str, Any]]]]
+"""What a page, by its id, wants done: status and answer."""
+
+
+class Guard:
+    """Stands before everything: who may not is told so here, and every answer has the headers of `access.HEADERS`."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+        self._rate = Bucket(100.0, 400.0)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """See ASGI."""
+        if scope["type"] not in ("http", "websocket"):
+            return
+        live = scope["type"] == "websocket"
+        pairs = [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in scope["headers"]]
+        plain = not live and scope["method"] in ("GET", "HEAD")
+        refusal = self._access.refusal(
+            dict(pairs), sum(name == "host" for name, _ in pairs), changes=not plain,
+            enters=plain and scope["path"] == ENTER,
+        )  # fmt: skip
+        if refusal is None and plain and not self._rate.take():
+            refusal = 429, "too many requests; wait a moment"
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                known = {name for name, _ in message["headers"]}
+                message["headers"] = [
+                    *message["headers"],
+                    *((n.encode(), v.encode()) for n, v in HEADERS.items() if n.encode() not in known),
+                ]
+            await send(message)
+
+        if refusal is None:
+            await self._app(scope, receive, sent)
+        elif live:
+            # Before it is accepted this is an answer 403 to the upgrade.
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await PlainTextResponse(refusal[1] + "\n", refusal[0])(scope, receive, sent)
+
+
+class Application:
+    """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station."""
+
+    def __init__(
+        self,
+        access: Access,
+        pages: Pages,
+        archive: Archive,
+        cell: Mapping[str, Any],
+        do: Ask,
+        stop: Callable[[], Awaitable[str | None]],
+        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, Any]]]],
+    ) -> None:
+        self._access = access
+        self._pages = pages
+        self._archive = archive
+        self._cell = cell
+        self._do = do
+        self._stop = stop
+        self._of_job = of_job
+        self._commands = Bucket(10.0, 40.0)
+
+    def asgi(self) -> ASGIApp:
+        """What is served."""
+        routes = [
+            Route("/", self._index),
+            Route(ENTER, self._enter),
+            Route("/api/cell", self._tell_cell),
+            Route("/api/runs", self._runs),
+            Route("/api/trend", self._trend),
+            Route("/api/runs/{run}", self._run),
+            Route("/api/runs/{run}/replay", self._replay),
+            Route("/api/runs/{run}/pictures/{name}", self._picture),
+            Route("/api/do", self._command, methods=["POST"]),
+            WebSocketRoute("/live", self._live),
+            Mount("/static", StaticFiles(directory=PAGE)),
+        ]
+        return Guard(Starlette(routes=routes, exception_handlers={HTTPException: _refused, 500: _failed}), self._access)
+
+    async def _index(self, request: Request) -> Response:
+        return FileResponse(PAGE / "index.html", headers={"cache-control": "no-store"})
+
+    async def _enter(self, request: Request) -> Response:
+        # Not by Starlette's own parser, whose errors would show what was sent.
+        token = parse_qs(request.scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        session = self._access.enter(token)
+        if session is None:
+            return PlainTextResponse("this link was used already, or is none; `cell console` shows a new one\n", 403)
+        return RedirectResponse("/", 303, {"set-cookie": self._access.set_cookie(session), "cache-control": "no-store"})
+
+    async def _tell_cell(self, request: Request) -> Response:
+        job = request.query_params.get("job")
+        if job is None:
+            return _json(self._cell)
+        status, words = await self._of_job(job[:200])
+        return _json(words, status)
+
+    async def _runs(self, request: Request) -> Response:
+        return await self._from_archive(Archive.runs)
+
+    async def _trend(self, request: Request) -> Response:
+        return await self._from_archive(Archive.trend)
+
+    async def _from_archive(self, what: Callable[[Archive], Any]) -> Response:
+        return _json(await run_in_threadpool(what, self._archive))
+
+    async def _run(self, request: Request) -> Response:
+        return _found(await run_in_threadpool(self._archive.run, request.path_params["run"]))
+
+    async def _replay(self, request: Request) -> Response:
+        return _found(await run_in_threadpool(self._archive.replay, request.path_params["run"]))
+
+    async def _picture(self, request: Request) -> Response:
+        path = self._archive.picture(request.path_params["run"], request.path_params["name"])
+        return _found(None) if path is None else FileResponse(path, media_type="image/png")
+
+    async def _command(self, request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            return _no("content", "commands are JSON (content-type application/json)", 415)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > MOST_BODY:
+                return _no("content", f"a command has at most {MOST_BODY} bytes", 413)
+        try:
+            words = json.loads(body)
+        except (ValueError, RecursionError):
+            words = None
+        if not isinstance(words, dict):
+            return _no("content", "this is no JSON object", 400)
+        if words.get("do") == "stop":
+            trouble = await self._stop()
+            return _json({"ok": True, "text": "the cell was stopped"}) if trouble is None else _no(
+                "DeviceFault", trouble, 500
+            )  # fmt: skip
+        if not self._commands.take():
+            return _no("rate", "too many commands; wait a moment", 429)
+        page = self._pages.by_key(words.pop("key", None))
+        if page is None:
+            return _no("InterlockError", "this page has no live link to the cell; load it again", 403)
+        status, answer = await self._do(page.id, words)
+        return _json(answer, status)
+
+    async def _live(self, socket: WebSocket) -> None:
+        await self._pages.serve(socket)
+
+
+def _json(words: Any, status: int = 200) -> Response:
+    return JSONResponse(words, status, {"cache-control": "no-store"})
+
+
+def _no(kind: str, text: str, status: int) -> Response:
+    return _json({"ok": False, "error": kind, "text": text}, status)
+
+
+def _found(words: Any) -> Response:
+    return _no("missing", "there is no such run, or it left none of this", 404) if words is None else _json(words)
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    status = error.status_code if isinstance(error, HTTPException) else 500
+    return _no("refused", {404: "there is no such address", 405: "this is not done so"}.get(status, "refused"), status)
+
+
+async def _failed(request: Request, error: Exception) -> Response:
+    # Never the request itself, which may hold a token.
+    return _no("internal", f"the server failed ({type(error).__name__})", 500)

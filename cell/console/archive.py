@@ -1,0 +1,99 @@
+"""The runs of a cell as the page lists them; read from their folders, for whoever asks."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cell.run.folder import list_runs
+from cell.run.reading import read_report, run_row
+from drivers.errors import CellError
+
+RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
+PICTURE = re.compile(r"[\w][\w.+-]*\.png")
+TRACE = "trace.json"
+MOST_RUNS, MOST_PICTURES = 200, 60
+
+
+class Archive:
+    """Below the folder `root`. What is not there is None."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._rows: dict[Path, dict[str, Any]] = {}
+
+    def runs(self) -> list[dict[str, Any]]:
+        """Newest first; see docs/console.md."""
+        return [self._row(folder) for folder in reversed(list_runs(self._root)[-MOST_RUNS:])]
+
+    def trend(self) -> list[dict[str, Any]]:
+        """Jobs, oldest first."""
+        keys = ("run", "started", "job", "outcome", "d_mean_mm", "expected_mm", "duration_s")
+        return [{key: row[key] for key in keys} for row in reversed(self.runs()) if row["kind"] == "job"]
+
+    def run(self, name: str) -> dict[str, Any] | None:
+        """One run's report and the names of its pictures."""
+        if (folder := self._folder(name)) is None:
+            return None
+        try:
+            report: dict[str, Any] = read_report(folder)
+        except CellError as error:
+            report = {"outcome": "unreadable", "reason": str(error)}
+        own = sorted(path.name for path in folder.glob("*.png"))
+        last = [str(name).rpartition("/")[2] for name in report.get("last_frames") or ()]
+        kept = sorted(path.name for path in (folder / "frames").glob("*.png") if not path.name.startswith("stripe"))
+        names = [name for name in dict.fromkeys((*own, *last, *kept)) if self.picture(folder.name, name) is not None]
+        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES]}
+
+    def picture(self, run: str, name: str) -> Path | None:
+        """The file of a picture."""
+        folder = self._folder(run)
+        if folder is None or not PICTURE.fullmatch(name):
+            return None
+        return next((path for path in (folder / name, folder / "frames" / name) if path.is_file()), None)
+
+    def replay(self, name: str) -> dict[str, Any] | None:
+        """How the cell moved in a run; None for one that left no trace."""
+        folder = self._folder(name)
+        try:
+            trace = json.loads((folder / TRACE).read_text(encoding="utf-8")) if folder is not None else None
+        except (OSError, ValueError):
+            return None
+        return {"run": name, **trace} if isinstance(trace, dict) else None
+
+    def _folder(self, name: str) -> Path | None:
+        if not RUN.fullmatch(name) or not (self._root / name).is_dir():
+            return None
+        return self._root / name
+
+    def _row(self, folder: Path) -> dict[str, Any]:
+        if (known := self._rows.get(folder)) is not None:
+            return known
+        row = run_row(folder)
+        try:
+            report = read_report(folder)
+        except (CellError, OSError):
+            report = {}
+        row |= {"d_mean_mm": _true(report), "expected_mm": _stated(report)}
+        if (folder / "report.json").exists():
+            self._rows[folder] = row
+        return row
+
+
+def _true(report: Mapping[str, Any]) -> float | None:
+    try:
+        return float(report["truth"]["error_mm"]["d"]["mean"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _stated(report: Mapping[str, Any]) -> float | None:
+    """One standard deviation of the surface's place, all directions together."""
+    try:
+        return round(math.hypot(*(float(value) for value in report["place_sigma"]["translation_mm"])), 4)
+    except (KeyError, TypeError, ValueError):
+        return None

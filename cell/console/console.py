@@ -1,0 +1,255 @@
+"""The console of an open cell: its server, the desk that obeys it, and the look that shows it the cell.
+
+with Console(cell, "pot") as console:
+    print(console.link)
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from cell.console.desk import Desk
+from cell.console.facts import cell_facts
+from cell.console.link import ServerProcess
+from cell.console.look import Look
+from cell.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
+from cell.console.trace import Trace
+from cell.job import load_job
+from cell.run.job_run import RunOutcome
+from cell.run.run import Run
+from cell.steps.kinds import find_kind
+from drivers.errors import CellError, ConfigError, InterlockError
+from statemachine.script import Script
+
+if TYPE_CHECKING:
+    from cell.supervisor import Cell
+
+LEAST_TOKEN = 32
+_LOOPBACK = "127.0.0.1"
+MOST_AT_ONCE = 8
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the server listens. Another address than 127.0.0.1 needs a token in a file, and a certificate with its key;
+    `names` are what browsers call this computer then. Port 0 is any that is free."""
+
+    host: str = _LOOPBACK
+    port: int = 0
+    names: tuple[str, ...] = ()
+    token_file: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+
+    def checked(self) -> str | None:
+        """The token of the file, if there is one; `ConfigError` for an address that this does not suffice for."""
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("TLS needs both: --certificate FILE and --key FILE")
+        if self.certificate is not None and self.key is not None:
+            try:
+                ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.certificate, self.key)
+            except (OSError, ssl.SSLError) as error:
+                raise ConfigError(
+                    f"certificate {self.certificate} and key {self.key} cannot be used: {error}"
+                ) from error
+        if self.host != _LOOPBACK and (self.token_file is None or self.certificate is None):
+            raise ConfigError(
+                f"the console listens at {_LOOPBACK} only; at {self.host} it moves an arm for whoever reaches it, so "
+                "that needs --token-file FILE, --certificate FILE and --key FILE"
+            )
+        if self.token_file is None:
+            return None
+        try:
+            token = self.token_file.read_text(encoding="utf-8").strip()
+            mode = self.token_file.stat().st_mode
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"the token file {self.token_file} cannot be read: {type(error).__name__}") from error
+        if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+            raise ConfigError(
+                f"the token in {self.token_file} has {len(token)} characters, at least {LEAST_TOKEN} are asked for, "
+                "ASCII without blanks. Make one with: python -c 'import secrets; print(secrets.token_urlsafe(32))'"
+            )
+        if mode & 0o077:
+            raise ConfigError(f"others may read the token file {self.token_file}; run: chmod 600 {self.token_file}")
+        return token
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """The names in a browser's address line."""
+        own = (_LOOPBACK, "localhost") if self.host == _LOOPBACK else (self.host,)
+        return tuple(name.lower() for name in (*own, *self.names))
+
+
+class Console:
+    """The console of `cell`, for `job` unless another one is chosen. To be used as a context.
+
+    `told` is given the link that opens a page once, whenever there is a new one; `gone` is called when the server has
+    ended by itself: then nobody sees the cell any more. Raises `ConfigError` for an address that is not allowed or not
+    free.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        job: str = "pot",
+        address: Address | None = None,
+        told: Callable[[str], None] = lambda link: None,
+        gone: Callable[[], None] = lambda: None,
+    ) -> None:
+        address = address or Address()
+        token = address.checked()
+        self.link = ""
+        self._cell = cell
+        self._told = told
+        self._scheme = "http" if address.certificate is None else "https"
+        self._names = address.hosts
+        self._working = threading.BoundedSemaphore(MOST_AT_ONCE)
+        bound = _bound(address)
+        self.port: int = bound.getsockname()[1]
+        self.desk = Desk(cell, job, self._say, lambda run, name: self._look.began(run, name))
+        self._look = Look(cell, self.desk, lambda message: self._server.tell(message))
+        certificate, key = (None if path is None else str(path) for path in (address.certificate, address.key))
+        facts = cell_facts(cell, job)
+        self._server = ServerProcess(
+            lambda fd: Setup(
+                fd, self.port, address.hosts, token, certificate, key, str(cell.runs_folder.resolve()), facts
+            ),
+            bound, self._heard, self._stop, gone,
+        )  # fmt: skip
+        self._look.start()
+
+    def __enter__(self) -> Console:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def server_pid(self) -> int:
+        """Process id of the server."""
+        return self._server.pid
+
+    @property
+    def seen(self) -> bool:
+        """Whether a page is open."""
+        return bool(self.desk.holders.rows())
+
+    def script(self, job: str) -> Script:
+        """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
+        return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, lambda: self.seen)
+
+    def began(self, run: Run[Any], job: str | None) -> None:
+        """A run was begun by somebody else than a page; it is shown as well."""
+        self.desk.questions.hold(run)
+        self._look.began(run, job)
+
+    @contextmanager
+    def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:
+        """Inside this context a job is done on the virtual clock, and noted; give its outcome to what this gives.
+
+        The page is told that it is being computed, and offers its motion when it is.
+        """
+        rehearsals, seed = self.desk.rehearsals, None
+        if self._cell.simulated is not None:
+            seed = self._cell.simulated.facts["seed"]
+        about = {"job": job, "seed": seed, "run": None}
+        rehearsals.present = {"state": "running", "text": "computing", **about}
+        trace = Trace(self._cell.devices, virtual=True)
+
+        def done(outcome: RunOutcome) -> None:
+            trace.write(outcome.folder)
+            told = {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
+            rehearsals.present = {**about, "state": "done", **told}
+
+        try:
+            with trace.taken():
+                yield done
+        finally:
+            if rehearsals.present["state"] == "running":
+                rehearsals.present = {**about, "state": "done", "outcome": "failed", "reason": "it could not be done"}
+
+    def close(self) -> None:
+        """End it: what is held by a page stops. The cell stays open."""
+        self.desk.close()
+        self._look.close()
+        self._server.close()
+
+    def _stop(self) -> str | None:
+        """Asks nobody and waits for nothing."""
+        try:
+            self._cell.stop()
+        # Whatever it is, whoever pressed it has to know.
+        except Exception as error:
+            log.error("the stop from the page: %s", error)
+            return str(error)
+        return None
+
+    def _say(self, client: str, words: dict[str, Any]) -> None:
+        self._server.tell(Say(client, words))
+
+    def _heard(self, message: object) -> None:
+        """In the pipe's thread: nothing here may last."""
+        match message:
+            case Beat(client, words, end):
+                self.desk.jog_end(client) if end else self.desk.beat(client, words)
+            case Joined(client):
+                self.desk.joined(client)
+            case Left(client):
+                self.desk.left(client)
+            case Do(number, client, words):
+                self._begin(number, lambda: self.desk.do(client, words))
+            case AskCell(number, job):
+                self._begin(number, lambda: cell_facts(self._cell, job))
+            case Ready(token):
+                self._new_link(token)
+
+    def _new_link(self, token: str | None) -> None:
+        base = f"{self._scheme}://{self._names[0]}:{self.port}"
+        self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
+        self._told(self.link)
+
+    def _begin(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+        if not self._working.acquire(blocking=False):
+            busy = {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
+            self._server.tell(Answer(number, 429, busy))
+            return
+        threading.Thread(target=self._answer, args=(number, work), name="console command", daemon=True).start()
+
+    def _answer(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+        status, answer = 200, {}
+        try:
+            answer = work()
+        except CellError as error:
+            not_held = isinstance(error, InterlockError) and "does not hold it" in str(error)
+            status = 400 if isinstance(error, ConfigError) else 403 if not_held else 409
+            answer = {"ok": False, "error": type(error).__name__, "text": str(error)}
+        except Exception as error:
+            log.exception("the console failed")
+            status, answer = 500, {"ok": False, "error": "internal", "text": f"{type(error).__name__}: {error}"}
+        finally:
+            self._working.release()
+            self._server.tell(Answer(number, status, answer))
+
+
+def _bound(address: Address) -> socket.socket:
+    bound = socket.socket(socket.AF_INET6 if ":" in address.host else socket.AF_INET)
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind((address.host, address.port))
+    except OSError as error:
+        bound.close()
+        raise ConfigError(f"the console cannot listen at {address.host}:{address.port}: {error.strerror}") from error
+    return bound

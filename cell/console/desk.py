@@ -1,0 +1,296 @@
+"""The operator's desk: what a page may ask of the cell, by the words of the command line, and who may ask it.
+
+Whoever asks is answered by a thread of its own, so that nothing waits behind something long. The stop is not here: it
+has a way of its own (`cell.console.link`), and asks nobody.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from cell.console.holders import Holders
+from cell.console.holding import Press, Presses
+from cell.console.manual import Manual
+from cell.console.questions import Questions
+from cell.console.rehearsal import Rehearsals
+from cell.devices.diagnosis import ask
+from cell.devices.gate import Gated
+from cell.devices.jogging import Jog
+from cell.job import job_path, load_job
+from cell.run.run import Run
+from cell.steps.kinds import find_kind
+from drivers.errors import CellError, ConfigError, InterlockError
+from statemachine.script import Script
+
+if TYPE_CHECKING:
+    from cell.supervisor import Cell
+
+FREE = ("hold",)
+"""What a page may do that does not hold the cell."""
+LEAST_SPEED = 0.05
+
+Words = Mapping[str, Any]
+Answer = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+
+class Desk:
+    """One cell's desk. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        job: str,
+        say: Callable[[str, dict[str, Any]], None],
+        began: Callable[[Run[Any], str | None], None] = lambda run, job: None,
+    ) -> None:
+        self.cell = cell
+        self.job = job
+        self.questions = Questions()
+        self.rehearsals = Rehearsals(cell)
+        self.holders = Holders(self._lost)
+        self.presses = Presses()
+        self._say = say
+        self._began = began
+        self._beginning = threading.Lock()
+        self.manual = Manual(cell, load_job(job)[0], self._pressed)
+        self._doing: dict[str, Callable[[str, Words], Answer | str]] = {
+            "hold": lambda client, words: self.holders.hold(client, _text(words, "name", "")),
+            "leave": lambda client, words: self.holders.leave(client),
+            "hand_over": lambda client, words: self.holders.hand_over(client, _text(words, "to")),
+            "clear_stop": self._clear_stop,
+            "start": self._start,
+            "resume": self._resume,
+            "dry_run": lambda client, words: self.rehearsals.begin(self._job(words), self._seed(words)),
+            "pause": lambda client, words: self._running("pause", Run.pause),
+            "go_on": lambda client, words: self._running("go on", Run.go_on),
+            "abort": self._abort,
+            "decide": self._decide,
+            "calibrate": lambda client, words: self._long("calibration", lambda: cell.calibrate(job=self._job(words))),
+            "verify": lambda client, words: self._long("verification", lambda: cell.verify(job=self._job(words))),
+            "home": self._home,
+            "diag": lambda client, words: self._diag(),
+            "manual": self._manual,
+            "jog_step": self._jog_step,
+            "speed": self._speed,
+        }
+
+    # --- clients ---
+
+    def joined(self, client: str) -> None:
+        """A page was opened."""
+        self.holders.joined(client)
+
+    def left(self, client: str) -> None:
+        """A page is gone: what it held stops."""
+        self.presses.left(client)
+        self.holders.left(client)
+
+    def do(self, client: str, words: Words) -> Answer:
+        """Do what a page asks; its answer as docs/console.md has it. Raises `CellError` for what is refused."""
+        name = words.get("do")
+        act = self._doing.get(name) if isinstance(name, str) else None
+        if act is None:
+            raise ConfigError(f"there is nothing called {str(name)[:40]!r} to do; docs/console.md lists what there is")
+        if name not in FREE:
+            self.holders.require(client)
+        log.info("%s (%s): %s", self.holders.name(client), client, name)
+        answer = act(client, words)
+        return {"ok": True, **({"text": answer} if isinstance(answer, str) else answer)}
+
+    def beat(self, client: str, words: Words) -> None:
+        """A page says that a button is held."""
+        number, sign = words.get("press"), words.get("sign")
+        if not (isinstance(number, int) and sign in (1, -1)):
+            return
+        at = words.get("at")
+        at_ms = float(at) if isinstance(at, int | float) and math.isfinite(at) else None
+        if self.holders.holder != client or not self.manual.on:
+            self.presses.end(client, "this page does not hold the cell")
+            self._say(client, {"type": "jog", "press": number, "state": "refused", "text": self._why_not(client)})
+            return
+        device, axis = str(words.get("device")), str(words.get("axis") or "")
+        press = self.presses.beat(client, number, device, axis, int(sign), at_ms)
+        if press is not None:
+            self.manual.press(press)
+
+    def jog_end(self, client: str) -> None:
+        """A page says that the button is up."""
+        self.presses.end(client, "the button was let go of")
+
+    def jogging(self) -> dict[str, Any] | None:
+        """What is moved by holding now."""
+        press = self.presses.present
+        if press is None or press.ended is not None or press.beat is None:
+            return None
+        return {"device": press.device, "axis": press.axis, "sign": press.sign}
+
+    def close(self) -> None:
+        """The console ends: what is held stops."""
+        self.presses.end_all("the console ends")
+        self.manual.end()
+        self.manual.join(5.0)
+
+    def _lost(self) -> None:
+        self.presses.end_all("the cell was let go of")
+        self.manual.end()
+
+    def _pressed(self, press: Press, state: str, text: str) -> None:
+        self._say(press.client, {"type": "jog", "press": press.number, "state": state, "text": text})
+
+    def _why_not(self, client: str) -> str:
+        try:
+            self.holders.require(client)
+        except InterlockError as error:
+            return str(error)
+        return "the cell is not in manual mode, in which alone something is jogged; switch it on"
+
+    # --- runs ---
+
+    def _start(self, client: str, words: Words) -> str:
+        job = self._job(words)
+        until = words.get("until")
+        kind = find_kind(load_job(job)[0].job.kind)
+        at_start = words.get("at_start") is True
+        return self._begin(job, lambda script: self.cell.start(
+            job, at_start=at_start, until=None if until is None else str(until), script=script
+        ), kind.names)  # fmt: skip
+
+    def _begin(self, job: str, start: Callable[[Script], Run[Any]], steps: tuple[str, ...]) -> str:
+        with self._beginning:
+            run = start(self.questions.script(steps))
+            self.questions.hold(run)
+        self._began(run, job)
+        return f"job {job} has begun"
+
+    def _resume(self, client: str, words: Words) -> str:
+        run = words.get("run")
+        kind = find_kind(load_job(self.job)[0].job.kind)
+        script = self.questions.script(kind.names)
+        return self._long("resumed job", lambda: self.cell.resume(None if run is None else str(run), script=script))
+
+    def _home(self, client: str, words: Words) -> str:
+        device = words.get("device")
+        return self._long("homing", lambda: self.cell.home(None if device is None else str(device)))
+
+    def _long(self, what: str, work: Callable[[], object]) -> str:
+        """Begin work that lasts, and give what refuses it at once."""
+        begun, failed = threading.Event(), []
+
+        def perform() -> None:
+            try:
+                work()
+            except CellError as error:
+                failed.append(error)
+                log.info("%s: %s", what, error)
+            finally:
+                begun.set()
+
+        with self._beginning:
+            if (going := self.cell.current) is not None:
+                raise InterlockError(
+                    "cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again"
+                )
+            threading.Thread(target=perform, name=f"console: {what}", daemon=True).start()
+            for _ in range(500):
+                if begun.wait(0.01) or self.cell.current is not None:
+                    break
+        if (run := self.cell.current) is not None:
+            self.questions.hold(run)
+            self._began(run, None)
+        elif failed:
+            raise failed[0]
+        return f"the {what} has begun"
+
+    def _running(self, what: str, act: Callable[[Run[Any]], None]) -> str:
+        if (run := self.cell.current) is None:
+            raise InterlockError("cell", f"nothing is going on that could {what}")
+        act(run)
+        return {"pause": f"asked the {run.kind} to hold before its next motion"}.get(
+            what, f"asked the {run.kind} to {what}"
+        )
+
+    def _abort(self, client: str, words: Words) -> str:
+        reason = _text(words, "reason", "asked for at the operator's screen")
+        return self._running("end", lambda run: run.abort(f"{self.holders.name(client)}: {reason}"))
+
+    def _decide(self, client: str, words: Words) -> str:
+        if (run := self.cell.current) is None:
+            raise InterlockError("cell", "nothing is going on that waits for a decision")
+        number, step = words.get("number"), words.get("step")
+        if not isinstance(number, int):
+            raise ConfigError("a decision names the number of its question")
+        by = _text(words, "by", self.holders.name(client))
+        choice, reason = _text(words, "choice"), _text(words, "reason")
+        return self.questions.decide(run, number, choice, None if step is None else str(step), by, reason)
+
+    def _clear_stop(self, client: str, words: Words) -> str:
+        by = _text(words, "by")
+        self.cell.clear_stop(by)
+        return f"the stop was cleared by {by}"
+
+    # --- devices ---
+
+    def _manual(self, client: str, words: Words) -> str:
+        if words.get("on") is True:
+            with self._beginning:
+                return self.manual.begin(self.holders.name(client))
+        return self.manual.end()
+
+    def _jog_step(self, client: str, words: Words) -> Answer:
+        amount = words.get("amount")
+        if not isinstance(amount, int | float) or isinstance(amount, bool) or not math.isfinite(amount):
+            raise ConfigError("a step needs its amount, in m or rad")
+        told = self.manual.step(Jog(_text(words, "device"), _text(words, "axis", ""), float(amount)))
+        return {"text": "  ".join(f"{name} {value}" for name, value in told.items())}
+
+    def _speed(self, client: str, words: Words) -> str:
+        fraction = words.get("fraction")
+        if not isinstance(fraction, int | float) or not LEAST_SPEED <= fraction <= 1.0:
+            raise ConfigError(f"speed {fraction!r}: allowed are {LEAST_SPEED:g} to 1")
+        self.manual.speed = float(fraction)
+        return f"held buttons move at {100 * fraction:.0f} %"
+
+    def _diag(self) -> Answer:
+        if self.cell.current is not None:
+            raise InterlockError("cell", "is at work, and its devices are asked only while it rests; wait for the end")
+        served = () if self.cell.simulated is None else self.cell.simulated.simulated
+        with self._beginning:
+            rows = []
+            for device in self.cell.devices:
+                bare: Any = device.bare if isinstance(device, Gated) else device
+                record = self.cell.config.device(device.name)
+                row = ask(device.name, record.place, bare, self.cell.devices.clock)
+                row.simulated = device.name in served
+                rows.append(row.as_dict())
+        well = all(row["ok"] for row in rows)
+        return {"text": "all devices are well" if well else "not all devices are well", "rows": rows}
+
+    def _seed(self, words: Words) -> int:
+        own = None if self.cell.simulated is None else self.cell.simulated.facts["seed"]
+        seed = words.get("seed", 1 if own is None else own)
+        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= 999_999:
+            raise ConfigError("a seed is a whole number from 0 to 999999")
+        return seed
+
+    def _job(self, words: Words) -> str:
+        """The job that is named, one of those that `/api/cell` lists; the console's own without one."""
+        name = words.get("job")
+        if name is None or name == self.job:
+            return self.job
+        if not isinstance(name, str) or "/" in name or "\\" in name:
+            raise ConfigError("a job is named by its name, as the page lists them")
+        job_path(name)
+        return name
+
+
+def _text(words: Words, key: str, otherwise: str | None = None) -> str:
+    value = words.get(key, otherwise)
+    if not isinstance(value, str):
+        raise ConfigError(f"this needs {key!r}, a text")
+    return value[:400]

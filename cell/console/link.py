@@ -1,0 +1,158 @@
+"""The cell's end of the pipes to its server: starts it, hears it, and tells it only as fast as it listens.
+
+The stop comes on a pipe of its own, to a thread that does nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+from cell.console.messages import CloudPart, Happened, Picture, Ready, Setup, Show, Stop, Stopped
+from drivers.errors import CellError
+
+START_S = 30.0
+END_S = 3.0
+MOST_EVENTS, MOST_CLOUDS = 200, 64
+
+
+class Outbox:
+    """What waits for the server: of what is shown only the newest."""
+
+    def __init__(self) -> None:
+        self._news = threading.Condition()
+        self._words: deque[object] = deque()
+        self._events: deque[object] = deque(maxlen=MOST_EVENTS)
+        self._clouds: deque[object] = deque(maxlen=MOST_CLOUDS)
+        self._newest: dict[str, object] = {}
+        self._closed = False
+
+    def put(self, message: object) -> None:
+        """Never waits."""
+        with self._news:
+            match message:
+                case Show():
+                    self._newest["state"] = message
+                case Picture(header, _):
+                    self._newest[header["camera"]] = message
+                case Happened():
+                    self._events.append(message)
+                case CloudPart():
+                    self._clouds.append(message)
+                case _:
+                    self._words.append(message)
+            self._news.notify_all()
+
+    def close(self) -> None:
+        """Nothing more is taken out."""
+        with self._news:
+            self._closed = True
+            self._news.notify_all()
+
+    def take(self) -> object | None:
+        """The next; waits for it, None once it is closed."""
+        with self._news:
+            while not self._closed:
+                for waiting in (self._words, self._events, self._clouds):
+                    if waiting:
+                        return waiting.popleft()
+                if self._newest:
+                    return self._newest.pop(next(iter(self._newest)))
+                self._news.wait()
+        return None
+
+
+class ServerProcess:
+    """The server, started for `setup`, whose socket `bound` it gets. `heard` is told its messages, `stop` stops the
+    cell and gives what was not confirmed, `gone` is called once when it has ended by itself."""
+
+    def __init__(
+        self,
+        setup: Callable[[int], Setup],
+        bound: socket.socket,
+        heard: Callable[[object], None],
+        stop: Callable[[], str | None],
+        gone: Callable[[], None],
+    ) -> None:
+        """Start it; `CellError` when it does not answer."""
+        self._heard, self._stop, self._gone = heard, stop, gone
+        self._outbox = Outbox()
+        self._closing = False
+        self._ready = threading.Event()
+        pairs = socket.socketpair(), socket.socketpair()
+        theirs = [pair[1] for pair in pairs]
+        fds = [bound.fileno(), *(end.fileno() for end in theirs)]
+        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cell.console.serve", str(fds[1]), str(fds[2])],
+            pass_fds=fds,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            start_new_session=True,  # a Ctrl-C is for the program that has the cell
+        )
+        for end in theirs:
+            end.close()
+        self._pipe, self._stops = (Connection(pair[0].detach()) for pair in pairs)
+        self._stop_lock = threading.Lock()
+        self._pipe.send(setup(fds[0]))
+        bound.close()
+        for work in (self._hear, self._hear_stops, self._tell):
+            threading.Thread(target=work, name=f"console {work.__name__.strip('_')}", daemon=True).start()
+        if not self._ready.wait(START_S):
+            self.close()
+            raise CellError("the console's server did not start; install it with: pip install -e '.[console]'")
+
+    @property
+    def pid(self) -> int:
+        """Process id of the server."""
+        return self._process.pid
+
+    def tell(self, message: object) -> None:
+        """To the server, when it listens; never waits."""
+        self._outbox.put(message)
+
+    def close(self) -> None:
+        """End it; idempotent."""
+        self._closing = True
+        self._outbox.close()
+        self._process.terminate()
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(END_S)
+
+    def _tell(self) -> None:
+        with suppress(OSError, ValueError):
+            while (message := self._outbox.take()) is not None:
+                self._pipe.send(message)
+
+    def _hear(self) -> None:
+        try:
+            while True:
+                message = self._pipe.recv()
+                if isinstance(message, Ready):
+                    self._ready.set()
+                self._heard(message)
+        except (EOFError, OSError):
+            if not self._closing:
+                self._gone()
+
+    def _hear_stops(self) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                message: Stop = self._stops.recv()
+                # One that comes while another one is carried out waits for nothing, either.
+                threading.Thread(target=self._carry_out, args=(message,), name="console stop", daemon=True).start()
+
+    def _carry_out(self, message: Stop) -> None:
+        trouble = self._stop()
+        with self._stop_lock, suppress(OSError):
+            self._stops.send(Stopped(message.number, trouble))

@@ -1,0 +1,165 @@
+"""Looks at the cell twenty times a second and tells the server; nothing of the cell ever waits for it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from cell.console.desk import Desk
+from cell.console.messages import CloudPart, Happened, Picture, Show
+from cell.console.pictures import GrowingCloud, Pictures
+from cell.console.readings import Readings
+from cell.console.run_view import RunView
+from cell.console.trace import Trace, traced
+from cell.geometry.poses import from_ur
+from cell.job import load_job
+from cell.run.folder import list_runs
+from cell.run.reading import read_report
+from cell.run.run import Run
+from cell.steps.kinds import find_kind
+from drivers.errors import CellError
+
+if TYPE_CHECKING:
+    from cell.supervisor import Cell
+
+PERIOD_S = 0.05
+EVERY = 2
+"""Pictures and cloud at every so many-th look."""
+RECENT_RUNS = 20
+
+log = logging.getLogger(__name__)
+
+
+class Look:
+    """Of one cell and its desk; `tell` gives a message to the server."""
+
+    def __init__(self, cell: Cell, desk: Desk, tell: Callable[[object], None]) -> None:
+        self._cell, self._desk, self._tell = cell, desk, tell
+        simulated = () if cell.simulated is None else cell.simulated.simulated
+        # On the virtual clock the devices have no time of the wall, and are not to be looked at by another thread.
+        self._virtual = cell.simulated is not None and cell.simulated.facts.get("clock") == "virtual"
+        self._readings = Readings(cell.config, cell.devices, simulated)
+        self._view: RunView | None = None
+        self._named: tuple[Run[Any], str | None] | None = None
+        self._pictures = Pictures()
+        self._cloud = GrowingCloud()
+        self._last: dict[str, Any] | None = None
+        self._faults: list[dict[str, Any]] = []
+        self._count = 0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._perform, name="console look", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Look no more."""
+        self._over.set()
+        self._thread.join(2.0)
+
+    def began(self, run: Run[Any], job: str | None) -> None:
+        """This run was begun, of this job if it is one."""
+        self._named = run, job
+
+    def _perform(self) -> None:
+        due = time.monotonic()
+        while not self._over.wait(max(0.0, due - time.monotonic())):
+            due = max(due + PERIOD_S, time.monotonic())
+            try:
+                self._look()
+            # One look that fails is no reason to look no more.
+            except Exception:
+                log.exception("the console's look failed")
+                self._over.wait(1.0)
+
+    def _look(self) -> None:
+        self._count += 1
+        self._follow_run()
+        run = self._cell.current
+        if not self._virtual:
+            self._readings.look(idle=run is None)
+        view = self._view
+        told = None if view is None or view.over else view.as_dict()
+        self._tell(Show(json.dumps(self._state(view, told))))
+        if view is not None and self._count % EVERY == 0:
+            self._show(view.run)
+
+    def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, Any]:
+        readings, desk = self._readings, self._desk
+        faults = [*self._faults, *(view.faults if view is not None and told is not None else [])]
+        return {
+            "type": "state", "n": self._count, "t": round(time.time(), 3),
+            "cell_s": round(self._cell.devices.clock.now(), 3),
+            **readings.motion(), "run": told, "question": desk.questions.present(view if told is not None else None),
+            "last": self._last, "faults": faults[-8:],
+            "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
+            "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
+            "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed,
+            "dry_run": desk.rehearsals.present, "behind": 0,
+        }  # fmt: skip
+
+    def _follow_run(self) -> None:
+        run = self._cell.current
+        if run is not None and (self._view is None or self._view.run is not run):
+            self._end_view()
+            self._view = self._viewed(run)
+            self._cloud = GrowingCloud()
+        if self._view is None:
+            return
+        for event in self._view.news():
+            self._tell(Happened(json.dumps(event, default=str)))
+        if self._view.over:
+            self._end_view()
+
+    def _end_view(self) -> None:
+        if (view := self._view) is None:
+            return
+        self._last = view.ended or self._last
+        self._faults = [*self._faults, *view.faults][-8:]
+        self._view = None
+
+    def _viewed(self, run: Run[Any]) -> RunView:
+        named = self._named
+        job = named[1] if named is not None and named[0] is run else None
+        if run.kind == "job" and job is None:
+            job = self._desk.job
+        steps: tuple[str, ...] = ()
+        if run.kind == "job" and job is not None:
+            with suppress(CellError):
+                steps = find_kind(load_job(job)[0].job.kind).names
+        if not self._virtual:
+            trace = Trace(self._cell.devices, virtual=False)
+            threading.Thread(target=traced, args=(self._cell.devices, run, trace), name="trace", daemon=True).start()
+        return RunView(run, steps, job, self._expected(job) if steps else {})
+
+    def _expected(self, job: str | None) -> dict[str, float]:
+        """Wall seconds of each step in the newest run of this job that came to its end."""
+        for folder in reversed(list_runs(self._cell.runs_folder)[-RECENT_RUNS:]):
+            with suppress(CellError, OSError, KeyError, TypeError, ValueError):
+                report = read_report(folder)
+                if (
+                    report.get("job") == job
+                    and report["outcome"] in ("placed", "done")
+                    and report.get("clock") == "wall"
+                ):
+                    return {step["name"]: float(step["wall_s"]) for step in report["steps"]}
+        return {}
+
+    def _show(self, run: Run[Any]) -> None:
+        newest = self._pictures.newest(run)
+        if newest is not None:
+            self._tell(Picture(*newest))
+        arm = self._readings.arm
+        flange = None if arm is None else from_ur(arm.flange).homogeneous
+        rail = self._cell.devices.rail.motion if "rail" in self._cell.devices else None
+        part = self._cloud.increment(run, flange, rail)
+        if part is not None:
+            header, payload = part
+            folder = None if run.folder is None else run.folder.name
+            self._tell(CloudPart({**header, "run": folder}, payload))

@@ -1,0 +1,272 @@
+"""Manual mode: one recorded run of kind jog, in which steps and held buttons move one device at a time.
+
+It ends with a stop, with the hold of the cell, or when it is switched off; nothing else can be begun meanwhile.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import queue
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cell.console.holding import Press
+from cell.devices.gate import Gated
+from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, moved
+from cell.job import Job
+from cell.run.recorded_work import Hands
+from drivers.errors import Aborted, CellError, ConfigError, InterlockError, LimitError
+from drivers.interfaces import Attended, Motion
+
+if TYPE_CHECKING:
+    from cell.supervisor import Cell
+
+LOOK_S = 0.005
+HOLD_SPEED = 0.05
+"""m/s of the flange."""
+HOLD_TURN = 0.15
+"""rad/s of a joint."""
+TURN_ACCELERATION, LINE_ACCELERATION = 1.0, 0.4
+RAIL_BRAKING_S = 0.04
+"""A held rail goes as fast as it can brake within this time."""
+LINES_M = (0.2, 0.1, 0.05, 0.02, 0.01)
+TURNS_RAD = (0.6, 0.3, 0.1, 0.05)
+"""How far one press moves at most: the first of these ways that is clear from end to end."""
+
+log = logging.getLogger(__name__)
+
+Told = Callable[[Press, str, str], None]
+"""A press and what has become of it: moving, ended or refused, and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    wish: Jog
+    done: threading.Event
+    answer: list[dict[str, str] | BaseException]
+
+
+class Manual:
+    """Manual mode of one cell, with the part of `job` out of the way. `tell` hears what becomes of presses."""
+
+    def __init__(self, cell: Cell, job: Job, tell: Told) -> None:
+        self.speed = 1.0
+        self._cell = cell
+        self._job = job
+        self._tell = tell
+        self._wanted: queue.SimpleQueue[_Step | Press] = queue.SimpleQueue()
+        self._off = threading.Event()
+        self._on = threading.Event()
+        self._busy = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._failure: BaseException | None = None
+
+    @property
+    def on(self) -> bool:
+        """Whether the cell is in manual mode."""
+        return self._thread is not None and self._thread.is_alive() and self._on.is_set()
+
+    def begin(self, by: str, timeout: float = 10.0) -> str:
+        """Switch it on; raises what keeps it from being on, such as a run that is going on."""
+        with self._busy:
+            if self.on:
+                return "manual mode is on"
+            self._off.clear()
+            self._on.clear()
+            self._failure = None
+            self._wanted = queue.SimpleQueue()
+            stops = self._cell.stops
+            self._thread = threading.Thread(
+                target=self._perform, args=(by, stops), name="manual mode", daemon=True
+            )  # fmt: skip
+            self._thread.start()
+            while not self._on.wait(0.02) and self._thread.is_alive() and timeout > 0:
+                timeout -= 0.02
+            if self._failure is not None:
+                raise self._failure
+            if not self._on.is_set():
+                self._off.set()
+                raise InterlockError("cell", "manual mode could not be begun; see the log")
+            return "manual mode is on"
+
+    def end(self) -> str:
+        """Switch it off: what moves is stopped."""
+        self._off.set()
+        return "manual mode is off"
+
+    def join(self, timeout: float) -> None:
+        """Wait until it is off."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+
+    def step(self, wish: Jog) -> dict[str, str]:
+        """One step, to its end; where the device is then, in words. Raises what refuses it."""
+        _require_small(wish)
+        self._require_on()
+        step = _Step(wish, threading.Event(), [])
+        self._wanted.put(step)
+        while not step.done.wait(0.05):
+            if not self.on:
+                raise Aborted("manual mode has ended; the step was not done")
+        (answer,) = step.answer
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def press(self, press: Press) -> None:
+        """A button is held: move until it is not."""
+        try:
+            self._require_on()
+        except InterlockError as error:
+            press.end(str(error))
+            self._tell(press, "refused", str(error))
+            return
+        self._wanted.put(press)
+
+    # --- the run's own thread ---
+
+    def _perform(self, by: str, stops: int) -> None:
+        try:
+            self._cell.perform("jog", self._work, info={"moved": "manual mode", "by": by}, stops=stops)
+        except Aborted as error:
+            self._failure = error
+            log.info("manual mode: %s", error)
+        except CellError as error:
+            self._failure = error
+            log.warning("manual mode: %s", error)
+        finally:
+            self._on.clear()
+
+    def _work(self, hands: Hands) -> None:
+        self._on.set()
+        while not self._off.is_set():
+            hands.check()
+            with suppress(queue.Empty):
+                wanted = self._wanted.get(timeout=LOOK_S)
+                if isinstance(wanted, Press):
+                    self._hold(wanted, hands)
+                else:
+                    self._do_step(wanted, hands)
+
+    def _do_step(self, step: _Step, hands: Hands) -> None:
+        wish = step.wish
+        try:
+            answer: dict[str, str] | BaseException = moved(self._cell, wish, self._job, hands)
+            log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, answer)
+        except (Aborted, CellError) as error:
+            answer = error
+            log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, error)
+        finally:
+            hands_ended = None
+            try:
+                hands.check()
+            except BaseException as ended:
+                hands_ended = ended
+        step.answer.append(answer)
+        step.done.set()
+        if hands_ended is not None:
+            raise hands_ended
+
+    def _hold(self, press: Press, hands: Hands) -> None:
+        if press.over() is not None:
+            self._tell(press, "ended", str(press.ended))
+            return
+        try:
+            why = self._move(press, hands)
+        except CellError as error:
+            press.end(str(error))
+            hands.check()
+            self._tell(press, "refused", str(error))
+            log.info("hold %s %s: %s", press.device, press.axis, error)
+            return
+        press.end(why)
+        self._tell(press, "ended", why)
+        log.info("hold %s %s%s: %s", press.device, press.axis, "+" if press.sign > 0 else "-", why)
+
+    def _move(self, press: Press, hands: Hands) -> str:
+        """Move until the press is over or the way ends; why it ended. The device stands then."""
+        device: Any = getattr(self._cell.devices, press.device)
+        bare = device.bare if isinstance(device, Gated) else device
+        if not isinstance(bare, Attended):
+            raise InterlockError(press.device, "nothing beside this program would stop it; move it by steps")
+        with bare.attended() as beat:
+            press.beat = beat
+            motion = self._begin(press, device)
+            try:
+                self._tell(press, "moving", "")
+                while (why := press.over()) is None and not motion.done and not self._off.is_set():
+                    hands.check()
+                    press.wait(LOOK_S)
+            finally:
+                press.beat = None
+                if not motion.done:
+                    device.stop()
+        if why is None and motion.done:
+            motion.wait(1.0)
+            return "the way of one press ends here; press again"
+        return why or "manual mode was switched off"
+
+    def _begin(self, press: Press, device: Any) -> Motion:
+        if press.device == "rail":
+            return self._begin_rail(press.sign, device)
+        if press.device == "arm":
+            return self._begin_arm(press, device)
+        raise InterlockError(press.device, "is moved by steps only")
+
+    def _begin_rail(self, sign: int, rail: Any) -> Motion:
+        if not rail.state().homed:
+            raise InterlockError("rail", "is not homed, so its limits are not known; home it first")
+        config = self._cell.config.rail
+        speed = self.speed * min(0.25 * config.max_speed, RAIL_BRAKING_S * config.acceleration)
+        motion: Motion = rail.move_to(rail.travel[1] if sign > 0 else rail.travel[0], speed)
+        return motion
+
+    def _begin_arm(self, press: Press, arm: Any) -> Motion:
+        if "vehicle" in self._cell.devices and self._cell.devices.vehicle.state().braked is not True:
+            self._cell.devices.vehicle.recover()
+        turning = press.axis.startswith("j")
+        if press.axis not in ("x", "y", "z", "j1", "j2", "j3", "j4", "j5", "j6"):
+            raise InterlockError("arm", f"axis {press.axis!r} is moved by steps only")
+        refused: CellError | None = None
+        for way in TURNS_RAD if turning else LINES_M:
+            if press.over() is not None:
+                break
+            try:
+                motion: Motion = self._turn(press, arm, way) if turning else self._line(press, arm, way)
+                return motion
+            except (InterlockError, LimitError, ConfigError) as error:
+                refused = error
+        raise refused or InterlockError("arm", str(press.ended))
+
+    def _turn(self, press: Press, arm: Any, way: float) -> Motion:
+        goal = arm.state().joints.copy()
+        goal[int(press.axis[1]) - 1] += press.sign * way
+        motion: Motion = arm.move_joints(goal, self.speed * HOLD_TURN, TURN_ACCELERATION)
+        return motion
+
+    def _line(self, press: Press, arm: Any, way: float) -> Motion:
+        goal = arm.state().flange.copy()
+        goal["xyz".index(press.axis)] += press.sign * way
+        motion: Motion = arm.move_linear(np.asarray(goal), self.speed * HOLD_SPEED, LINE_ACCELERATION)
+        return motion
+
+    def _require_on(self) -> None:
+        if not self.on:
+            raise InterlockError("cell", "is not in manual mode, in which alone something is jogged; switch it on")
+
+
+def _require_small(wish: Jog) -> None:
+    turning = wish.axis.startswith(("r", "j")) or wish.axis == "yaw"
+    most, unit = (math.radians(MAX_ANGLE_DEG), "rad") if turning else (1e-3 * MAX_LENGTH_MM, "m")
+    known = {"rail": ("",), "vehicle": ("x", "yaw"), "arm": ("x", "y", "z", "rx", "ry", "rz")}
+    axes = (*known.get(wish.device, ()), *(f"j{k}" for k in range(1, 7) if wish.device == "arm"))
+    if wish.axis not in axes:
+        raise ConfigError(f"there is no {wish.device} {wish.axis} to jog")
+    if not abs(wish.amount) <= most:
+        raise LimitError(wish.device, f"a step of {wish.amount:g} {unit} is too large, allowed up to {most:g} {unit}")

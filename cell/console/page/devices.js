@@ -1,0 +1,55 @@
+// Each device: its state, who holds it, how its link does, its last error with what to do; faults above all.
+
+import { byId, el, remake, say, show, words } from './dom.js';
+
+const OLD_S = 0.5;
+
+export function devices(state) {
+  const entries = Object.entries(state.devices);
+  remake(byId('device-list'), entries.map(([name, device]) => [name, device.simulated, device.fault, device.errors]), () => entries.map(row));
+  entries.forEach(([name, device], k) => refresh(byId('device-list').children[k], name, device));
+  const fault = state.faults?.at(-1) ?? null;
+  show(byId('fault'), fault !== null && !state.question);
+  if (fault) say(byId('fault'), `${words(fault.device)}: ${fault.text}${fault.remedy ? ` → ${fault.remedy}` : ''}`);
+  show(byId('stopped'), Boolean(state.safety?.stopped));
+}
+
+function row([name, device]) {
+  const errors = Object.entries(device.errors ?? {}).filter(([, count]) => count);
+  const fault = device.fault && (typeof device.fault === 'string' ? device.fault : [device.fault.text, device.fault.remedy].filter(Boolean).join(' → '));
+  return el('li', {},
+    el('span', { className: 'lamp', 'aria-hidden': 'true' }),
+    el('strong', { textContent: words(name) }),
+    el('span', { className: `kind ${device.simulated ? 'sim' : 'real'}`, textContent: device.simulated ? 'sim' : 'REAL' }),
+    el('span', { className: 'what' }),
+    el('small', { className: 'link' }),
+    ...(errors.length ? [el('small', { className: 'errors', textContent: errors.map(([what, count]) => `${count} ${words(what)}`).join(', ') })] : []),
+    ...(fault ? [el('p', { className: 'fault', textContent: fault })] : []));
+}
+
+function refresh(item, name, device) {
+  item.classList.toggle('bad', !device.ok);
+  item.classList.toggle('old', (device.age_s ?? 0) > OLD_S);
+  say(item.querySelector('.what'), device.state ?? '');
+  const held = device.held_by ? `held by ${words(device.held_by)}` : '';
+  const trip = device.rtt_ms === null || device.rtt_ms === undefined ? '' : `${device.rtt_ms.toFixed(1)} ms`;
+  const age = (device.age_s ?? 0) > OLD_S ? `${device.age_s.toFixed(1)} s old` : '';
+  say(item.querySelector('.link'), [held, trip, age].filter(Boolean).join(' · '));
+}
+
+// Simulated or real, and which: always in sight.
+export function world(cell, state) {
+  const pill = byId('world');
+  const simulated = state?.simulated ?? cell.simulated;
+  if (simulated === true) {
+    say(pill, `SIMULATED · seed ${cell.seed} · ${cell.level}${cell.speed !== 1 ? ` · ${+cell.speed.toFixed(1)}× time` : ''}`);
+    pill.className = 'pill sim';
+  } else if (simulated === false) {
+    say(pill, 'REAL DEVICES');
+    pill.className = 'pill real';
+  } else {
+    const real = cell.devices.map((device) => device.name).filter((name) => !simulated.includes(name));
+    say(pill, `REAL: ${real.map(words).join(', ')} · simulated: ${simulated.map(words).join(', ')}`);
+    pill.className = 'pill real';
+  }
+}

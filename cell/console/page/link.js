@@ -1,0 +1,111 @@
+// The link to the server: one WebSocket that shows the cell, POST for commands. A lost link is told at once.
+
+const STALE_MS = 500;
+const AGAIN_MS = 700;
+const ANSWER_MS = 1500;
+
+export class Link extends EventTarget {
+  constructor() {
+    super();
+    this.heard = -Infinity;
+    this.hello = null;
+    this.state = null;
+    this.stale = null;
+    this.refused = '';
+    this.connect();
+    setInterval(() => this.look(), 100);
+  }
+
+  tell(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, { detail }));
+  }
+
+  on(type, heard) {
+    this.addEventListener(type, (event) => heard(event.detail));
+  }
+
+  connect() {
+    const scheme = location.protocol === 'https:' ? 'wss' : 'ws';
+    const socket = new WebSocket(`${scheme}://${location.host}/live`);
+    this.socket = socket;
+    socket.binaryType = 'arraybuffer';
+    socket.onmessage = ({ data }) => (typeof data === 'string' ? this.text(JSON.parse(data)) : this.binary(data));
+    socket.onclose = () => {
+      if (this.hello === null) this.why();
+      this.hello = null;
+      this.tell('closed');
+      this.look();
+      setTimeout(() => this.connect(), AGAIN_MS);
+    };
+  }
+
+  // Why there is no link: a server that knows this browser no more says so in words.
+  async why() {
+    const answer = await fetch('/api/cell').catch(() => null);
+    this.refused = answer?.status === 401 ? await answer.text() : '';
+  }
+
+  text(message) {
+    if (message.type === 'state') {
+      this.heard = performance.now();
+      this.state = message;
+      this.look();
+    } else if (message.type === 'hello') {
+      this.hello = message;
+    }
+    this.tell(message.type, message);
+  }
+
+  binary(data) {
+    const length = new DataView(data).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+    this.tell(header.type, { header, payload: data.slice(4 + length) });
+  }
+
+  // How old what is shown is, ms.
+  get age() {
+    return performance.now() - this.heard;
+  }
+
+  look() {
+    const stale = this.age > STALE_MS;
+    if (stale !== this.stale || stale) this.tell('freshness', { stale, age: this.age });
+    this.stale = stale;
+  }
+
+  // Say something on the socket; false when there is none. Nothing is kept for later.
+  send(message) {
+    if (this.socket.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
+  }
+
+  // A command; gives the server's answer, {ok, text, …}, and never throws.
+  async do(name, values = {}) {
+    const key = name === 'stop' ? {} : { key: this.hello?.key ?? '' };
+    try {
+      const answer = await fetch('/api/do', {
+        method: 'POST',
+        headers: { 'Content-Type': 'application/json' },
+        body: JSON.stringify({ do: name, ...key, ...values }),
+        keepalive: name === 'stop',
+        signal: name === 'stop' ? AbortSignal.timeout(ANSWER_MS) : undefined,
+      });
+      return { ...(await answer.json()), ok: answer.ok };
+    } catch (error) {
+      return { ok: false, error: 'no answer', text: `the server did not answer (${error.message})` };
+    }
+  }
+
+  // Both ways at once, never queued.
+  stop() {
+    this.send({ type: 'stop' });
+    return this.do('stop');
+  }
+
+  async get(path) {
+    const answer = await fetch(path);
+    if (!answer.ok) throw new Error(`${path}: ${answer.status} ${(await answer.text()).slice(0, 300)}`);
+    return answer;
+  }
+}

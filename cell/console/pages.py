@@ -1,0 +1,149 @@
+"""The pages that are open: what each is sent, what each says, and what of it goes on to the cell."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import secrets
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from cell.console.access import Bucket
+from cell.console.mailbox import Mailbox
+from cell.console.messages import Beat, Joined, Left
+
+VERSION = 1
+BEAT_MS = 80
+MOST_PAGES = 16
+MOST_BYTES = 1024
+"""Of a message from a page."""
+PATIENCE_S = 10.0
+"""Wall seconds after which a page that takes nothing is given up."""
+MOST_CLOUD_BYTES = 8_000_000
+"""Of the cloud so far, which a page that comes later is given."""
+MALFORMED, TOO_MANY, FULL = 1007, 1008, 1013
+"""Codes with which a page's link is closed."""
+
+
+class Page:
+    """One open page."""
+
+    def __init__(self, number: int) -> None:
+        self.id = f"c{number}"
+        self.key = secrets.token_urlsafe(24)
+        self.mailbox = Mailbox()
+        self.rate = Bucket(50.0, 100.0)
+
+
+class Pages:
+    """All of them. `tell` sends a message on to the cell, `stop` stops it. In the event loop's thread."""
+
+    def __init__(self, tell: Callable[[object], None], stop: Callable[[], object]) -> None:
+        self._tell = tell
+        self._stop = stop
+        self._numbers = itertools.count(1)
+        self._pages: dict[str, Page] = {}
+        self._cloud: list[bytes] = []
+
+    def by_key(self, key: object) -> Page | None:
+        """The page that has this key."""
+        if not isinstance(key, str) or not key.isascii():
+            return None
+        return next((page for page in self._pages.values() if secrets.compare_digest(page.key, key)), None)
+
+    @property
+    def mailboxes(self) -> list[Mailbox]:
+        """Of all pages."""
+        return [page.mailbox for page in self._pages.values()]
+
+    def say(self, client: str, words: Mapping[str, Any]) -> None:
+        """Something to one page, if it is still there."""
+        if (page := self._pages.get(client)) is not None:
+            page.mailbox.say(json.dumps(words))
+
+    def cloud(self, header: Mapping[str, Any], packed: bytes) -> None:
+        """An increment of the cloud, to all, and kept for those that come later."""
+        if header.get("reset"):
+            self._cloud.clear()
+        if sum(map(len, self._cloud)) + len(packed) <= MOST_CLOUD_BYTES:
+            self._cloud.append(packed)
+        for mailbox in self.mailboxes:
+            if header.get("reset"):
+                mailbox.clear_cloud()
+            mailbox.cloud(packed)
+
+    async def serve(self, socket: WebSocket) -> None:
+        """One page's live link, until it is closed."""
+        await socket.accept()
+        if len(self._pages) >= MOST_PAGES:
+            await socket.close(FULL, "too many pages are open; close one")
+            return
+        page = Page(next(self._numbers))
+        self._pages[page.id] = page
+        self._tell(Joined(page.id))
+        page.mailbox.say(
+            json.dumps({"type": "hello", "id": page.id, "key": page.key, "version": VERSION, "beat_ms": BEAT_MS})
+        )
+        for part in self._cloud:
+            page.mailbox.cloud(part)
+        sending = asyncio.create_task(self._send(page, socket))
+        try:
+            await self._hear(page, socket)
+        except (WebSocketDisconnect, RuntimeError):
+            # RuntimeError: closed by the sender meanwhile.
+            pass
+        finally:
+            self._pages.pop(page.id, None)
+            self._tell(Left(page.id))
+            sending.cancel()
+
+    async def _send(self, page: Page, socket: WebSocket) -> None:
+        try:
+            while True:
+                item = await page.mailbox.take()
+                sent = socket.send_text(item) if isinstance(item, str) else socket.send_bytes(item)
+                await asyncio.wait_for(sent, PATIENCE_S)
+        except (TimeoutError, RuntimeError, WebSocketDisconnect):
+            # One that takes nothing any more: its button is not held, either.
+            self._tell(Left(page.id))
+            self._pages.pop(page.id, None)
+            await socket.close(TOO_MANY)
+
+    async def _hear(self, page: Page, socket: WebSocket) -> None:
+        while True:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            words = _words(message.get("text"))
+            if words is None:
+                await socket.close(MALFORMED, "not understood")
+                return
+            # Ahead of the rate: who has said too much may still say stop.
+            if words["type"] == "stop":
+                self._stop()
+                continue
+            if not page.rate.take():
+                await socket.close(TOO_MANY, "too many messages")
+                return
+            match words["type"]:
+                case "jog":
+                    self._tell(Beat(page.id, words))
+                case "jog_end":
+                    self._tell(Beat(page.id, words, end=True))
+                case _:
+                    await socket.close(MALFORMED, "not understood")
+                    return
+
+
+def _words(text: object) -> dict[str, Any] | None:
+    """A message of a page; None when it is none."""
+    if not isinstance(text, str) or len(text.encode()) > MOST_BYTES:
+        return None
+    try:
+        words = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return words if isinstance(words, dict) and isinstance(words.get("type"), str) else None

@@ -1,0 +1,153 @@
+"""What the devices tell of themselves, for the page: only what is there already, so that no line is kept busy.
+
+The rail is asked while nothing goes on; in a run it is where its own motion has read it. The simulated devices on the
+virtual clock have no time of the wall and are not read here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cell.config import DEVICES, CellConfig
+from cell.devices.devices import Devices
+from drivers.errors import CellError, DeviceFault
+from drivers.interfaces import ArmSafety, ArmState, RailState, VehicleState
+
+OLD_S = 1.0
+"""A reading that is older is not shown."""
+REST_S = 1.0
+"""Wall seconds between two questions to a rail that rests."""
+
+Told = TypeVar("Told")
+
+
+class Readings:
+    """The newest of each device; `look` takes them, called by one thread."""
+
+    def __init__(self, config: CellConfig, devices: Devices, simulated: tuple[str, ...]) -> None:
+        self.arm: ArmState | None = None
+        self.vehicle: VehicleState | None = None
+        self.rail: float | None = None
+        self.laser: bool | None = None
+        self._config = config
+        self._devices = devices
+        self._simulated = simulated
+        self._rail_state: RailState | None = None
+        self._rail_motion: object = None
+        self._asked = 0.0
+        self._faults: dict[str, dict[str, str] | None] = {}
+
+    def look(self, idle: bool) -> None:
+        """Take the newest readings; with `idle`, when nothing goes on, the rail is asked as well."""
+        devices, rate = self._devices, self._devices.clock.rate
+        self.arm = self._of("arm", lambda: devices.arm.state(OLD_S * rate))
+        self.vehicle = self._of("vehicle", lambda: devices.vehicle.state(OLD_S * rate))
+        self.laser = self._of("laser", lambda: devices.laser.is_on)
+        self._look_at_rail(idle)
+
+    def _look_at_rail(self, idle: bool) -> None:
+        if "rail" not in self._devices:
+            return
+        rail = self._devices.rail
+        motion = rail.motion
+        readings: Sequence[Any] = getattr(motion, "readings", ())
+        if motion is not None and len(readings) and (not motion.done or motion is not self._rail_motion):
+            self.rail = float(readings[-1][1])
+        if idle and time.monotonic() - self._asked > REST_S and (motion is None or motion.done):
+            self._asked = time.monotonic()
+            self._rail_state = self._of("rail", rail.state)
+            if self._rail_state is not None:
+                self.rail = self._rail_state.position
+                self._rail_motion = motion
+
+    def _of(self, name: str, read: Callable[[], Told]) -> Told | None:
+        if name not in self._devices:
+            return None
+        try:
+            told = read()
+        except CellError as error:
+            hint = error.hint if isinstance(error, DeviceFault) else ""
+            code = error.code if isinstance(error, DeviceFault) else type(error).__name__
+            self._faults[name] = {"code": code, "text": str(error), "remedy": hint}
+            return None
+        self._faults[name] = None
+        return told
+
+    def motion(self) -> dict[str, Any]:
+        """Joints, flange, rail, vehicle, laser, for the state."""
+        vehicle = self.vehicle
+        return {
+            "joints": None if self.arm is None else [round(float(q), 5) for q in self.arm.joints],
+            "flange": None if self.arm is None else [round(float(v), 6) for v in self.arm.flange],
+            "rail": None if self.rail is None else round(self.rail, 6),
+            "vehicle": None if vehicle is None else _vehicle(vehicle),
+            "laser": self.laser,
+        }
+
+    def safety(self) -> dict[str, Any]:
+        """The arm's safety state, the vehicle's emergency stop, and whether a stop holds direct commands."""
+        return {
+            "arm": None if self.arm is None else self.arm.safety.value,
+            "vehicle_stop": None if self.vehicle is None else self.vehicle.emergency_stop,
+            "stopped": not self._devices.gate.is_open,
+        }
+
+    def devices(self, held_by: str) -> dict[str, Any]:
+        """Each device's row: state in words, whether it is well, link, last error."""
+        rows: dict[str, Any] = {}
+        for device in self._devices:
+            name = device.name
+            fault = self._faults.get(name) or self._ailing(name)
+            trips = device.statistics.round_trips_s[-50:]
+            rows[name] = {
+                "state": self._words(name), "ok": fault is None, "simulated": name in self._simulated,
+                "held_by": held_by, "rtt_ms": round(1e3 * float(np.median(trips)), 2) if trips else None,
+                "errors": dict(device.statistics.errors), "fault": fault,
+            }  # fmt: skip
+        return {name: rows[name] for name in DEVICES if name in rows}
+
+    def _ailing(self, name: str) -> dict[str, str] | None:
+        if name == "arm" and self.arm is not None and self.arm.safety is not ArmSafety.NORMAL:
+            state = self.arm.safety
+            remedy = "Look for the reason and clear the way."
+            return {"code": f"arm.{state.name.lower()}", "text": f"the arm is in {state.value}", "remedy": remedy}
+        if name == "vehicle" and self.vehicle is not None and self.vehicle.trouble:
+            told = "; ".join(self.vehicle.trouble)
+            return {"code": "vehicle.trouble", "text": told, "remedy": "Look at the vehicle, then recover it."}
+        return None
+
+    def _words(self, name: str) -> str:
+        match name:
+            case "arm" if self.arm is not None:
+                return "moves" if self.arm.moving else "stands" if self.arm.controlled else "stands, no control program"
+            case "vehicle" if self.vehicle is not None:
+                brake = {None: "brake unknown", True: "braked", False: "brake open"}[self.vehicle.braked]
+                return brake if abs(self.vehicle.speed) + abs(self.vehicle.yaw_rate) < 1e-3 else "drives"
+            case "rail":
+                motion = self._devices.rail.motion
+                if motion is not None and not motion.done:
+                    return "moves"
+                if self._rail_state is None:
+                    return "stands"
+                return "homed" if self._rail_state.homed else "not homed"
+            case "laser" if self.laser is not None:
+                return "on" if self.laser else "off"
+            case "claw":
+                held = self._of("claw", lambda: self._devices.claw.holding)
+                return "" if held is None else "holds a part" if held else "empty"
+        return ""
+
+
+def _vehicle(state: VehicleState) -> dict[str, Any]:
+    return {
+        "x": round(state.x, 5),
+        "y": round(state.y, 5),
+        "yaw": round(state.yaw, 6),
+        "speed": round(state.speed, 4),
+        "yaw_rate": round(state.yaw_rate, 5),
+        "braked": state.braked,
+    }

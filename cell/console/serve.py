@@ -1,0 +1,250 @@
+"""The server's own process: what browsers talk to, beside the program that has the cell. Run as a module by it.
+
+It ends when that program does. It has no device and no way to one but the pipes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import os
+import resource
+import signal
+import socket
+import struct
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from cell.console.access import Access
+from cell.console.application import Application
+from cell.console.archive import Archive
+from cell.console.messages import (
+    Answer,
+    AskCell,
+    CloudPart,
+    Do,
+    Happened,
+    Picture,
+    Ready,
+    Say,
+    Setup,
+    Show,
+    Stop,
+    Stopped,
+)
+from cell.console.pages import MOST_BYTES, Pages
+
+JPEG = (cv2.IMWRITE_JPEG_QUALITY, 75)
+ANSWER_S, STOP_S = 60.0, 15.0
+IDLE_S = 4.0
+"""Wall seconds in which a connection has to say what it wants."""
+PING_S = 5.0
+MOST_FILES = 2048
+WAITING = 256
+BUSY, SILENT = 503, 504
+
+
+class Patient(H11Protocol):
+    """Closes a connection that says nothing, so that those who open many and wait keep nobody out."""
+
+    def connection_made(self, transport: Any) -> None:
+        """See `asyncio.Protocol`."""
+        super().connection_made(transport)
+        self.loop.call_later(IDLE_S, self._look)
+
+    def _look(self) -> None:
+        # Set with the first request; to its type it is there from the beginning.
+        asked: object = self.cycle
+        # A live link has another protocol by now, which looks after itself.
+        if asked is None and self.transport.get_protocol() is self and not self.transport.is_closing():
+            self.transport.close()
+
+
+class Server:
+    """The two pipes, and the event loop between them and the pages."""
+
+    def __init__(self, pipe: Connection, stops: Connection, setup: Setup) -> None:
+        self._pipe, self._stops, self._setup = pipe, stops, setup
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, asyncio.Future[Any]] = {}
+        self._sending = threading.Lock()
+        self.access = Access(
+            setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting
+        )  # fmt: skip
+        self.pages = Pages(self._tell, self._stop_unasked)
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    async def run(self) -> None:
+        """Until the program at the other end is gone."""
+        self._loop = asyncio.get_running_loop()
+        application = Application(
+            self.access,
+            self.pages,
+            Archive(Path(self._setup.runs)),
+            self._setup.cell,
+            self._do,
+            self._stop,
+            self._of_job,
+        )
+        config = uvicorn.Config(
+            _entering(application.asgi(), self._renew),
+            http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",
+            log_config=None, access_log=False, server_header=False, date_header=False, proxy_headers=False,
+            ws_max_size=MOST_BYTES, ws_max_queue=8, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
+            ws_per_message_deflate=False, h11_max_incomplete_event_size=16384,
+            timeout_keep_alive=10, timeout_graceful_shutdown=1,
+            ssl_certfile=self._setup.cert, ssl_keyfile=self._setup.key, backlog=WAITING,
+        )  # fmt: skip
+        server = uvicorn.Server(config)
+        for hear in (self._hear, self._hear_stops):
+            threading.Thread(target=hear, name=hear.__name__, daemon=True).start()
+        # Who comes as soon as the link is known waits a moment, and is not turned away.
+        listening = socket.socket(fileno=self._setup.fd)
+        listening.listen(WAITING)
+        self._renew()
+        await server.serve(sockets=[listening])
+
+    def _renew(self) -> None:
+        """A new link for the next page."""
+        self._tell(Ready(None if self._setup.lasting is not None else self.access.link()))
+
+    # --- to the cell ---
+
+    def _tell(self, message: object) -> None:
+        with self._sending:
+            self._pipe.send(message)
+
+    async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, Any]]:
+        number = next(self._numbers)
+        answer: asyncio.Future[Answer] = self._loop.create_future()
+        self._waiting[number] = answer
+        self._tell(make(number))
+        try:
+            told = await asyncio.wait_for(answer, ANSWER_S)
+        except TimeoutError:
+            return SILENT, {"ok": False, "error": "DeadlineError", "text": f"no answer within {ANSWER_S:.0f} s"}
+        finally:
+            self._waiting.pop(number, None)
+        return told.status, told.words
+
+    async def _do(self, client: str, words: Mapping[str, Any]) -> tuple[int, Mapping[str, Any]]:
+        return await self._ask(lambda number: Do(number, client, words))
+
+    async def _of_job(self, job: str) -> tuple[int, Mapping[str, Any]]:
+        return await self._ask(lambda number: AskCell(number, job))
+
+    async def _stop(self) -> str | None:
+        """On its own pipe, whatever else is under way; what could not be confirmed."""
+        number = -next(self._numbers)
+        answer: asyncio.Future[Stopped] = self._loop.create_future()
+        self._waiting[number] = answer
+        self._stops.send(Stop(number))
+        try:
+            return (await asyncio.wait_for(answer, STOP_S)).trouble
+        except TimeoutError:
+            return f"the stop was not confirmed within {STOP_S:.0f} s: use the emergency stop"
+        finally:
+            self._waiting.pop(number, None)
+
+    def _stop_unasked(self) -> None:
+        task = self._loop.create_task(self._stop())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # --- from the cell ---
+
+    def _hear_stops(self) -> None:
+        _until_the_end(self._stops, lambda message: self._loop.call_soon_threadsafe(self._answered, message))
+
+    def _hear(self) -> None:
+        _until_the_end(self._pipe, self._take)
+
+    def _take(self, message: object) -> None:
+        """In the pipe's thread: compressing is done here, beside the event loop."""
+        match message:
+            case Picture(header, image):
+                done, jpeg = cv2.imencode(".jpg", image, JPEG)
+                if done:
+                    message = header["camera"], packed(header, np.asarray(jpeg).tobytes())
+            case CloudPart(header, payload):
+                message = header, packed(header, payload)
+        self._loop.call_soon_threadsafe(self._pass_on, message)
+
+    def _pass_on(self, message: object) -> None:
+        match message:
+            case Show(state):
+                for mailbox in self.pages.mailboxes:
+                    mailbox.show("state", state)
+            case Happened(event):
+                for mailbox in self.pages.mailboxes:
+                    mailbox.event(event)
+            case Say(client, words):
+                self.pages.say(client, words)
+            case Answer():
+                self._answered(message)
+            case (str() as camera, bytes() as picture):
+                for mailbox in self.pages.mailboxes:
+                    mailbox.show(camera, picture)
+            case (dict() as header, bytes() as part):
+                self.pages.cloud(header, part)
+
+    def _answered(self, message: Any) -> None:
+        future = self._waiting.get(message.number)
+        if future is not None and not future.done():
+            future.set_result(message)
+
+
+def packed(header: Mapping[str, Any], payload: bytes) -> bytes:
+    """A binary message: length of the header, the header, the payload (docs/console.md)."""
+    words = json.dumps(header).encode()
+    return struct.pack("<I", len(words)) + words + payload
+
+
+def _entering(app: Any, renew: Callable[[], None]) -> Any:
+    """Asks for a new link whenever one was used."""
+
+    async def entered(scope: Any, receive: Any, send: Any) -> None:
+        async def sent(message: Any) -> None:
+            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 303:
+                renew()
+            await send(message)
+
+        await app(scope, receive, sent if scope["type"] == "http" else send)
+
+    return entered
+
+
+def _until_the_end(pipe: Connection, take: Callable[[Any], object]) -> None:
+    try:
+        while True:
+            take(pipe.recv())
+    except (EOFError, OSError, RuntimeError):
+        # The program is gone, and the cell with it.
+        os._exit(0)
+
+
+def main(pipe: int, stops: int) -> None:
+    """Serve on two inherited pipes."""
+    for number in (signal.SIGINT, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(MOST_FILES, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
+    cv2.setNumThreads(1)
+    ends = Connection(pipe), Connection(stops)
+    setup: Setup = ends[0].recv()
+    asyncio.run(Server(*ends, setup).run())
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

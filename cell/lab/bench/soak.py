@@ -1,0 +1,129 @@
+"""Jobs one after the other over the wires at the wall's speed: does anything grow that a month would not bear?
+
+Counted after each job, for this process and each that it has started: memory, threads, open handles. Growth is the
+median slope between all pairs of jobs after the first ones, so that one odd job does not make it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.supervisor import Cell
+from drivers.errors import CalibrationStale
+
+WARM_UP = 2
+"""Jobs that are not counted: caches fill, compiled code is loaded."""
+LEAST = 3
+"""Jobs after those that a verdict needs."""
+MOST_GROWTH = {"memory_mb": 0.5, "threads": 0.1, "handles": 0.1}
+"""What each process may grow by, a job. Half a megabyte is 1 GB in 2000 jobs."""
+
+
+def soak(
+    minutes: float, seed: int, job: str, progress: Callable[[float, str], None], speed: float = 1.0
+) -> dict[str, Any]:
+    """Repeat the job for `minutes` on the wall, at least once; what was counted, the growth and a verdict."""
+    until, begun = time.monotonic() + 60.0 * minutes, time.monotonic()
+    rows: list[dict[str, Any]] = []
+    with Cell.open(sim="all", seed=seed, speed=speed, job=job) as cell:
+        try:
+            cell.calibration()
+        except CalibrationStale:
+            progress(0.0, "calibration")
+            cell.calibrate(job=job)
+        while not rows or time.monotonic() < until:
+            outcome = cell.run(job, at_start=True)
+            rows.append({
+                "job": len(rows) + 1, "outcome": outcome.outcome, "reason": outcome.reason,
+                "minutes": round((time.monotonic() - begun) / 60.0, 2), "processes": counted(os.getpid()),
+            })  # fmt: skip
+            if outcome.outcome == "aborted":
+                # Somebody wants the end.
+                break
+            progress(min(1.0, (time.monotonic() - begun) / (60.0 * minutes)), f"job {len(rows)}: {outcome.outcome}")
+    growth = growth_of(rows)
+    return {"speed": speed, "jobs": rows, "growth_a_job": growth, "limits": MOST_GROWTH, "verdict": verdict(growth)}
+
+
+def counted(owner: int) -> dict[str, dict[str, float]]:
+    """Memory (resident, MB), threads and open handles of a process and of all that it has started, by what they are."""
+    found: dict[str, dict[str, float]] = {}
+    for process in [owner, *_descendants(owner)]:
+        folder = Path(f"/proc/{process}")
+        try:
+            status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
+            name = "this program" if process == owner else _name(folder)
+            handles = len(list((folder / "fd").iterdir()))
+            row = {
+                "memory_mb": int(status["VmRSS"].split()[0]) / 1024.0, "threads": float(status["Threads"]),
+                "handles": float(handles),
+            }  # fmt: skip
+        except (OSError, KeyError):
+            # It has just ended.
+            continue
+        for key, value in row.items():
+            found.setdefault(name, {}).setdefault(key, 0.0)
+            found[name][key] += value
+    return found
+
+
+def _name(folder: Path) -> str:
+    """What a process is: the module that it runs."""
+    words = (folder / "cmdline").read_bytes().decode("utf-8", "replace").split("\0")
+    return (
+        words[words.index("-m") + 1]
+        if "-m" in words
+        else Path(next((w for w in words if w.endswith(".py")), words[0])).name
+    )
+
+
+def _descendants(owner: int) -> list[int]:
+    parents: dict[int, int] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+        except (OSError, ValueError, IndexError):
+            continue
+    found, grown = {owner}, True
+    while grown:
+        more = {process for process, parent in parents.items() if parent in found} - found
+        grown = bool(more)
+        found |= more
+    return sorted(found - {owner})
+
+
+def growth_of(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """What each process grows by, a job; nothing of less than `LEAST` jobs after the first ones."""
+    kept = rows[WARM_UP:]
+    if len(kept) < LEAST:
+        return {}
+    names = set.intersection(*(set(row["processes"]) for row in kept))
+    return {
+        name: {key: _slope([row["processes"][name][key] for row in kept]) for key in MOST_GROWTH}
+        for name in sorted(names)
+    }
+
+
+def _slope(values: list[float]) -> float:
+    pairs = itertools.combinations(enumerate(values), 2)
+    return float(np.median([(late - early) / (k - j) for (j, early), (k, late) in pairs]))
+
+
+def verdict(growth: dict[str, dict[str, float]]) -> str:
+    """In words."""
+    if not growth:
+        return f"none: at least {WARM_UP + LEAST} jobs are needed"
+    grown = [
+        f"{name}: {key} {value:+.2f} a job (allowed {MOST_GROWTH[key]:g})"
+        for name, row in growth.items()
+        for key, value in row.items()
+        if value > MOST_GROWTH[key]
+    ]
+    return "grows: " + "; ".join(grown) if grown else "nothing grows"

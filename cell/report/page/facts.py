@@ -1,0 +1,134 @@
+"""The tables of a page: who was there, what was judged, and what was assumed. Values are text, not yet escaped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from cell.report.figures import shown_limit, shown_value, simulated_words
+
+Row = tuple[str, ...]
+K95 = 1.96
+"""Standard deviations within which 95 % of a normal distribution lie."""
+AXES = "xyz"
+
+
+def verdict(report: Mapping[str, Any]) -> tuple[str, bool]:
+    """The outcome beside the tolerance in one line, and whether it is a good one."""
+    outcome, bound, truth = str(report["outcome"]), report.get("place_bound_95"), report.get("truth")
+    tolerance = (report.get("tolerance") or {}).get("translation_mm")
+    outside = [row for row in report.get("measured") or () if not row.get("kept", True)]
+    words = [outcome]
+    if truth is not None:
+        words.append(f"true place error at most {truth['error_mm']['d']['max']:.3f} mm (simulated world)")
+    if bound is not None:
+        words.append(f"stated: 95 % within {bound['d']:.3f} mm")
+    if tolerance is not None and (truth is not None or bound is not None):
+        words.append(f"tolerance {tolerance:g} mm")
+    if outside:
+        words.append(
+            "one figure outside its limit" if len(outside) == 1 else f"{len(outside)} figures outside their limits"
+        )
+    return "; ".join(words), outcome in ("placed", "done") and not outside
+
+
+def identities(folder: Path, report: Mapping[str, Any]) -> list[Row]:
+    """What the run was: cell, devices, job, calibration with its age, configuration, program."""
+    rows: list[Row] = [("run", str(report.get("run", folder.name))), ("cell", str(report.get("cell", "")))]
+    if words := simulated_words(report.get("simulated")):
+        rows.append(("world", f"{words}, seed {report.get('seed')}, level {report.get('level')}"))
+    rows.append(("begun", str(report.get("started", "")).replace("T", " ")))
+    rows.append(("ended", str(report.get("ended") or "not ended").replace("T", " ")))
+    if report.get("kind", "job") == "job":
+        mesh = report.get("mesh") or {}
+        rows.append(("job", f"{report.get('job')}, hash {report.get('job_hash')}"))
+        if mesh:
+            rows.append(
+                ("drawn surface", f"{Path(str(mesh.get('file'))).name}, SHA-256 {str(mesh.get('sha256'))[:16]}")
+            )
+    calibration = _calibration(folder)
+    if report.get("calibration_hash"):
+        rows.append(("calibration", f"hash {report['calibration_hash']}, {_age(calibration, report)}"))
+    for device, serial in (calibration.get("identities") or {}).items():
+        rows.append((f"{device}, serial number", str(serial)))
+    if calibration.get("kinematics"):
+        rows.append(("arm, kinematics", str(calibration["kinematics"])))
+    if report.get("configuration_hash"):
+        rows.append(("configuration", f"hash {report['configuration_hash']}"))
+    rows.append(("program", f"assembly-cell {report.get('version', 'of another version')}"))
+    return rows
+
+
+def _calibration(folder: Path) -> dict[str, Any]:
+    try:
+        told = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def _age(calibration: Mapping[str, Any], report: Mapping[str, Any]) -> str:
+    date = f"made {report.get('calibration_date')}"
+    try:
+        seconds = datetime.fromisoformat(str(report["started"])).timestamp() - float(calibration["made"])
+    except (KeyError, ValueError):
+        return date
+    unit, size = next(((u, s) for u, s in (("days", 86400), ("h", 3600), ("min", 60)) if seconds >= 2 * s), ("s", 1))
+    return f"{date}, {seconds / size:.0f} {unit} before the run"
+
+
+COMPARED: Row = ("quantity", "nominal", "actual", "deviation", "tolerance", "uncertainty (95 %)")
+
+
+def compared(report: Mapping[str, Any]) -> list[Row]:
+    """Rows of `COMPARED`: where the surface was found, where the part ended, and where it was first touched.
+
+    The surface may lie anywhere: the part goes with it. What has to keep the tolerance is the part on the surface.
+    """
+    rows: list[Row] = []
+    found = _result(report, "invert_pose")
+    tolerance = report.get("tolerance") or {}
+    if found is not None and report.get("place_pose") and report.get("place_sigma"):
+        sigma = report["place_sigma"]
+        for axis, off, one in zip(AXES, found["correction_mm"], sigma["translation_mm"], strict=True):
+            rows.append((f"surface {axis}, from the board", "0 mm", f"{off:+.3f} mm", f"{off:+.3f} mm", "follows it",
+                         f"± {K95 * one:.3f} mm"))  # fmt: skip
+        for axis, off, one in zip(AXES, found["correction_mrad"], sigma["rotation_mrad"], strict=True):
+            rows.append((f"surface about {axis}, from the board", "0 mrad", f"{off:+.3f} mrad", f"{off:+.3f} mrad",
+                         "follows it", f"± {K95 * one:.3f} mrad"))  # fmt: skip
+    bound, truth = report.get("place_bound_95"), report.get("truth")
+    if bound is not None:
+        allowed = f"at most {tolerance['translation_mm']:g} mm" if "translation_mm" in tolerance else ""
+        for name in (*AXES, "d"):
+            most = None if truth is None else truth["error_mm"][name]["max"]
+            actual = "not measured" if most is None else f"{most:.3f} mm"
+            of = "part's points, largest D" if name == "d" else f"part's points, largest along {name}"
+            rows.append((of, "0 mm", actual, "" if most is None else actual, allowed if name == "d" else "",
+                         f"{bound[name]:.3f} mm"))  # fmt: skip
+    touch = (_result(report, "place") or {}).get("touch")
+    if touch is not None:
+        felt = (f"{touch[key]:.3f} mm" for key in ("expected_mm", "felt_mm"))
+        off, unsure = f"{touch['off_mm']:+.3f} mm", f"± {K95 * touch['sigma_mm']:.3f} mm"
+        rows.append(("first touch above the place", *felt, off, _touch_limit(report), unsure))
+    return rows
+
+
+def _touch_limit(report: Mapping[str, Any]) -> str:
+    row = next((row for row in report.get("measured") or () if str(row["name"]).startswith("first touch")), None)
+    return "" if row is None else shown_limit(row)
+
+
+def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:
+    made = next((row.get("result") for row in report.get("steps") or () if row.get("name") == step), None)
+    return made if isinstance(made, dict) and "summary_missing" not in made else None
+
+
+def judged(report: Mapping[str, Any]) -> list[tuple[Row, bool]]:
+    """Every figure beside its limit, and whether it keeps it."""
+    return [
+        ((str(row["name"]), shown_value(row), shown_limit(row)), bool(row.get("kept", True)))
+        for row in report.get("measured") or ()
+    ]

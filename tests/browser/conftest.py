@@ -1,0 +1,48 @@
+"""One browser and one simulated cell with its screen for all tests that look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+from tests.browser.screen import Console, Screen, browser_path, console_of, opened_browser  # noqa: E402
+from tests.browser.watcher import Watcher  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def browsers() -> Iterator[playwright.Playwright]:
+    if browser_path() is None:
+        pytest.skip("no Chromium is installed on this system (apt-get install chromium)")
+    with playwright.sync_playwright() as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def browser(browsers: playwright.Playwright) -> Iterator[playwright.Browser]:
+    """Draws no 3-D, which would keep the processor busy."""
+    made = opened_browser(browsers)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def console(tmp_path_factory: pytest.TempPathFactory, browsers: object) -> Iterator[Console]:
+    with console_of(tmp_path_factory.mktemp("screen")) as going:
+        yield going
+
+
+@pytest.fixture(scope="session")
+def watcher(console: Console) -> Iterator[Watcher]:
+    """Somebody else who looks on, without a browser."""
+    with Watcher(console.link()) as made:
+        yield made
+
+
+@pytest.fixture
+def screen(browser: playwright.Browser, console: Console) -> Iterator[Screen]:
+    made = Screen.of(browser, console.link())
+    yield made
+    made.close()

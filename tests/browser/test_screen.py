@@ -1,0 +1,68 @@
+"""The operator's screen in a real browser, before a cell that is simulated behind its real protocols."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, leave, press
+from tests.browser.screen import LOCAL, Screen
+from tests.browser.watcher import Watcher
+
+pytestmark = pytest.mark.wire
+
+
+def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -> None:
+    screen.shows("world", "SIMULATED.*seed 3")
+    # Who does not hold the cell can do one thing alone.
+    assert screen.page.locator("#start").is_disabled()
+    assert screen.page.locator("#manual").is_disabled()
+    assert screen.page.locator("#stop").is_enabled()
+    assert "not an emergency stop" in screen.page.inner_text("#stop")
+    screen.hold()
+    screen.page.click("#start")
+    run = watcher.until(lambda state: state["run"])["run"]
+    assert run["job"] == "pot"
+    screen.shows("run-title", "job pot")
+    screen.page.click("#pause")
+    watcher.until(lambda state: state["run"]["state"] in ("pausing", "paused"))
+    screen.shows("run-title", "paus")
+    screen.page.click("#go-on")
+    watcher.until(lambda state: state["run"]["state"] == "running")
+    screen.page.click("#stop")
+    ended = watcher.until(idle)
+    screen.shows("stop-said", "was carried out")
+    screen.shows("run-title", "No run")
+    # A stop holds direct commands until a person says that they have looked.
+    assert ended["safety"]["stopped"]
+    screen.page.click("#clear-stop")
+    watcher.until(lambda state: not state["safety"]["stopped"])
+    assert screen.hosts <= LOCAL
+    assert screen.complaints == []
+
+
+def test_a_held_button_moves_the_arm_until_it_is_let_go(screen: Screen, watcher: Watcher) -> None:
+    press(screen, watcher)
+    # The speed is steady: a late beat here and there does not make it halt.
+    begin = joint(watcher.state)
+    time.sleep(0.5)
+    assert abs(joint(watcher.state) - begin) > 0.02
+    released = time.monotonic()
+    screen.page.mouse.up()
+    assert watcher.still(joint) - released < STOPS_WITHIN_S + SEEN_S
+    screen.shows("jog-said", "let go|ended|stopped")
+    leave(screen, watcher)
+
+
+def test_a_page_that_hangs_while_a_button_is_held_stops_the_arm(screen: Screen, watcher: Watcher) -> None:
+    press(screen, watcher)
+    hung = time.monotonic()
+    screen.page.evaluate("setTimeout(() => { const end = Date.now() + 1500; while (Date.now() < end); })")
+    assert watcher.still(joint) - hung < STOPS_WITHIN_S + SEEN_S
+    # It comes to itself with the button still down: that press moves nothing any more.
+    stood = joint(watcher.state)
+    time.sleep(1.8)
+    assert joint(watcher.state) == pytest.approx(stood, abs=1e-4)
+    screen.page.mouse.up()
+    leave(screen, watcher)

@@ -1,0 +1,83 @@
+"""A client without a browser that follows the live link: what the cell does, as somebody else is told."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import urlsplit
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+
+class _Stay(urllib.request.HTTPRedirectHandler):
+    """The cookie is in the answer that sends on."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+class Watcher:
+    """Keeps the newest state and when it came; a context that leaves the link at its end."""
+
+    def __init__(self, link: str) -> None:
+        self.state: dict[str, Any] = {}
+        self._changed = threading.Condition()
+        parts = urlsplit(link)
+        try:
+            urllib.request.build_opener(_Stay).open(link)
+            raise AssertionError("the link sends on to the page")
+        except urllib.error.HTTPError as answer:
+            cookie = answer.headers["set-cookie"].split(";")[0]
+        self._link = connect(
+            f"ws://{parts.netloc}/live",
+            origin=f"{parts.scheme}://{parts.netloc}",
+            additional_headers={"Cookie": cookie},
+            compression=None,
+        )
+
+    def _hear(self, socket: ClientConnection) -> None:
+        try:
+            for message in socket:
+                if isinstance(message, bytes):
+                    continue
+                said = json.loads(message)
+                if said["type"] == "state":
+                    with self._changed:
+                        self.state = said
+                        self._changed.notify_all()
+        except ConnectionClosed:
+            pass
+
+    def __enter__(self) -> Watcher:
+        threading.Thread(target=self._hear, args=(self._link.__enter__(),), daemon=True).start()
+        self.until(lambda state: True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._link.__exit__(None, None, None)
+
+    def until(self, holds: Callable[[dict[str, Any]], Any], timeout: float = 20.0) -> dict[str, Any]:
+        """Wait for a state in which something holds, and give it."""
+        with self._changed:
+            found = self._changed.wait_for(lambda: self.state and holds(self.state), timeout)
+            assert found, f"not within {timeout:g} s; last told: {json.dumps(self.state)[:1500]}"
+            return self.state
+
+    def still(self, reading: Callable[[dict[str, Any]], float], quiet: float = 0.2, timeout: float = 5.0) -> float:
+        """Wait until a reading has not changed for `quiet` s; when it did last, by `time.monotonic`."""
+        begin = last = time.monotonic()
+        value = reading(self.state)
+        while time.monotonic() - last < quiet:
+            assert time.monotonic() - begin < timeout, f"it still moves after {timeout:g} s"
+            with self._changed:
+                self._changed.wait(0.1)
+                now = reading(self.state)
+            if abs(now - value) > 2e-5:
+                value, last = now, time.monotonic()
+        return last

@@ -1,0 +1,151 @@
+"""A server as a cell starts it, for tests that talk to it as strangers do: over sockets, with clients not made here."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import queue
+import re
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+from cell.console.link import ServerProcess
+from cell.console.messages import Answer, AskCell, Do, Ready, Setup
+
+HOSTS = ("127.0.0.1", "localhost")
+
+
+class Served:
+    """The server, and this side of its pipes: `heard` are its messages, `stops` counts what its stop pipe asked for."""
+
+    def __init__(self, runs: Path, lasting: str | None = None) -> None:
+        bound = socket.socket()
+        bound.bind(("127.0.0.1", 0))
+        self.port: int = bound.getsockname()[1]
+        self.host = f"127.0.0.1:{self.port}"
+        self.origin = f"http://{self.host}"
+        self.heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.tokens: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.stops = 0
+        self.trouble: str | None = None
+        facts = {"version": 1, "name": "test"}
+        self.process = ServerProcess(
+            lambda fd: Setup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts),
+            bound, self._hear, self._stop, lambda: None,
+        )  # fmt: skip
+        self._cookie: str | None = None
+
+    def _hear(self, message: object) -> None:
+        match message:
+            case Ready(str() as token):
+                self.tokens.put(token)
+            case Do(number, _, words):
+                self.heard.put(message)
+                if words.get("do") != "nothing":
+                    self.process.tell(Answer(number, 200, {"ok": True, "text": str(words.get("do"))}))
+            case AskCell(number, job):
+                self.process.tell(Answer(number, 200, {"job": job}))
+            case _:
+                self.heard.put(message)
+
+    def _stop(self) -> str | None:
+        self.stops += 1
+        return self.trouble
+
+    # --- clients ---
+
+    @property
+    def cookie(self) -> str:
+        """Of a browser that has opened the link."""
+        if self._cookie is None:
+            answer = self.ask("GET", f"/enter?token={self.tokens.get(timeout=20)}", cookie=None)
+            assert answer.status == 303
+            self._cookie = answer.headers["set-cookie"].partition(";")[0]
+        return self._cookie
+
+    def ask(
+        self, method: str, path: str, body: str | bytes | None = None, *, cookie: str | None = "", **headers: str | None
+    ) -> Reply:
+        """One request by the standard library's client; headers of None are left out."""
+        sent: dict[str, str | None] = {"host": self.host, "origin": self.origin if method == "POST" else None}
+        sent |= {"cookie": self.cookie if cookie == "" else cookie}
+        sent |= {"content-type": "application/json"} if method == "POST" else {}
+        sent |= {name.replace("_", "-"): value for name, value in headers.items()}
+        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        try:
+            link.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+            for name, value in sent.items():
+                if value is not None:
+                    link.putheader(name, value)
+            data = body.encode() if isinstance(body, str) else body
+            if data is not None:
+                link.putheader("content-length", str(len(data)))
+            link.endheaders(data)
+            return Reply(link.getresponse())
+        finally:
+            link.close()
+
+    def do(self, **words: Any) -> Reply:
+        """A command."""
+        return self.ask("POST", "/api/do", json.dumps(words))
+
+    def live(self, **options: Any) -> ClientConnection:
+        """A page's live link."""
+        headers = {"cookie": self.cookie} | options.pop("headers", {})
+        origin = options.pop("origin", self.origin)
+        url = options.pop("url", f"ws://{self.host}/live")
+        return connect(url, additional_headers=headers, origin=origin, max_size=None, compression=None, **options)
+
+    def raw(self, request: bytes) -> bytes:
+        """What comes back to these bytes, until the other side has nothing more to say."""
+        with socket.create_connection(("127.0.0.1", self.port), timeout=20) as link:
+            link.sendall(request)
+            link.settimeout(3.0)
+            said = b""
+            try:
+                while data := link.recv(65536):
+                    said += data
+                    if re.match(rb"HTTP/1.1 \d+", said) and b"\r\n\r\n" in said:
+                        break
+            except TimeoutError:
+                pass
+            return said
+
+
+class Reply:
+    """Status, headers and body of an answer."""
+
+    def __init__(self, response: http.client.HTTPResponse) -> None:
+        self.status = response.status
+        self.headers = {name.lower(): value for name, value in response.getheaders()}
+        self.text = response.read().decode("utf-8", "replace")
+
+    @property
+    def words(self) -> dict[str, Any]:
+        return json.loads(self.text)
+
+
+@contextmanager
+def serving(runs: Path, lasting: str | None = None) -> Iterator[Served]:
+    """A server; ended afterwards."""
+    served = Served(runs, lasting)
+    try:
+        yield served
+    finally:
+        served.process.close()
+
+
+def until(true: Any, seconds: float = 10.0) -> bool:
+    """Whether it becomes true in time."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if true():
+            return True
+        time.sleep(0.01)
+    return False

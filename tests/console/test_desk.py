@@ -1,0 +1,274 @@
+"""What pages may ask of a cell on the virtual clock: who holds, what is refused in which words, what is decided."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell.console.desk import Desk
+from cell.console.facts import cell_facts
+from cell.console.mailbox import MOST_CLOUDS, Mailbox
+from cell.console.questions import Questions
+from cell.console.run_view import RunView
+from cell.run.run import Run
+from cell.supervisor import Cell
+from drivers.errors import CellError, ConfigError, InterlockError, LimitError, Measured, RefusedError
+from statemachine.policy import Failure, Outcome
+from statemachine.script import Again
+from statemachine.step import Event
+from tests.console.server import until
+
+STEPS = ("board_photo", "laser_sweep", "reconstruct")
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    folder = tmp_path_factory.mktemp("cell")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        with Cell.open(sim="all", seed=3, clock="virtual") as opened:
+            yield opened
+
+
+@pytest.fixture
+def desk(cell: Cell) -> Iterator[Desk]:
+    made = Desk(cell, "pot", lambda client, words: None)
+    made.joined("c1")
+    made.joined("c2")
+    yield made
+    made.close()
+
+
+def refusal(desk: Desk, client: str, **words: Any) -> CellError:
+    with pytest.raises(CellError) as refused:
+        desk.do(client, words)
+    return refused.value
+
+
+def test_one_holds_the_others_see(desk: Desk) -> None:
+    assert "nobody" in str(refusal(desk, "c1", do="home"))
+    assert desk.do("c1", {"do": "hold", "name": "  Ann\n\x07 "}) == {"ok": True, "text": "Ann holds the cell"}
+    assert "Ann" in str(refusal(desk, "c2", do="hold", name="Bob"))
+    assert "Ann does" in str(refusal(desk, "c2", do="start", job="pot"))
+    assert isinstance(refusal(desk, "c1", do="hand_over", to="c9"), InterlockError)
+    desk.do("c1", {"do": "hand_over", "to": "c2"})
+    assert isinstance(refusal(desk, "c1", do="leave"), InterlockError)
+    desk.left("c2")
+    assert desk.holders.holder is None
+    # A page that is gone cannot come back as itself.
+    assert isinstance(refusal(desk, "c2", do="hold", name="Bob"), InterlockError)
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ({"do": "explode"}, ConfigError),
+        ({"do": None}, ConfigError),
+        ({"do": ["stop"]}, ConfigError),
+        ({"do": "start", "job": "../../etc/passwd"}, ConfigError),
+        ({"do": "start", "job": "no-such-job"}, ConfigError),
+        ({"do": "start", "job": 3}, ConfigError),
+        ({"do": "pause"}, InterlockError),
+        ({"do": "abort", "reason": "x"}, InterlockError),
+        ({"do": "decide", "number": 1}, InterlockError),
+        ({"do": "clear_stop", "by": " "}, ConfigError),
+        ({"do": "speed", "fraction": 2}, ConfigError),
+        ({"do": "speed", "fraction": float("nan")}, ConfigError),
+        ({"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.001}, InterlockError),
+        ({"do": "dry_run", "seed": -1}, ConfigError),
+    ],
+)
+def test_what_is_wrong_is_refused(desk: Desk, words: dict[str, Any], kind: type[CellError]) -> None:
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    assert type(refusal(desk, "c1", **words)) is kind
+
+
+def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, desk: Desk) -> None:
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    desk.do("c1", {"do": "manual", "on": True})
+    assert desk.manual.on
+    before = cell.devices.arm.state().flange.copy()
+    desk.do("c1", {"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.01})
+    moved = cell.devices.arm.state().flange - before
+    assert moved[:3] == pytest.approx([0, 0, 0.01], abs=1e-4)
+    assert isinstance(refusal(desk, "c1", do="jog_step", device="arm", axis="z", amount=2.0), LimitError)
+    assert isinstance(refusal(desk, "c1", do="jog_step", device="arm", axis="q", amount=0.01), ConfigError)
+    # What a step refuses does not end the mode; a job does not begin in it.
+    assert desk.manual.on
+    assert "jog is going on" in str(refusal(desk, "c1", do="start", job="pot"))
+    desk.do("c1", {"do": "leave"})
+    assert until(lambda: not desk.manual.on)
+
+
+def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk: Desk) -> None:
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    desk.do("c1", {"do": "manual", "on": True})
+    cell.stop()
+    assert until(lambda: not desk.manual.on)
+    assert not cell.devices.gate.is_open
+    desk.do("c1", {"do": "clear_stop", "by": "Ann"})
+    assert cell.devices.gate.is_open
+
+
+def test_holding_is_offered_only_where_something_beside_the_program_would_stop_it(cell: Cell) -> None:
+    """The devices on the virtual clock have nothing beside them."""
+    facts = cell_facts(cell, "pot")
+    assert {entry["device"] for entry in facts["jog"]} == {"rail", "arm", "vehicle"}
+    assert not any(entry["hold"] for entry in facts["jog"])
+    assert facts["simulated"] is True
+    assert facts["jobs"][0] == "pot"
+
+
+# --- decisions ---
+
+
+def asked(questions: Questions, run: Run[Any]) -> tuple[list[object], threading.Thread]:
+    """A run of these steps that is refused at its sweep, in a thread of its own."""
+    made: list[object] = []
+    number = Measured("stripe, rows seen", 12, "rows", least=200)
+    failure = Failure(Outcome.REFUSED, "too little stripe", "RefusedError", error=RefusedError("x", number))
+    decide = questions.script(STEPS).on_refusal
+    assert decide is not None
+    questions.hold(run)
+
+    def ask() -> None:
+        try:
+            made.append(decide("laser_sweep", failure))
+        except RefusedError as error:
+            made.append(error)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    assert until(lambda: questions.present(None) is not None)
+    return made, thread
+
+
+def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_allows() -> None:
+    questions, end = Questions(), threading.Event()
+    run: Run[Any] = Run("job", lambda run: end.wait(10))
+    made, thread = asked(questions, run)
+    shown = questions.present(None)
+    assert shown is not None
+    assert shown["numbers"] == [{"name": "stripe, rows seen", "value": 12, "limit": 200, "unit": "rows", "ok": False}]
+    again, abort = shown["choices"]
+    assert again == {"choice": "again", "steps": ["board_photo", "laser_sweep"]}
+    assert abort == {"choice": "abort"}
+    number = shown["number"]
+    for wrong in (
+        (number + 1, "again", "laser_sweep", "Ann", "dust"),
+        (number, "again", "reconstruct", "Ann", "dust"),
+        (number, "confirm", None, "Ann", "dust"),
+        (number, "again", "laser_sweep", " ", "dust"),
+        (number, "again", "laser_sweep", "Ann", " \n"),
+    ):
+        with pytest.raises(ConfigError):
+            questions.decide(run, *wrong)
+    questions.decide(run, number, "again", "board_photo", "Ann", "wiped the lens")
+    thread.join(5)
+    assert made == [Again("board_photo", "Ann: wiped the lens")]
+    assert questions.present(None) is None
+
+    made, thread = asked(questions, run)
+    later = questions.present(None)
+    assert later is not None
+    questions.decide(run, later["number"], "abort", None, "Bob", "the part is scrap")
+    thread.join(5)
+    assert isinstance(made[0], RefusedError)
+    assert "Bob: the part is scrap" in str(made[0])
+    end.set()
+
+
+def test_a_run_that_is_ended_asks_no_more() -> None:
+    questions, end = Questions(), threading.Event()
+    run: Run[Any] = Run("job", lambda run: end.wait(10))
+    made, thread = asked(questions, run)
+    run.abort("stopped")
+    thread.join(5)
+    assert made == [None]
+    end.set()
+
+
+def test_nobody_is_asked_where_nobody_looks() -> None:
+    decide = Questions().script(STEPS, seen=lambda: False).on_refusal
+    assert decide is not None
+    assert decide("board_photo", Failure(Outcome.REFUSED, "no board")) is None
+
+
+def test_a_run_is_followed_by_its_own_events() -> None:
+    begun, end = threading.Event(), threading.Event()
+
+    def work(run: Run[Any]) -> None:
+        run.tell(Event("step_started", "board_photo", {"attempt": 1}))
+        run.tell(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
+        run.tell(
+            Event(
+                "fault", "board_photo", {"attempt": 1, "code": "arm.link_lost", "reason": "cut", "remedy": "recovered"}
+            )
+        )
+        run.tell(Event("confirm_needed", "board_photo", {"reason": "look", "code": "arm.protective_stop", "number": 1}))
+        begun.set()
+        end.wait(10)
+        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
+
+    run: Run[Any] = Run("job", work)
+    view = RunView(run, STEPS, "pot", {"board_photo": 10.0, "laser_sweep": 5.0, "reconstruct": 1.0})
+    assert begun.wait(5)
+    view.news()
+    told = view.as_dict()
+    assert (told["state"], told["step"], told["fraction"]) == ("asking", "board_photo", 0.5)
+    assert told["left_s"] == pytest.approx(16.0, abs=1.0)
+    assert [step["state"] for step in told["steps"]] == ["active", "open", "open"]
+    assert view.faults[0]["device"] == "arm"
+    question = Questions().present(view)
+    assert question is not None
+    assert [choice["choice"] for choice in question["choices"]] == ["confirm", "abort"]
+    end.set()
+    run.ended(5)
+    view.news()
+    assert view.over
+    assert view.ended is not None and view.ended["outcome"] == "placed"
+
+
+def test_the_mailbox_keeps_the_newest_and_of_the_cloud_as_much_as_it_may() -> None:
+    import asyncio
+
+    async def fill() -> list[str | bytes]:
+        mailbox = Mailbox()
+        for n in range(500):
+            mailbox.show("state", f"state {n}")
+            mailbox.cloud(n.to_bytes(2, "big"))
+        mailbox.say("hello")
+        return [await mailbox.take() for _ in range(mailbox.waiting)]
+
+    taken = asyncio.run(fill())
+    assert taken[:2] == ["hello", "state 499"]
+    assert taken[2:] == [n.to_bytes(2, "big") for n in range(500 - MOST_CLOUDS, 500)]
+
+
+def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None:
+    from cell.console.archive import Archive
+
+    folder = tmp_path / "20260101T000000-abcd"
+    (folder / "frames").mkdir(parents=True)
+    (folder / "frames" / "board-01-000001.png").write_bytes(b"png")
+    (tmp_path / "secret.png").write_bytes(b"png")
+    report = (
+        '{"outcome": "placed", "reason": "done", "job": "pot", "place_sigma": {"translation_mm": [0.03, 0.04, 0.0]}'
+    )
+    (folder / "report.json").write_text(report + ', "truth": {"error_mm": {"d": {"mean": 0.07}}}, "started": "2026"}')
+    archive = Archive(tmp_path)
+    (row,) = archive.runs()
+    assert (row["d_mean_mm"], row["expected_mm"], row["outcome"]) == (0.07, 0.05, "placed")
+    (point,) = archive.trend()
+    assert point["run"] == folder.name
+    run = archive.run(folder.name)
+    assert run is not None and run["pictures"] == ["board-01-000001.png"]
+    assert archive.picture(folder.name, "board-01-000001.png") is not None
+    assert archive.replay(folder.name) is None
+    for name in ("../secret.png", "..", "secret.png"):
+        assert archive.picture(folder.name, name) is None
+    assert archive.run("..") is None

@@ -1,0 +1,117 @@
+"""What the page draws of the cell is where the simulator, which the planner knows nothing of, has it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cell.config import load_config
+from cell.console.scene import MOST_TRIANGLES, coarser, scene
+from cell.job import load_job
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+
+PAGE = Path(__file__).parent.parent / "cell" / "console" / "page"
+POSTURES = np.random.default_rng(5).uniform(-2.5, 2.5, (20, 6))
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[str, Any]:
+    made = scene(load_config(None), "pot")
+    # What is not JSON, or no number, fails here.
+    assert json.loads(json.dumps(made, allow_nan=False)) == made
+    return made
+
+
+def matrix(numbers: list[float]) -> NDArray[np.float64]:
+    return np.array(numbers).reshape(4, 4)
+
+
+def turned(drawn: dict[str, Any], joints: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The frames of the base, the six joints and the flange as the page puts them one into the other."""
+    frames = [np.eye(4)]
+    for pose, q in zip(drawn["arm"]["parent_from_joint"], joints, strict=True):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(q), -np.sin(q)], [np.sin(q), np.cos(q)]]
+        frames.append(frames[-1] @ matrix(pose) @ turn)
+    return [*frames, frames[-1] @ matrix(drawn["arm"]["joint6_from_flange"])]
+
+
+def test_the_drawn_flange_is_where_the_simulated_arm_has_it(drawn: dict[str, Any]) -> None:
+    arm = Kinematics(UR10E_DH)
+    for joints in POSTURES:
+        np.testing.assert_allclose(turned(drawn, joints)[-1], arm.forward(joints), atol=1e-7)
+
+
+def test_links_join_where_the_arm_bends(drawn: dict[str, Any]) -> None:
+    """The capsules of upper arm and forearm meet in the elbow's, whatever the posture: each is in the right frame."""
+    bodies = {body["name"]: body for body in drawn["bodies"]}
+
+    def ends(name: str, frames: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        body = bodies[name]
+        half = 0.5 * body["size"][2]
+        there = frames[body["parent"]] @ matrix(body["placement"])
+        return np.array([(there @ [0, 0, z, 1])[:3] for z in (-half, half)])
+
+    for joints in POSTURES[:5]:
+        frames = turned(drawn, joints)
+        elbow = ends("elbow", frames)
+        for link in ("upper arm", "forearm"):
+            apart = np.linalg.norm(ends(link, frames)[:, None] - elbow[None], axis=2).min()
+            assert apart < bodies["elbow"]["radius"]
+
+
+def test_the_station_is_in_its_own_frame_and_the_surface_looks_like_its_mesh(drawn: dict[str, Any]) -> None:
+    station, (job, _) = drawn["station"], load_job("pot")
+    # Where the vehicle ends, the place is in reach in front of the arm; where it starts, it is not.
+    reach = np.abs(UR10E_DH[:, :2]).sum()
+    assert np.linalg.norm(matrix(station["base_from_place"])[:3, 3]) < 0.7 * reach
+    place_from_base = matrix(station["place_from_start"]) @ matrix(drawn["vehicle_from_base"])
+    assert np.linalg.norm(place_from_base[:3, 3]) > reach
+    vertices = np.array(station["surface"]["vertices"]).reshape(-1, 3)
+    triangles = np.array(station["surface"]["triangles"]).reshape(-1, 3)
+    assert len(triangles) <= MOST_TRIANGLES
+    assert triangles.max() < len(vertices)
+    np.testing.assert_allclose(np.ptp(vertices, axis=0)[:2], (0.070, 0.036), atol=5e-4)
+    assert {body["name"] for body in station["bodies"]} >= {"table", "board", "board post"}
+    np.testing.assert_allclose(next(b["size"] for b in drawn["bodies"] if b["name"] == "part"), job.grasp.size)
+
+
+def test_a_mesh_is_made_coarser_without_leaving_its_place() -> None:
+    x, y = np.meshgrid(np.linspace(0, 0.1, 201), np.linspace(0, 0.05, 101))
+    sphere = np.sqrt(0.5**2 - (x - 0.05) ** 2 - (y - 0.025) ** 2)
+    vertices = np.column_stack([x.ravel(), y.ravel(), sphere.ravel()])
+    at = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    points, faces = coarser(vertices, triangles, 3000)
+    assert 500 < len(faces) <= 3000
+    off = np.linalg.norm(points - [0.05, 0.025, 0.0], axis=1) - 0.5
+    assert np.abs(off).max() < 1e-4
+    normals = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+    assert (normals[:, 2] > 0).all()
+
+
+def test_without_a_job_there_is_neither_part_nor_station() -> None:
+    bare = scene(load_config(None))
+    assert bare["station"] is None
+    assert "part" not in {body["name"] for body in bare["bodies"]}
+
+
+def test_the_page_asks_nobody_else_and_has_nothing_inline() -> None:
+    """Its policy is `default-src 'self'`: what is inline would not run, and what is elsewhere would not load."""
+    html = (PAGE / "index.html").read_text(encoding="utf-8")
+    assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\bstyle=|\bon\w+=", html)
+    names = re.findall(r'(?:src|href)="([^"]+)"', html)
+    assert names
+    assert all((PAGE / name.removeprefix("/static/")).is_file() for name in names)
+    for file in PAGE.glob("*.*"):
+        text = file.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+        assert not re.search(r"https?://|@import|url\(|eval\(|new Function|innerHTML", text), file.name
+        for imported in re.findall(r"from '([^']+)'", text):
+            assert (PAGE / imported).is_file(), f"{file.name} imports {imported}"

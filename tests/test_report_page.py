@@ -1,0 +1,192 @@
+"""A run's page: one file that asks for nothing, says what the report says, and what it cannot show."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cell.cli.app import app
+from cell.lab.bench.whole_job import JobRecord
+from cell.reconstruction.ply import write_cloud
+from cell.report.page.make import MOST_BYTES, make_page, write_page
+from cell.report.page.maps import MOST_POINTS
+from cell.report.page.timeline import timeline
+from cell.report.page.trend import past_runs
+from cell.run.folder import write_json
+from cell.steps.reconstruct import Reconstruction
+from drivers.errors import CellError
+from statemachine.journal import Journal
+from tests import report_runs
+from tests.report_runs import Ended, Ends, pot
+
+VOID = {"meta", "img", "line", "rect", "circle"}
+
+
+class Page(HTMLParser):
+    """Reads a page as a browser does: its text, its tags in pairs, and whatever it could ask for."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.asked: list[str] = []
+        self.words: list[str] = []
+        self.scripts = ""
+        self.feed(page)
+        self.close()
+        assert self.open == []
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open += [] if tag in VOID else [tag]
+        for name, value in attrs:
+            if name in ("src", "href", "action", "data", "srcset") and not str(value).startswith("data:image/"):
+                self.asked.append(str(value))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] == ["script"]:
+            self.scripts += data
+        else:
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A placed run with what a whole run leaves: cloud, job and journal."""
+    folder = tmp_path_factory.mktemp("page") / ends(report_runs.placed).folder.name
+    shutil.copytree(ends(report_runs.placed).folder, folder)
+    made = placed_pot.results["reconstruct"]
+    assert isinstance(made, Reconstruction)
+    write_cloud(folder / "cloud.ply", made.cloud)
+    write_json(folder / "job.json", pot()[0].model_dump(mode="json"))
+    journal = Journal(folder, folder.name, {"clock": "virtual"})
+    for name, attempt, error in (("laser_sweep", 1, "frames were lost"), ("laser_sweep", 2, None)):
+        journal.step_ended(journal.step_started(name, attempt), 2.0 * attempt, {}, error)
+    journal.close()
+    return folder
+
+
+def test_the_page_of_a_placed_run(folder: Path, placed_pot: JobRecord) -> None:
+    text = make_page(folder)
+    page = Page(text)
+    report = json.loads((folder / "report.json").read_text())
+    assert len(text.encode()) < MOST_BYTES
+    assert page.asked == []
+    # An inline script or style could ask as well; the policy is what a browser holds it to.
+    assert "default-src 'none'; img-src data:;" in text
+    assert not re.search(r"https?:|@import|url\(|fetch|XMLHttp|import\(", text)
+    for said in (
+        f"{report['truth']['error_mm']['d']['max']:.3f} mm (simulated world)",
+        f"{report['place_bound_95']['d']:.3f} mm",
+        "tolerance 0.6 mm",
+        "Simulated",
+        report["calibration_hash"],
+        report["job_hash"],
+        "camera.frames_lost in laser_sweep",
+        "camera's read noise",
+    ):
+        assert said in page.text, said
+    data = json.loads(re.findall(r'id="cloud-data">(.*?)</script>', text)[0])
+    assert data["count"] == MOST_POINTS
+    assert f"{MOST_POINTS} of {data['total']} measured points are shown" in page.text
+    made = placed_pot.results["reconstruct"]
+    assert isinstance(made, Reconstruction)
+    assert data["total"] == made.cloud.size
+    assert (data["from"], data["to"]) == pytest.approx((-0.2, 0.2))
+    # What is drawn has the measured cloud's size: distances do not depend on where it is seen from.
+    shown = data["step"] * np.frombuffer(base64.b64decode(data["points"]), "<i2").reshape(-1, 3)
+    measured = 1e3 * made.cloud.points[made.cloud.valid]
+    spread = [np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))) for points in (shown, measured)]
+    assert spread[0] == pytest.approx(spread[1], rel=0.01)
+
+
+def test_a_report_is_not_believed_to_be_harmless(folder: Path, tmp_path: Path) -> None:
+    hostile = "</script><script>alert(1)</script><img src=http://elsewhere/x>"
+    run = tmp_path / folder.name
+    run.mkdir()
+    report = json.loads((folder / "report.json").read_text())
+    report.update(outcome="refused", reason=hostile, job=hostile, cell=hostile, truth=None, place_pose=None)
+    report["refusal"] = {"step": hostile, "reason": hostile, "numbers": [], "frames": [], "cloud": None}
+    report["faults"] = [{"at": report["started"], "step": hostile, "attempt": 1, "code": hostile, "reason": hostile}]
+    report["measured"][0].update(name=hostile, kept=False)
+    write_json(run / "report.json", report)
+    page = Page(make_page(run))
+    assert page.asked == []
+    assert "alert(1)" not in page.scripts
+    assert hostile in page.text
+    assert "one figure outside its limit" in page.text
+
+
+@pytest.mark.parametrize("make", [report_runs.too_strict, report_runs.no_board, report_runs.faulted])
+def test_a_run_that_did_not_place_says_why_with_its_numbers(ends: Ends, make: report_runs.Make) -> None:
+    ended: Ended = ends(make)
+    text = make_page(ended.folder)
+    page = Page(text)
+    assert " ".join(ended.report["reason"].split()) in page.text
+    assert ended.report["outcome"] in page.text
+    for row in (ended.report["refusal"] or {"numbers": []})["numbers"]:
+        assert row["name"] in page.text
+    assert "data:image/jpeg;base64," in text
+
+
+def test_a_surface_that_is_another_by_now_is_not_compared_with(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / folder.name
+    shutil.copytree(folder, run)
+    report = json.loads((run / "report.json").read_text())
+    report["mesh"]["sha256"] = 64 * "0"
+    write_json(run / "report.json", report)
+    text = Page(make_page(run)).text
+    assert "pot.stl was changed since the run" in text
+    assert "mm (height)" in text
+    (run / "cloud.ply").write_bytes(b"ply\n")
+    assert "is no cloud of this program" in Page(make_page(run)).text
+
+
+def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(folder: Path) -> None:
+    fault = {"step": "laser_sweep", "attempt": 1, "code": "c", "reason": "r", "remedy": "tried again"}
+    course = timeline(folder, {"clock": "virtual", "faults": [fault]})
+    assert course is not None
+    assert [(bar.begin, bar.end, bar.state) for bar in course.bars] == [(0.0, 2.0, "failed"), (2.0, 6.0, "done")]
+    assert [mark.at for mark in course.marks] == [2.0]
+
+
+def test_the_trend_holds_the_runs_of_the_job_before_this_one(tmp_path: Path) -> None:
+    def run(name: str, **facts: Any) -> Path:
+        (tmp_path / name).mkdir()
+        write_json(tmp_path / name / "report.json", {"outcome": "placed", "kind": "job", "job": "pot", **facts})
+        return tmp_path / name
+
+    run("20260101T000000-0001", place_bound_95={"d": 0.3}, truth={"error_mm": {"d": {"max": 0.1}}})
+    run("20260101T000000-0002", job="seat")
+    run("20260101T000000-0003", outcome="refused")
+    here = run("20260101T000000-0004", place_bound_95={"d": 0.4})
+    run("20260101T000000-0005")
+    past = past_runs(here, json.loads((here / "report.json").read_text()))
+    assert [(p.name[-4:], p.true_mm, p.stated_mm) for p in past] == [
+        ("0001", 0.1, 0.3), ("0003", None, None), ("0004", None, 0.4),
+    ]  # fmt: skip
+
+
+def test_the_command_writes_it_beside_the_run_or_where_it_is_asked_to(tmp_path: Path) -> None:
+    run = tmp_path / "20260101T000000-0001"
+    run.mkdir()
+    Journal(run, run.name, {"kind": "home"}).close()
+    told = CliRunner().invoke(app, ["report", str(run), "--html", "--json"])
+    assert json.loads(told.stdout) == {
+        "run": run.name, "file": str(run / "report.html"), "bytes": (run / "report.html").stat().st_size,
+    }  # fmt: skip
+    assert "not ended" in Page((run / "report.html").read_text()).text
+    with pytest.raises(CellError, match="--out"):
+        write_page(run, tmp_path / "nowhere" / "page.html")

@@ -1,0 +1,148 @@
+"""A scan head that slipped since the calibration, and pictures that come later, are seen on the plate on the claw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.calibration.collect.edge import look_at_edge, require_edge
+from cell.calibration.collect.witness import require_witness
+from cell.calibration.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
+from cell.calibration.witness import Witness
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from cell.geometry.camera import CameraModel
+from cell.geometry.light_plane import LightPlane
+from drivers.errors import RefusedError
+from drivers.interfaces import Frame
+
+CONFIG = load_config(None)
+
+
+def let_go(what: str, frame: Frame) -> None:
+    """No picture is kept."""
+
+
+def looked(cell: VirtualCell, before: Witness | None = None) -> Witness:
+    now = require_witness(CONFIG, cell.devices, let_go)
+    if before is not None:
+        return require_edge(CONFIG, cell.devices, let_go, before, now)
+    return replace(now, edge=look_at_edge(CONFIG, cell.devices, let_go, now, None))
+
+
+@pytest.fixture(scope="module")
+def cell() -> tuple[VirtualCell, Witness, Callable[[Witness], Slip]]:
+    """A simulated cell, what it shows of the plate, and how a later look is held against that."""
+    cell = VirtualCell(CONFIG, 3, "nominal")
+    cell.devices.vehicle.brake()
+    cell.devices.rail.home().wait(60.0)
+    cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+    before = looked(cell)
+    scene = cell.world.scene
+    lens = scene.scan_lens
+    camera = CameraModel(640, 480, lens.fx, lens.fy, lens.cx, lens.cy, lens.dist)
+    plane = LightPlane.of(scene.light_plane_normal, scene.light_plane_distance)
+    return cell, before, lambda now: slip_since(before, now, camera, plane, scene.rail_direction)
+
+
+def test_the_edge_is_where_the_world_has_it(cell) -> None:
+    world, before = cell[0].world, cell[1]
+    assert before.edge is not None
+    world.rail.carriage(0.0)
+    scene, plate = world.scene, world.scene.drawing.cell.witness
+    edge = np.linalg.inv(scene.flange_from_scan_camera) @ plate @ np.array([0.0065, 0.0, 0.0, 1.0])
+    # The way of the carriage, in the camera's frame, until the edge lies in the light plane.
+    way = (edge[:3] @ scene.light_plane_normal - scene.light_plane_distance) / (
+        scene.rail_direction @ scene.light_plane_normal
+    )
+    assert before.edge.place == pytest.approx(way / (1 + scene.rail_lead_error), abs=2e-5)
+    assert abs(before.edge.lag) < 5e-3
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
+def test_a_head_that_has_slipped_is_seen_to_hundredths(cell, moved: tuple[float, float]) -> None:
+    virtual, before, since = cell
+    world, scene = virtual.world, virtual.world.scene
+    off = np.eye(4)
+    off[:2, 3] = moved
+    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        world.scene = scene
+    assert slip.shift == pytest.approx(moved, abs=2.5e-5)
+    assert abs(slip.lag) < 3e-3 and not slip.hidden
+
+
+def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell) -> None:
+    virtual, before, _ = cell
+    world, scene = virtual.world, virtual.world.scene
+    off = np.eye(4)
+    off[0, 3] = 1e-3
+    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
+    try:
+        with pytest.raises(RefusedError, match=r"slipped.*cell calibrate"):
+            looked(virtual, before)
+    finally:
+        world.scene = scene
+
+
+def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
+    virtual, before, since = cell
+    world, scene = virtual.world, virtual.world.scene
+    shown = world._cameras._shown
+    drifted = replace(scene, workshop=replace(scene.workshop, pointing=0.4e-3))
+    world._cameras._shown = drifted, *shown[1:]
+    world.stand(1e5)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        world._cameras._shown = shown
+    assert slip.size < 2.5e-5
+
+
+def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
+    virtual, before, since = cell
+    spec = virtual.scan_camera.model.spec
+    virtual.scan_camera.model.spec = replace(spec, latency=spec.latency + 1 / 60)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        virtual.scan_camera.model.spec = spec
+    assert slip.lag == pytest.approx(1 / 60, abs=3e-3)
+    assert abs(slip.along) < 2.5e-5
+    with pytest.raises(RefusedError, match=r"pictures come \+1\d\.\d ms later"):
+        slip.require()
+
+
+def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused() -> None:
+    axes = np.eye(3)[[1, 2, 0]]
+    small, some, far = (Slip(size, 0.0, 0.0) for size in (0.9 * NOTED_M, 1.5 * NOTED_M, 1.1 * LARGEST_M))
+    assert small.notes == () and not small.covariance(axes).any()
+    assert "slipped by +0.075 mm along" in some.notes[0]
+    # In the base, along the camera's x axis, and no less than the plate shows.
+    assert np.sqrt(np.diag(some.covariance(axes))[2]) >= 1.5 * NOTED_M
+    # A head that turned on its mount, 85 mm before the plate.
+    assert np.sqrt(np.diag(some.covariance(axes))[3:]) == pytest.approx(3 * [1.5 * NOTED_M / 0.085])
+    small.require(), some.require()
+    with pytest.raises(RefusedError, match=r"scan head has slipped by \+0\.165 mm along"):
+        far.require()
+    with pytest.raises(RefusedError, match="later"):
+        Slip(0.0, 0.0, -1.1 * LARGEST_LAG_S).require()
+
+
+def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
+    _, before, since = cell
+    columns = before.columns.copy()
+    columns[before.rows[-25:]] = np.nan
+    slip = since(replace(before, columns=columns))
+    assert slip.hidden and slip.across == 0.0 and "covered" in slip.notes[0]
+
+
+def test_it_is_kept_with_the_calibration(cell) -> None:
+    before = cell[1]
+    again = Witness.read(before.as_dict())
+    assert again is not None and again.edge == before.edge

@@ -1,0 +1,55 @@
+"""What `cell bench soak` and `cell bench servo` reckon with, against numbers that are known."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from cell.lab.bench.soak import MOST_GROWTH, counted, growth_of, verdict
+from drivers.arm.ur_streaming import pace_of
+
+
+def rows(memory: list[float], handles: list[float]) -> list[dict[str, object]]:
+    return [
+        {"processes": {"this program": {"memory_mb": m, "threads": 9.0, "handles": h}}}
+        for m, h in zip(memory, handles, strict=True)
+    ]
+
+
+def test_growth_is_that_of_the_jobs_after_the_first_and_one_odd_job_makes_none() -> None:
+    steady = rows([300.0, 380.0, 400.0, 400.2, 460.0, 400.1, 400.3, 400.2], [20.0] * 8)
+    assert verdict(growth_of(steady)) == "nothing grows"
+    leaking = rows([300.0 + 2.0 * k for k in range(8)], [20.0 + k // 2 for k in range(8)])
+    growth = growth_of(leaking)["this program"]
+    assert growth["memory_mb"] == pytest.approx(2.0)
+    assert growth["handles"] == pytest.approx(0.5, abs=0.11)
+    assert verdict(growth_of(leaking)) == (
+        f"grows: this program: memory_mb +2.00 a job (allowed {MOST_GROWTH['memory_mb']:g}); "
+        f"this program: handles +{growth['handles']:.2f} a job (allowed {MOST_GROWTH['handles']:g})"
+    )
+    assert verdict(growth_of(steady[:4])).startswith("none: at least 5 jobs")
+
+
+def test_a_thread_and_a_handle_more_are_counted() -> None:
+    before, end = counted(os.getpid())["this program"], threading.Event()
+    thread = threading.Thread(target=end.wait)
+    thread.start()
+    with Path(os.devnull).open("rb"):
+        after = counted(os.getpid())["this program"]
+    end.set()
+    thread.join()
+    assert (after["threads"] - before["threads"], after["handles"] - before["handles"]) == (1.0, 1.0)
+    assert after["memory_mb"] > 10.0
+
+
+def test_a_pace_is_told_by_its_rate_and_its_gaps() -> None:
+    times = [0.002 * k for k in range(201)]
+    times[100] += 0.001
+    pace = pace_of(times)
+    assert pace is not None
+    assert (pace.points, pace.rate, pace.median) == (201, pytest.approx(500.0), pytest.approx(0.002))
+    assert (pace.p99, pace.longest) == (pytest.approx(0.002), pytest.approx(0.003))
+    assert pace_of([0.0, 1.0]) is None
