@@ -125,8 +125,9 @@ def dry_run(
         clock=clock.value,
     )
     if console:
-        from cell.cli.console import run_shown
+        from cell.cli.console import require_installed, run_shown
 
+        require_installed()
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
         _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
