@@ -169,7 +169,7 @@ def test_a_cell_that_another_process_runs_is_watched(cell: tuple[Path, str]) -> 
             seen: list[str] = []
             until(lambda: seen.append("\n".join(watch.lines())) or "homing" in seen[-1], 90.0, "the run")
             until(lambda: seen.append("\n".join(watch.lines())) or home.poll() is not None, 90.0, "its end")
-            assert home.poll() == 0
+            assert home.poll() == 0, home.communicate()[1]
             until(lambda: seen.append("\n".join(watch.lines())) or "nothing goes on" in seen[-1], 10.0, "rest")
             until(lambda: seen.append("\n".join(watch.lines())) or "  deg" in seen[-1], 10.0, "the arm")
             last = seen[-1]
