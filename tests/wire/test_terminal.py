@@ -201,7 +201,7 @@ def test_a_terminal_that_reports_no_release_is_offered_steps_only(cell: tuple[Pa
         terminal.wait_for("steps only")
         terminal.wait_for("safety normal")
         terminal.say(*[b"\x1b[B"] * 7, b"]", b"]", b"]", b"\x1b[C")
-        terminal.wait_for("j1 0.000 deg")
+        until(lambda: re.search(r"j1 -?[0-9]+[.][0-9]{3} deg", terminal.shown) is not None, 40.0, "the end of a step")
         until(lambda: not moving(cell[1]), 5.0, "rest")
         # A step that is under way ends when it is told to, and when the terminal goes.
         terminal.say(b"\x1b[C")
