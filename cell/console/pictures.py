@@ -76,6 +76,8 @@ class GrowingCloud:
         self._sweep = -1
         self._next = 0
         self._total = 0
+        self._points: list[NDArray[np.float32]] = []
+        self._told: object = None
 
     def increment(self, run: Run[Any], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
         """The lines that came since; `flange` (4, 4) is base_from_flange now and `rail` the rail's motion."""
@@ -107,7 +109,20 @@ class GrowingCloud:
         rows[:, :3] = points
         surface = present.base_from_surface
         rows[:, 3] = present.nominal.deviations((points - surface.translation) @ surface.rotation)
+        self._points.append(rows[:, :3])
         return {**header, "count": len(rows)}, rows.tobytes()
+
+    def final(self, run: Run[Any]) -> Sent | None:
+        """All points anew, with their distances from the surface where it was found; once, as soon as it was."""
+        found, present = run.registered, run.sweeping
+        if found is None or found is self._told or present is None or not self._points:
+            return None
+        self._told = found
+        points = np.concatenate(self._points)
+        deviations = present.nominal.deviations((points - found.translation) @ found.rotation)
+        rows = np.column_stack([points, deviations]).astype("<f4")
+        header = {"type": "cloud", "sweep": self._sweep, "from": 0, "reset": True, "final": True, "count": len(rows)}
+        return header, rows.tobytes()
 
 
 def _places(rail: object, times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -48,8 +48,6 @@ class GatedArm(Gated[Arm]):
     """
 
     touch: SimulatedTouch | None = None
-    planned: Vector | None = None
-    """The way (n, 6), rad, of the newest motion if it follows one; whoever shows it takes it from here."""
 
     def link_table(self) -> LinkTable | None:
         """See `Arm.link_table`."""
@@ -114,7 +112,7 @@ class GatedArm(Gated[Arm]):
         def begin() -> ArmMotion:
             # Should the start fail, the arm may move all the same: what its motion before ended with holds no more.
             situation.last = None
-            self.planned = command.arguments.get("joints") if command.name == "follow" else None
+            situation.way = command.arguments.get("joints") if command.name == "follow" else None
             situation.last = motion = start()
             return motion
 

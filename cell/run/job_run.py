@@ -158,6 +158,7 @@ class JobRun:
                 self.earlier,
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
+                registered=self._registered,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),
@@ -205,8 +206,11 @@ class JobRun:
         )
 
     def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
-        base_from_place = base_from_surface * self.job.surface.place_from_surface.se3().inverse()
-        self.run.sweeping = Sweeping(collector, base_from_surface, base_from_place, self.nominal)
+        self.run.registered = None
+        self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
+
+    def _registered(self, base_from_surface: pin.SE3) -> None:
+        self.run.registered = base_from_surface
 
     def _following(self, following: Following) -> dict[str, Any]:
         try:

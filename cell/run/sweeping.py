@@ -12,10 +12,8 @@ from cell.steps.swath import Collector
 
 @dataclass(frozen=True, eq=False)
 class Sweeping:
-    """Who takes its frames; where the surface and the place are by the board, before anything was registered; and the
-    surface."""
+    """Who takes its frames, where the surface is by the board before anything was registered, and the surface."""
 
     collector: Collector
     base_from_surface: pin.SE3
-    base_from_place: pin.SE3
     nominal: NominalSurface

@@ -118,6 +118,7 @@ def _at(here: Workplace, context: StepContext) -> PlacePose:
         raise told.showing(seen=refused.seen) from refused
     for note in found.notes:
         context.note(text=note)
+    here.registered(found.base_from_surface)
     return found
 
 
