@@ -188,7 +188,9 @@ class Desk:
 
     def _long(self, what: str, work: Callable[[], object]) -> str:
         """Begin work that lasts, and give what refuses it at once."""
-        begun, failed, runs = threading.Event(), [], []
+        begun = threading.Event()
+        failed: list[CellError] = []
+        runs: list[Run[Any]] = []
 
         def perform() -> None:
             try:
