@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from cell.cli import completing
 from cell.cli.options import (
     CellClock,
     ConfigOption,
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
     from cell.run.job_run import Observer, RunOutcome
     from cell.supervisor import Cell
 
-UntilOption = Annotated[str | None, typer.Option(help="End the run, done, after the step of this name.")]
+UntilOption = Annotated[
+    str | None,
+    typer.Option(help="End the run, done, after the step of this name.", autocompletion=completing.steps),
+]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -76,7 +80,11 @@ def dry_run(
     ] = CellClock.wall,
     inject: Annotated[
         list[str] | None,
-        typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
+        typer.Option(
+            "--inject",
+            help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.',
+            autocompletion=completing.faults,
+        ),
     ] = None,
     confirm: Annotated[
         Confirm | None,

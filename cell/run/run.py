@@ -53,6 +53,8 @@ class Run(Generic[Result]):
         self.sweeping: Sweeping | None = None
         self.registered: pin.SE3 | None = None
         self.control = RunControl()
+        self.record: Observer | None = None
+        """Told every event before the run goes on, progress as well; while the run is recorded."""
         self._telling = threading.Lock()
         self._over = False
         self._subscriptions: list[Subscription] = []
@@ -129,6 +131,8 @@ class Run(Generic[Result]):
         """The run's work says what happens; nobody who listens can hold it up."""
         if event.kind != "progress":
             log.info("%s %s %s", event.step or self.kind, event.kind, json.dumps(dict(event.data), default=_plain))
+        if (record := self.record) is not None:
+            record(event)
         with self._telling:
             if event.kind != "progress":
                 self._past.append(event)
