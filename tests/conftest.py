@@ -65,6 +65,7 @@ GROUPS = (
         "test_quiet.py",
         "test_timing.py",
         "test_fixed_vehicle.py",
+        "test_record.py",
     ),
     # Long ones begin early, so that no worker is left with one of them at the end.
     ("recorded/test_recorded_calibration.py", "recorded/test_recorded_command.py"),
@@ -144,10 +145,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session")
-def placed_pot() -> JobRecord:
+def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
     """The job `pot` on the virtual clock, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
     job, nominal = pot()
-    record = run_whole_job(CONFIG, job, nominal, 2, "nominal")
+    record = run_whole_job(CONFIG, job, nominal, 2, "nominal", runs=tmp_path_factory.mktemp("placed"))
     assert (record.outcome, record.reason) == ("placed", "")
     return record
 
