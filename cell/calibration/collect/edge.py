@@ -125,7 +125,7 @@ def _passed(
     lit = np.array(light)[inside]
     # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
     bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
-    whole = np.ma.masked_less(lit, 0.5 * bright).mean(axis=0).filled(0.0)
+    whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
     order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
