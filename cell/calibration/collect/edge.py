@@ -32,8 +32,8 @@ LEAST_FRAMES = 8
 BRIGHTEST, LEAST_LIGHT_DN = 3, 2.0
 """So many pictures say about how bright a row of the line is; with less than that over its surroundings it is none."""
 UNSEEN = (
-    "whether the scan head slips on its mount will not be seen: the plate on the claw has no edge that the laser's line "
-    "passes within 10 mm of laser.witness"
+    "whether the scan head slips on its mount will not be seen: the plate on the claw has no edge that the laser's "
+    "line passes within 10 mm of laser.witness"
 )
 ALL, NONE = 0.85, 0.15
 """Share of the line's light on the plate, and beside it."""
