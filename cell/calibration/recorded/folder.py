@@ -31,8 +31,8 @@ from cell.vision.stripe.extract import Laser, StripeProfile
 from drivers.errors import ConfigError
 
 RAW = (
-    "; it looks like a colour camera's raw picture (a Bayer mosaic: pixels side by side differ by their colour): save it in "
-    "colour or grey"
+    "; it looks like a colour camera's raw picture (a Bayer mosaic: pixels side by side differ by their colour): "
+    "save it in colour or grey"
 )
 
 
