@@ -83,4 +83,5 @@ class Opened:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
         health = require_no_emergency_stop if kind == "jog" else require_healthy
         facts = {**self.facts, **(info or {})}
-        return RecordedWork(run, kind, self.devices, self.runs_folder, facts, health).perform(work)
+        recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health, self.config)
+        return recorded.perform(work)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -9,8 +10,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cell.units import shown
-from drivers.errors import ConfigError
+from cell.units import KEPT, shown
+from drivers.errors import CellError, ConfigError
 
 T = TypeVar("T", bound=BaseModel)
 
@@ -66,6 +67,14 @@ def validate(kind: type[T], data: dict[str, Any], where: str) -> T:
     except ValidationError as error:
         lines = dict.fromkeys(f"  {_key(problem['loc'])}{wording(problem)}" for problem in error.errors())
         raise ConfigError(f"{where} is not valid:\n" + "\n".join(lines)) from error
+
+
+def restored(kind: type[T], path: Path) -> T:
+    """The record that a run has kept as JSON, as it was, to the last digit; `CellError` when the file is no such."""
+    try:
+        return kind.model_validate(json.loads(path.read_text(encoding="utf-8")), context=KEPT)
+    except (OSError, ValueError, RecursionError) as error:
+        raise CellError(f"{path} cannot be read as what the run was done with: {str(error)[:500]}") from error
 
 
 def _key(place: tuple[int | str, ...]) -> str:

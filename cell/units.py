@@ -12,10 +12,13 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, ValidationInfo
 
 if TYPE_CHECKING:
     import pint
+
+KEPT = "kept"
+"""Context of a validation of what this program wrote itself: numbers are in base units then."""
 
 _UNIT = r"[a-zA-Zµ°]{1,24}((\^|\*\*)[1-4])?"
 _QUANTITY = re.compile(rf"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{{1,3}})?\s*({_UNIT}([/*]{_UNIT}){{0,3}})?", re.ASCII)
@@ -96,7 +99,13 @@ def _converted(text: str, unit: str) -> tuple[float, float]:
 
 def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> Any:
     """Validator for a field of type float that is written with a unit; bounds as in `parse_quantity`."""
-    return BeforeValidator(lambda text: parse_quantity(text, unit, low, high))
+
+    def check(text: object, info: ValidationInfo) -> float:
+        if info.context == KEPT and isinstance(text, float):
+            return text
+        return parse_quantity(text, unit, low, high)
+
+    return BeforeValidator(check)
 
 
 def number(low: float, high: float) -> Any:

@@ -22,6 +22,7 @@ from cell.cli import main
 from cell.devices.direct import VirtualCell
 from cell.job import job_path
 from cell.lab.bench.whole_job import JobRecord
+from cell.record.reading import Parts, said
 from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
@@ -87,6 +88,11 @@ def plain_journal(folder: Path) -> list[Any]:
     return [runs, steps, events, asked]
 
 
+def plain_record(folder: Path) -> list[Any]:
+    """All messages of the record with their times: the run's name and date are in its metadata alone."""
+    return [(m.topic, m.at, m.schema, m.data) for m in said(folder / "record.mcap", Parts())]
+
+
 def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -> None:
     """Whether pictures are looked at on one core or on more."""
     first = done((STOP,), confirm="simulated")
@@ -99,6 +105,7 @@ def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -
         cv2.setNumThreads(threads)
     assert plain_report(first.folder) == plain_report(second.folder)
     assert plain_journal(first.folder) == plain_journal(second.folder)
+    assert plain_record(first.folder) == plain_record(second.folder)
     frames = [sorted((run.folder / "frames").iterdir()) for run in (first, second)]
     assert [path.name for path in frames[0]] == [path.name for path in frames[1]]
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(*frames, strict=True))

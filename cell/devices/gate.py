@@ -8,18 +8,31 @@ devices behind the gate are in `cell.devices.gated`.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from cell.devices.interlocks import Command, Interlocks
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import Device, Identity
 from statemachine.cancel import CancelToken
 
+log = logging.getLogger(__name__)
+
 Made = TypeVar("Made")
 Bare = TypeVar("Bare", bound=Device)
+
+
+class Listener(Protocol):
+    """Is told what the cell's devices are asked to do, and what was read of them. Puts it aside, and never waits."""
+
+    def command(self, command: Command, refused: str | None) -> None:
+        """A command is passed on, or `refused` for this reason."""
+
+    def reading(self, device: str, reading: object) -> None:
+        """This was read of a device."""
 
 
 class Gate:
@@ -31,6 +44,7 @@ class Gate:
 
     def __init__(self, interlocks: Interlocks) -> None:
         self.interlocks = interlocks
+        self.listener: Listener | None = None
         self._stops = 0
         self._cleared = 0
         self._entered = threading.local()
@@ -81,6 +95,33 @@ class Gate:
         `Aborted` when this thread's work is to end or the cell was stopped since it entered; `InterlockError` when it
         never entered and nobody has cleared a stop, or when the command is not safe now.
         """
+        try:
+            self._require(command)
+        except (Aborted, InterlockError) as refused:
+            self.asked(command, str(refused))
+            raise
+        self.asked(command)
+
+    def asked(self, command: Command | None, refused: str | None = None) -> None:
+        """Tell the listener that a command is passed on, or was refused."""
+        if self.listener is not None and command is not None:
+            self._tell(lambda listener: listener.command(command, refused))
+
+    def seen(self, device: str, reading: object) -> None:
+        """Tell the listener what was read of a device."""
+        if self.listener is not None:
+            self._tell(lambda listener: listener.reading(device, reading))
+
+    def _tell(self, tell: Callable[[Listener], None]) -> None:
+        try:
+            if (listener := self.listener) is not None:
+                tell(listener)
+        # Whatever is wrong with it, it keeps no command from passing, and no stop.
+        except Exception as error:
+            self.listener = None
+            log.warning("what listened at the gate failed and is told nothing more: %s", error)
+
+    def _require(self, command: Command | None) -> None:
         token: CancelToken | None = getattr(self._entered, "token", None)
         if token is not None and token.reason is not None:
             raise Aborted(f"{token.reason}; nothing new is begun")
@@ -130,6 +171,7 @@ class Gated(Generic[Bare]):
 
     def stop(self) -> None:
         """See `Device.stop`."""
+        self.gate.asked(Command(self.name, "stop"))
         self.bare.stop()
 
     def close(self) -> None:

@@ -61,7 +61,10 @@ class GatedArm(Gated[Arm]):
     def state(self, max_age: float = 0.1) -> ArmState:
         """See `Arm.state`."""
         state = self.bare.state(max_age)
-        return state if self.touch is None else self.touch.felt(state)
+        if self.touch is not None:
+            state = self.touch.felt(state)
+        self.gate.seen("arm", state)
+        return state
 
     @contextmanager
     def record(self) -> Iterator[list[ArmState]]:
@@ -70,6 +73,8 @@ class GatedArm(Gated[Arm]):
             yield states
         if self.touch is not None:
             self.touch.recorded(states)
+        for state in states:
+            self.gate.seen("arm", state)
 
     def latch_clock(self) -> Latch:
         """See `Arm.latch_clock`."""
@@ -112,6 +117,7 @@ class GatedArm(Gated[Arm]):
         def begin() -> ArmMotion:
             # Should the start fail, the arm may move all the same: what its motion before ended with holds no more.
             situation.last = None
+            situation.way = command.arguments.get("joints") if command.name == "follow" else None
             situation.last = motion = start()
             return motion
 
@@ -161,7 +167,9 @@ class GatedRail(Gated[Rail]):
 
     def state(self) -> RailState:
         """See `Rail.state`."""
-        return self.bare.state()
+        state = self.bare.state()
+        self.gate.seen("rail", state)
+        return state
 
     def home(self) -> Motion:
         """See `Rail.home`."""
@@ -200,7 +208,9 @@ class GatedVehicle(Gated[Vehicle]):
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """See `Vehicle.state`."""
-        return self.bare.state(max_age)
+        state = self.bare.state(max_age)
+        self.gate.seen("vehicle", state)
+        return state
 
     def check(self) -> None:
         """See `Vehicle.check`."""
@@ -232,6 +242,7 @@ class GatedVehicle(Gated[Vehicle]):
 
     def brake(self) -> None:
         """See `Vehicle.brake`."""
+        self.gate.asked(Command("vehicle", "brake"))
         self.bare.brake()
 
 
@@ -256,4 +267,6 @@ class GatedClaw(Gated[Claw]):
     @property
     def holding(self) -> bool:
         """See `Claw.holding`."""
-        return self.bare.holding
+        holding = self.bare.holding
+        self.gate.seen("claw", {"holding": holding})
+        return holding

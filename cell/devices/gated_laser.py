@@ -33,6 +33,7 @@ class GatedLaser(Gated[Laser]):
     def lit(self) -> Iterator[None]:
         """See `Laser.lit`. Goes off, and raises `InterlockError` at the end, when it is not renewed every 20 s."""
         with ExitStack() as held:
+            held.callback(lambda: self.gate.asked(Command("laser", "off")))
             self.gate.begin(Command("laser", "lit"), lambda: held.enter_context(self.bare.lit()), held.close)
             self._renewed, self._slept, self._off = self._clock.now(), False, False
             with self._clock.alarm(self._limit, self._look):
@@ -53,7 +54,9 @@ class GatedLaser(Gated[Laser]):
     @property
     def is_on(self) -> bool:
         """See `Laser.is_on`."""
-        return self.bare.is_on
+        on = self.bare.is_on
+        self.gate.seen("laser", {"on": on})
+        return on
 
     @property
     def _limit(self) -> float:

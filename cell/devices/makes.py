@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
 from cell.device_config import DeviceConfig
@@ -71,13 +71,13 @@ def make_of(kind: str, name: str) -> AnyMake:
     raise ConfigError(f'no {kind} "{name}" is installed; known: {known}')
 
 
-def record_of(kind: str) -> Callable[[Any, Any], DeviceConfig]:
+def record_of(kind: str) -> Callable[[Any, Any, ValidationInfo], DeviceConfig]:
     """A pydantic validator that reads a device's table as the record of the make that its `driver` names.
 
     Without `driver` it is the built-in make of that kind.
     """
 
-    def read(value: Any, _handler: Any) -> DeviceConfig:
+    def read(value: Any, _handler: Any, info: ValidationInfo) -> DeviceConfig:
         if isinstance(value, KINDS[kind]):
             return value
         default = next(make for make in BUILT_IN if make.kind == kind)
@@ -91,7 +91,7 @@ def record_of(kind: str) -> Callable[[Any, Any], DeviceConfig]:
             make = make_of(kind, name)
         except ConfigError as error:
             raise _wrong_driver("value_error", name, {"error": ValueError(str(error))}) from error
-        record: DeviceConfig = make.record.model_validate(value)
+        record: DeviceConfig = make.record.model_validate(value, context=info.context)
         return record
 
     return read

@@ -14,16 +14,23 @@ from numpy.typing import ArrayLike
 
 from cell.geometry.camera import Array
 
+ROUNDING = 4e-15
+"""What is left of R Rᵀ − 1 when a rotation was brought back to the nearest true one."""
+
 
 def from_matrix(matrix: ArrayLike) -> pin.SE3:
-    """Pose of a homogeneous 4×4 matrix; the rotation is brought back to the nearest true rotation."""
+    """Pose of a homogeneous 4×4 matrix; the rotation is brought back to the nearest true rotation.
+
+    One that is true as far as doubles go stays as it is: a pose that was kept comes back to the last bit.
+    """
     m = np.asarray(matrix, dtype=np.float64)
     if m.shape != (4, 4) or not np.allclose(m[3], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(f"a pose must be a 4×4 matrix with last row 0 0 0 1, not of shape {m.shape}: {m.tolist()}")
     u, s, vt = np.linalg.svd(m[:3, :3])
     if abs(s - 1).max() > 1e-2 or np.linalg.det(m[:3, :3]) < 0:
         raise ValueError(f"the upper left 3×3 of a pose must be a rotation; its singular values are {s.tolist()}")
-    return pin.SE3(u @ vt, m[:3, 3].copy())
+    true = np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < ROUNDING
+    return pin.SE3(m[:3, :3].copy() if true else u @ vt, m[:3, 3].copy())
 
 
 def from_parts(translation: ArrayLike, rotation: ArrayLike | None = None) -> pin.SE3:

@@ -113,6 +113,12 @@ class ArmKinematics:
         pin.forwardKinematics(self.model, self._data, np.asarray(joints, dtype=np.float64))
         return pin.updateFramePlacement(self.model, self._data, self._flange).copy()
 
+    def placements(self, joints: Joints) -> list[pin.SE3]:
+        """At the joint angles (6,): each joint's frame in the one before it, the first in the base; then the flange in
+        the last joint's."""
+        pin.forwardKinematics(self.model, self._data, np.asarray(joints, dtype=np.float64))
+        return [*(self._data.liMi[k].copy() for k in range(1, 7)), self.joint6_from_flange]
+
     def jacobian(self, joints: Joints) -> NDArray[np.float64]:
         """(6, 6) flange velocity (linear, then angular, in flange axes) per joint speed."""
         jacobian: NDArray[np.float64] = pin.computeFrameJacobian(

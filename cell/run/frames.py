@@ -5,13 +5,15 @@ from __future__ import annotations
 import queue
 import threading
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
 import cv2
+import numpy as np
 
 from drivers.errors import CellError
-from drivers.interfaces import Frame
+from drivers.interfaces import Frame, Vector
 
 CAPACITY = 64
 """Frames that may wait to be written; with more, the sweep is held up rather than a frame lost."""
@@ -27,17 +29,41 @@ PNG = (
 """A third of the time of the default and no larger: choosing a filter for each row of a noisy picture gains nothing."""
 
 
+class Picture:
+    """A frame's file: its `name`, and its bytes once they are there."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._done = threading.Event()
+        self._png: bytes | None = None
+
+    def give(self, png: bytes | None) -> None:
+        """These are its bytes; None when there are none."""
+        self._png = png
+        self._done.set()
+
+    def png(self, timeout: float) -> bytes | None:
+        """Its bytes, or None when there are none after so many seconds on the wall."""
+        self._done.wait(timeout)
+        return self._png
+
+
+Listener = Callable[[str, Frame, Picture], None]
+"""Told of each frame that is kept: of what, the frame, and its file."""
+
+
 class FrameStore:
     """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless.
 
     `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
-    there was looking at.
+    there was looking at. `found` is where the board was seen last: the frame, and its points (n, 2) in px.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, listener: Listener | None = None) -> None:
         self.begin()
         self._folder = folder
-        self._waiting: queue.Queue[tuple[Path, Frame] | None] = queue.Queue(CAPACITY)
+        self._listener = listener
+        self._waiting: queue.Queue[tuple[Picture, Frame] | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
         self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
         self._thread.start()
@@ -46,6 +72,7 @@ class FrameStore:
         """A step begins: what the steps before it looked at is no longer recent."""
         self.recent: deque[str] = deque(maxlen=RECENT)
         self.last: tuple[str, Frame] | None = None
+        self.found: tuple[Frame, Vector] | None = None
 
     def keep(self, what: str, frame: Frame) -> None:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""
@@ -54,8 +81,11 @@ class FrameStore:
         name = f"{what}-{frame.frame_id:06d}.png"
         self.recent.append(name)
         self.last = what, frame
+        picture = Picture(name)
+        if self._listener is not None:
+            self._listener(what, frame, picture)
         try:
-            self._waiting.put((self._folder / name, frame), timeout=WRITE_TIMEOUT_S)
+            self._waiting.put((picture, frame), timeout=WRITE_TIMEOUT_S)
         except queue.Full:
             self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
             raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
@@ -67,13 +97,19 @@ class FrameStore:
 
     def _write(self) -> None:
         while (item := self._waiting.get()) is not None:
-            path, frame = item
+            picture, frame = item
+            path, data = self._folder / picture.name, None
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                if not cv2.imwrite(str(path), frame.image, PNG):
+                made, png = cv2.imencode(".png", frame.image, PNG)
+                if made:
+                    data = np.asarray(png).tobytes()
+                    path.write_bytes(data)
+                else:
                     self._failure = f"{path} could not be written"
             except Exception as error:  # the writer must go on emptying the queue
                 self._failure = f"{path}: {error}"
+            picture.give(data)
 
     def __enter__(self) -> FrameStore:
         return self

@@ -20,6 +20,8 @@ from cell.devices.injection import Injector
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.record.perception import save as save_perception
+from cell.record.recorder import Recorder, recorded
 from cell.report.figures import told
 from cell.report.html import table
 from cell.report.report import make_report
@@ -133,18 +135,20 @@ class JobRun:
             raise CellError(f"no run can be recorded in {root}: {error}") from error
         self.run.folder = folder
         try:
-            with run_log(folder):
-                return self._recorded(folder, journal, whereabouts)
+            with run_log(folder), recorded(folder, self.run, self.config, self.devices, self.calibration) as record:
+                return self._recorded(folder, journal, whereabouts, record)
         finally:
             journal.close()
 
-    def _recorded(self, folder: Path, journal: Journal, whereabouts: Whereabouts) -> RunOutcome:
+    def _recorded(
+        self, folder: Path, journal: Journal, whereabouts: Whereabouts, record: Recorder | None
+    ) -> RunOutcome:
         started = time.time()
         begun = self.devices.clock.now()
         open_before = self.devices.gate.is_open
         witness = None if self.truth is None else Witness(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
-        with FrameStore(folder / "frames") as frames:
+        with FrameStore(folder / "frames", None if record is None else record.frame) as frames:
             self.run.frames = frames
             here = Workplace(
                 self.config,
@@ -158,6 +162,7 @@ class JobRun:
                 self.earlier,
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
+                registered=self._registered,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),
@@ -174,6 +179,7 @@ class JobRun:
                 script=self._in_the_gate(self.script),
             )
             result = runner.run()
+        save_perception(folder, result)
         good = result.outcome in (Outcome.PLACED, Outcome.DONE)
         if good and open_before:
             # The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
@@ -205,7 +211,11 @@ class JobRun:
         )
 
     def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
+        self.run.registered = None
         self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
+
+    def _registered(self, base_from_surface: pin.SE3) -> None:
+        self.run.registered = base_from_surface
 
     def _following(self, following: Following) -> dict[str, Any]:
         try:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
+from cell.record.recorder import begin_record
 from cell.run.folder import REPORT, new_run, timeless, when, write_json
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
@@ -57,6 +59,8 @@ class Hands:
 class RecordedWork:
     """Work of one kind on the cell's devices, recorded below `root`; `info` goes into the journal and the report.
 
+    Without the `config` of the cell the devices' own doings are not recorded.
+
     `health(devices)` is called about ten times a second, and raises what must end the work whatever it does.
     """
 
@@ -66,6 +70,7 @@ class RecordedWork:
     root: Path
     info: Mapping[str, Any]
     health: Callable[[Devices], None] = require_healthy
+    config: CellConfig | None = None
 
     def perform(self, work: Callable[[Hands], Made]) -> Made:
         """Do `work` and record how it ended.
@@ -83,7 +88,8 @@ class RecordedWork:
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
-        frames = self.run.frames = FrameStore(folder / FRAMES)
+        record = None if self.config is None else begin_record(folder, self.run, self.config, self.devices)
+        frames = self.run.frames = FrameStore(folder / FRAMES, None if record is None else record.frame)
         try:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)
@@ -93,6 +99,8 @@ class RecordedWork:
         finally:
             if self.run.kind == self.kind:
                 self.run.tell(Event("run_ended", self.kind, {"outcome": outcome, "reason": reason}))
+            if record is not None:
+                record.close()
             report = {
                 "run": folder.name, "version": release(), "outcome": outcome, "reason": reason,
                 "started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2),

@@ -105,8 +105,12 @@ def job_source(name: str | Path) -> dict[str, object]:
     """For journal and report: the job's file and its hash, and the file and the hash of its mesh alone."""
     path = str(job_path(name).resolve())
     _, mesh = load_job(path)
-    shape = {"file": str(mesh.resolve()), "sha256": hashlib.sha256(mesh.read_bytes()).hexdigest()}
-    return {"job_file": path, "job_hash": job_hash(path), "mesh": shape}
+    return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(mesh)}
+
+
+def mesh_source(mesh: Path) -> dict[str, str]:
+    """A surface's file, and its hash alone."""
+    return {"file": str(mesh.resolve()), "sha256": hashlib.sha256(mesh.read_bytes()).hexdigest()}
 
 
 def job_hash(name: str | Path) -> str:

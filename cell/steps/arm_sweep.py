@@ -122,4 +122,5 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],
         middle_profile=middle[1],
+        seen=np.array(collector.frame_ids),
     )

@@ -61,6 +61,11 @@ def until_quiet(
         progress(0.8, f"waiting until the vehicle is quiet: the board goes to and fro by ±{1e3 * fix.swung:.2f} mm")
         wait(WAIT_S)
         fix = photograph()
+    return settled(fix, base_from_vehicle)
+
+
+def settled(fix: BoardFix, base_from_vehicle: pin.SE3) -> BoardFix:
+    """The newest photograph once no more is waited for: what still swings is in its covariance, and noted."""
     if not fix.swung:
         return fix
     unknown = swing_covariance(fix.swung, fix.base_from_board, base_from_vehicle)

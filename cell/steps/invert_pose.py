@@ -104,20 +104,25 @@ def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
     return sweep.slip.covariance(camera)
 
 
-def _at(here: Workplace, context: StepContext) -> PlacePose:
-    sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
-    times = np.concatenate([swath.times for swath in sweep.swaths])
-    taken = Lines(times, here.config.arm.vehicle_from_base.se3().inverse())
+def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:
+    """`invert_pose` where a job is done."""
+    taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse())
     try:
-        found = invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
+        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
     except NotObservable as refused:
         if not sweep.notes:
             raise
         # What is known too little may be where the laser points, which no more scanning mends.
         told = NotObservable(f"{refused}. Before: {'; '.join(sweep.notes)}", *refused.numbers)
         raise told.showing(seen=refused.seen) from refused
+
+
+def _at(here: Workplace, context: StepContext) -> PlacePose:
+    sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
+    found = inverted(here, sweep, scan, fix)
     for note in found.notes:
         context.note(text=note)
+    here.registered(found.base_from_surface)
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -23,7 +23,7 @@ class BoardFix:
     """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad.
 
     `views` are the points found in each of the `frames`; by ±`swung` m the board moved between them, 0 where that does
-    not show. `notes` are for people.
+    not show. `notes` are for people. `flange` (6,) is what the arm told meanwhile; `number` counts a run's photographs.
     """
 
     base_from_board: pin.SE3
@@ -34,6 +34,8 @@ class BoardFix:
     views: tuple[BoardView, ...] = ()
     swung: float = 0.0
     notes: tuple[str, ...] = ()
+    flange: Vector = field(default_factory=lambda: np.zeros(6))
+    number: int = 0
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -65,7 +67,8 @@ def photograph(
     Raises `RefusedError` with the reason: board not found, seen more obliquely than `limits.max_obliquity`, residual
     above `limits.max_residual`, or pose ambiguous; it shows the "frame" and the "view", as far as there is one.
     """
-    base_from_flange = from_ur(arm.state().flange)
+    flange = arm.state().flange
+    base_from_flange = from_ur(flange)
     frames: list[Frame] = []
     for k in range(count):
         if k:
@@ -98,7 +101,7 @@ def photograph(
     centre = transform(camera_from_board, views[0].object_points.mean(axis=0)[None])[0]
     swung = swing(views, float(centre[2]) / calibration.camera.fx)
     seen = base_from_camera * camera_from_board, covariance, residual, obliquity
-    return BoardFix(*seen, tuple(frames), tuple(views), swung)
+    return BoardFix(*seen, tuple(frames), tuple(views), swung, flange=flange)
 
 
 def _require(pose: BoardPose, limits: PhotoSection) -> None:

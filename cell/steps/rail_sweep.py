@@ -7,6 +7,7 @@ import numpy as np
 from cell.devices.devices import Devices
 from cell.devices.following import MOST_SCATTER
 from cell.geometry.poses import from_ur
+from cell.record.seen import RailPath
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
 from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
@@ -70,6 +71,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     times_known = [TimeBound(rail.name, "rail", sweep.time_bound), TimeBound.of(devices.scan_camera)]
     shift, variance = shift_by_times(times_known, scan.speed, errors.by_rail)
     samples = sweep.samples
+    devices.gate.seen("rail", RailPath(samples))
     moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
     deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
     residual = float(np.median(deviations)) if deviations else 0.0
@@ -94,4 +96,5 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
         points=sum(collector.counts[k] for k in lines),
         middle=middle[0],
         middle_profile=middle[1],
+        seen=np.array(collector.frame_ids),
     )

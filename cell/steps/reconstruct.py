@@ -23,6 +23,7 @@ from cell.reconstruction import (
 )
 from cell.reconstruction.cloud import Array, Indices
 from cell.reconstruction.seams import Motions
+from cell.record.seen import Lines
 from cell.steps.step import JobStep
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
@@ -93,11 +94,11 @@ def reconstruct(
     return Reconstruction(cloud, seams, by_calibration, by_poses)
 
 
-def _at(here: Workplace, context: StepContext) -> Reconstruction:
+def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
+    """`reconstruct` where a job is done; the cloud is `cloud.ply` in its folder."""
     path = here.folder / "cloud.ply"
     # The cloud of an earlier sweep must not be taken for this one's.
     path.unlink(missing_ok=True)
-    sweep = context.made(SweepRecord)
     head = here.calibration.scan
     return reconstruct(
         sweep,
@@ -108,6 +109,13 @@ def _at(here: Workplace, context: StepContext) -> Reconstruction:
         here.config.vehicle.lean_sigma,
         here.config.cell.sim,
     )
+
+
+def _at(here: Workplace, context: StepContext) -> Reconstruction:
+    sweep = context.made(SweepRecord)
+    made = reconstructed(here, sweep)
+    here.devices.gate.seen("scan_camera", Lines(made.cloud, sweep.times))
+    return made
 
 
 STEP = JobStep(Step("reconstruct", 60.0, on_wall=True), _at, Reconstruction, needs=(SweepRecord,))

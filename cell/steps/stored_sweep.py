@@ -29,11 +29,11 @@ from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Frame, Vector
 
 FILE = "sweep.npz"
-FORMAT = 3
+FORMAT = 4
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
-_ARRAYS = ("frame_ids", "times", "flanges", "rail", "line_spread", "covariance")
+_ARRAYS = ("lines", "frame_ids", "times", "flanges", "rail", "line_spread", "covariance", "seen")
 
 
 def frame_path(folder: Path, frame_id: int) -> Path:
@@ -100,7 +100,8 @@ class StoredSweep:
         if moved is not None:
             raise CalibrationStale(f"the board has moved by {moved} since the sweep of run {self.folder.name}")
         spread = fix.covariance + self.board_covariance
-        return replace(self.sweep, swaths=tuple(self._loosened(swath, spread) for swath in self.sweep.swaths))
+        swaths = tuple(self._loosened(swath, spread) for swath in self.sweep.swaths)
+        return replace(self.sweep, swaths=swaths, earlier=self.folder.name)
 
     def _loosened(self, swath: Swath, spread: Vector) -> Swath:
         """With the motion that may have gone unnoticed, (6, 6) at the board's origin, added to the flange's pose."""
@@ -112,7 +113,7 @@ class StoredSweep:
         """Let the run in `folder` hold the sweep too, so that it can be resumed in its turn."""
         (folder / "frames").mkdir(parents=True, exist_ok=True)
         for swath in self.sweep.swaths:
-            for frame_id in swath.frame_ids:
+            for frame_id in swath.seen:
                 shutil.copyfile(frame_path(self.folder, frame_id), frame_path(folder, frame_id))
         shutil.copyfile(self.folder / FILE, folder / FILE)
 
@@ -134,18 +135,18 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
     lost, residual, shift = stored[f"figures_{k}"]
     shape = (geometry.camera.height, geometry.camera.width)
     collector = Collector(geometry, scan, lambda frame: None, lambda fraction, text: None)
-    for frame_id in arrays["frame_ids"]:
+    for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)
         collector.see(Frame(image, int(frame_id), scan.exposure, 0.0, 0.0, 0.0))
-    middle = collector.require_frames("stored sweep", np.arange(len(collector.times)))
+    lines = arrays["lines"]
+    middle = collector.require_frames("stored sweep", lines)
     return Swath(
         builder=collector.builder,
-        lines=np.arange(len(collector.times)),
         **arrays,
         lost=int(lost),
         residual=float(residual),
         shift=float(shift),
-        points=sum(collector.counts),
+        points=sum(collector.counts[int(line)] for line in lines),
         middle=middle[0],
         middle_profile=middle[1],
     )

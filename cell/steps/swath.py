@@ -89,6 +89,8 @@ class Swath:
     (n, 4, 4) and the rail's position in `rail` (n,) at that time, and `line_spread` (n, 3), m in base axes, one
     standard deviation of the line's own place along the sweep.
 
+    `seen` are the ids of all its frames, in their order, also of those that made no line: how the stripe is found in a
+    frame rests on those before it.
     `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts the frames that the gaps of the frame
     ids tell of, and those left out because nothing tells where the arm was; `residual` in m is how far the readings
     scatter about an even motion, `shift` in m the farthest that the sweep may lie off because of its times.
@@ -108,6 +110,7 @@ class Swath:
     middle: Frame
     middle_profile: StripeProfile
     shift: float
+    seen: NDArray[np.intp]
 
     @property
     def base_from_flange(self) -> pin.SE3:

@@ -4,29 +4,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pinocchio as pin
 
 from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
 from cell.steps.swath import Swath
 from cell.vision import StripeProfile
-from drivers.interfaces import Frame
+from drivers.interfaces import Frame, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
     """What the sweeps brought, in their order; at least one. `pointing` of the laser and `slip` of the head, where a
-    witness told them; `doubts` for people: what of calibration and arm is not as one would have it."""
+    witness told them; `doubts` for people: what of calibration and arm is not as one would have it. `earlier` names the
+    run that swept, where it was another one."""
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
     doubts: tuple[str, ...] = ()
     slip: Slip | None = None
+    earlier: str = ""
 
     @property
     def base_from_flange(self) -> pin.SE3:
         """Where the flange was half-way through the first sweep."""
         return self.swaths[0].base_from_flange
+
+    @property
+    def times(self) -> Vector:
+        """When each line was taken, sweep after sweep, s."""
+        return np.concatenate([swath.times for swath in self.swaths])
 
     @property
     def middle(self) -> Frame:

@@ -17,6 +17,7 @@ from drivers.arm.rtde_link import PORT, RATE_HZ, VERSION, RtdeLink
 from drivers.clock import Clock
 from drivers.clock_map import Latch
 from drivers.errors import DeadlineError, NotConnectedError
+from drivers.traffic import Traffic
 
 _REGISTER = "input_int_register_47"
 """The last of those that are left to clients like this one; ur-rtde uses the first 24."""
@@ -26,14 +27,14 @@ _QUESTIONS, _LONG_S, _TIMEOUT_S = 20, 0.3, 3.0
 _STATE, _NUMBER = struct.Struct(">Bdi"), struct.Struct(">Bi")
 
 
-def latch_clock(name: str, address: str, clock: Clock) -> Latch:
+def latch_clock(name: str, address: str, clock: Clock, traffic: Traffic | None = None) -> Latch:
     """The shortest of several round trips, host times in s of `clock`, the arm's in s of its own.
 
     `DeadlineError` or `NotConnectedError` without an answer, `DeviceFault` (arm.refused) when another program holds the
     register; `name` is the arm's in them.
     """
     try:
-        with RtdeLink(address, clock, _TIMEOUT_S) as link:
+        with RtdeLink(address, clock, _TIMEOUT_S, traffic) as link:
             return _shortest(name, link, clock)
     except TimeoutError as error:
         raise DeadlineError(name, f"no answer within {_TIMEOUT_S:g} s when its clock was asked for") from error

@@ -11,6 +11,7 @@ import threading
 import time
 
 from drivers.errors import DeadlineError, NotConnectedError
+from drivers.traffic import Traffic
 
 PORT = 29999
 
@@ -26,10 +27,11 @@ def unknown(reply: str) -> bool:
 class Dashboard:
     """Asks the dashboard server of the arm at `address`; every call ends within `timeout` wall seconds."""
 
-    def __init__(self, name: str, address: str, timeout: float = 1.0) -> None:
+    def __init__(self, name: str, address: str, timeout: float = 1.0, traffic: Traffic | None = None) -> None:
         self._name = name
         self._address = address
         self._timeout = timeout
+        self._traffic = traffic or Traffic()
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None
         self._rest = b""
@@ -44,7 +46,10 @@ class Dashboard:
                 self._connect(deadline)
             assert self._socket is not None
             self._socket.sendall(command.encode() + b"\n")
-            return self._line(deadline)
+            self._traffic.sent(command)
+            reply = self._line(deadline)
+            self._traffic.received(reply)
+            return reply
         except TimeoutError as error:
             self._drop()
             raise DeadlineError(

@@ -9,6 +9,7 @@ import socket
 import struct
 
 from drivers.clock import Clock
+from drivers.traffic import Traffic
 
 PORT = 30004
 VERSION, RATE_HZ = 2, 500.0
@@ -21,8 +22,9 @@ class RtdeLink:
     Raises `TimeoutError` or another `OSError`.
     """
 
-    def __init__(self, address: str, clock: Clock, timeout: float) -> None:
+    def __init__(self, address: str, clock: Clock, timeout: float, traffic: Traffic | None = None) -> None:
         self._clock = clock
+        self._traffic = traffic or Traffic()
         self._deadline = clock.now() + timeout * clock.rate
         self._rest = b""
         self._socket = socket.create_connection((address, PORT), timeout=timeout)
@@ -36,15 +38,19 @@ class RtdeLink:
 
     def send(self, kind: str, payload: bytes) -> None:
         """One packet to the controller."""
-        self._socket.sendall(_HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload)
+        packet = _HEADER.pack(_HEADER.size + len(payload), ord(kind)) + payload
+        self._socket.sendall(packet)
+        self._traffic.sent(packet)
 
     def receive(self, kind: str) -> bytes:
         """The payload of the next packet of this kind; others are passed over."""
         while True:
-            size, got = _HEADER.unpack(self._take(_HEADER.size))
+            head = self._take(_HEADER.size)
+            size, got = _HEADER.unpack(head)
             if size < _HEADER.size:
                 raise ConnectionAbortedError(f"a packet of {size} bytes came, which is none of RTDE")
             payload = self._take(size - _HEADER.size)
+            self._traffic.received(head + payload)
             if chr(got) == kind:
                 return payload
 

@@ -55,7 +55,7 @@ class ArmSession:
         """
         self.setup = setup
         self.statistics = LinkStatistics()
-        self.dashboard = Dashboard(name, setup.address)
+        self.dashboard = Dashboard(name, setup.address, traffic=self.statistics.traffic)
         self.feed = StateFeed(name, clock, lambda: self.link.lost is not None, self.require_link, self.statistics)
         self._name = name
         self._clock = clock
@@ -116,6 +116,7 @@ class ArmSession:
         """Have the child do something; see `ArmLink.call`. `Aborted` when a stop overtook it."""
         self.require_control()
         self.require_link()
+        self.statistics.traffic.sent((name, arguments))
         problem = self.link.call(name, *arguments, deadline=deadline)
         if problem is not None:
             if problem[0] == "arm.stopped":
@@ -228,9 +229,11 @@ class ArmSession:
     # --- inside ---
 
     def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
-        return ArmLink(
-            self._name, self.setup, self._connect_timeout, self.feed.take, self._on_ended, self._on_lost, wanted
-        )
+        return ArmLink(self._name, self.setup, self._connect_timeout, self._take, self._on_ended, self._on_lost, wanted)
+
+    def _take(self, snapshot: Snapshot) -> None:
+        self.statistics.traffic.received(snapshot)
+        self.feed.take(snapshot)
 
     def _require_remote(self) -> None:
         """As `require_remote`; an arm that does not answer is left to the connection, which says more."""

@@ -162,7 +162,7 @@ class UrArm:
         """The arm's clock between two host times; see `drivers.interfaces.Arm`."""
         self._session.require_control()
         self._session.require_link()
-        return latch_clock(self.name, self._session.setup.address, self._clock)
+        return latch_clock(self.name, self._session.setup.address, self._clock, self.statistics.traffic)
 
     def _state(self, snapshot: Snapshot) -> ArmState:
         return ArmState(

@@ -74,6 +74,7 @@ class RobotiqLink:
                 before = time.monotonic()
                 try:
                     data = self._exchange(self._socket, request, reply)
+                    self._statistics.traffic.received(data)
                 except TimeoutError:
                     # A late reply would answer the next request: it dies with this connection.
                     self._statistics.count("timeouts")
@@ -111,6 +112,7 @@ class RobotiqLink:
             pass
         link.settimeout(REPLY_TIMEOUT_S)
         link.sendall(request)
+        self._statistics.traffic.sent(request)
         data = b""
         until = time.monotonic() + REPLY_TIMEOUT_S
         while True:

@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.traffic import Traffic
+
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""
 
@@ -30,10 +32,12 @@ class Identity:
 
 @dataclass
 class LinkStatistics:
-    """Health of a link since it was opened: round trips in seconds (newest 1000) and error counters by name."""
+    """Health of a link since it was opened: round trips in seconds (newest 1000) and error counters by name; and its
+    `traffic`, for whoever listens."""
 
     round_trips_s: list[float] = field(default_factory=list)
     errors: dict[str, int] = field(default_factory=dict)
+    traffic: Traffic = field(default_factory=Traffic, repr=False, compare=False)
 
     def add_round_trip(self, seconds: float) -> None:
         """Record one round trip, forgetting the oldest beyond 1000."""

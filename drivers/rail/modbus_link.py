@@ -231,6 +231,7 @@ class ModbusLink:
             time.sleep(left)
         before = self._clock.now()
         self._port.write(request)
+        self._statistics.traffic.sent(request)
         if self._echoes is None:
             data = self._learn_echo(request)
         else:
@@ -278,6 +279,7 @@ class ModbusLink:
     def _learn_echo(self, request: bytes) -> bytes:
         """The first reply, and whether this line repeats what is sent: many adapters to two wires hear themselves."""
         came = self._get(1) + self._rest()
+        self._statistics.traffic.received(came[1:])
         echoed = came.startswith(request)
         reply = came[len(request) :] if echoed else came
         if len(reply) >= 5 and _crc(reply[:-2]) == reply[-2:]:
@@ -286,6 +288,7 @@ class ModbusLink:
 
     def _get(self, count: int) -> bytes:
         data = bytes(self._port.read(count))
+        self._statistics.traffic.received(data)
         if len(data) < count:
             self._statistics.count("timeouts")
             raise FrameError(f"{len(data)} of {count} bytes came")

@@ -240,14 +240,18 @@ class TmclLink:
             raise TelegramError("no reply came to the question after the one before it")
         before = self._clock.now()
         sent = request.encode()
+        traffic = self._statistics.traffic
         self._port.write(sent)
+        traffic.sent(sent)
         data = self._port.read(TELEGRAM_BYTES)
+        traffic.received(data)
         echoed = data == sent
         if echoed:
             # Many adapters to a two-wire line hear themselves. No reply looks like its request: a status of 100 is no
             # type of a command that is sent here.
             self._statistics.count("echoes")
             data = self._port.read(TELEGRAM_BYTES)
+            traffic.received(data)
         after = self._clock.now()
         if len(data) < TELEGRAM_BYTES:
             self._statistics.count("timeouts")

@@ -119,8 +119,10 @@ class RelayPort:
             with self._held() as port:
                 before = time.monotonic()
                 port.write(request)
+                self.statistics.traffic.sent(request)
                 data = bytes(port.read_until(end, _LONGEST))
                 took = time.monotonic() - before
+            self.statistics.traffic.received(data)
             try:
                 if not data.endswith(end):
                     self.statistics.count("timeouts")
@@ -142,6 +144,7 @@ class RelayPort:
         with self._held() as port:
             port.write(words)
             port.flush()
+            self.statistics.traffic.sent(words)
 
     def touch(self) -> None:
         """See that the port is still there, without sending a byte."""

@@ -102,6 +102,7 @@ class CanLink:
         try:
             with self._sending:
                 self._bus.send(frame, timeout=SEND_TIMEOUT_S)
+            self._statistics.traffic.sent(frame)
         except (can.CanError, OSError) as error:
             self._fail(f"sending {what}: {error}")
             self.check()
@@ -174,6 +175,7 @@ class CanLink:
                 if frame is not None:
                     if (heard := self._heard) is not None:
                         heard.append((time.monotonic(), frame))
+                    self._statistics.traffic.received(frame)
                     self._handle(frame)
             except (ValueError, IndexError):
                 self._statistics.count("malformed")

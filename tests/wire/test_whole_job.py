@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from can.io.canutils import CanutilsLogReader
 
+from cell.record.export import as_candump
+from cell.record.information import information
+from drivers.vehicle.agilex_link import load_database
 from tests.wire.cells import Supervised, assert_safe, cell, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
@@ -66,6 +70,22 @@ def test_the_run_folder_holds_everything(place: Path, placed: dict[str, Any]) ->
     base = sqlite3.connect(folder / "journal.sqlite")
     done = [name for (name,) in base.execute("SELECT name FROM steps WHERE state = 'done' ORDER BY id")]
     assert done == [step["name"] for step in placed["steps"]]
+
+
+def test_the_record_holds_what_passed_on_the_wires(place: Path, placed: dict[str, Any], tmp_path: Path) -> None:
+    record = place / "runs" / placed["run"] / "record.mcap"
+    told = information(record)
+    messages = {channel["topic"]: channel["messages"] for channel in told["channels"]}
+    assert told["whole"] and told["dropped"] == {}
+    assert min(messages[topic] for topic in ("/vehicle/can", "/rail/serial", "/arm/rtde")) > 500
+    # A simulated cell runs three times as fast as the wall, and so do its wires.
+    assert told["cpu_s"] < 0.09 * told["span_s"]
+    as_candump(record, tmp_path / "can.log")
+    with CanutilsLogReader(tmp_path / "can.log") as log:
+        frames = list(log)
+    names = {message.frame_id: message.name for message in load_database().messages}
+    assert "MotionCommand" in {names.get(frame.arbitration_id) for frame in frames if not frame.is_rx}
+    assert "SystemState" in {names.get(frame.arbitration_id) for frame in frames if frame.is_rx}
 
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:

@@ -21,6 +21,7 @@ from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError
 WARM_UP = 2
 """Jobs that are not counted: caches fill, compiled code is loaded."""
 PAUSE_S = 5.0
+"""Of the clock, before the next try of a job that could not be begun."""
 LEAST = 3
 """Jobs after those that a verdict needs."""
 MOST_GROWTH = {"memory_mb": 0.5, "threads": 0.1, "handles": 0.1}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from cell.job import Job
 from cell.run.frames import FrameStore
 from cell.run.job_run import JobRun, classify
 from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.resumption import mesh_source
 from cell.run.run import Run
 from cell.steps.kinds import PLACE
 from cell.steps.moves import Mover
@@ -57,7 +59,7 @@ class JobRecord:
     `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `kinematic` is the
     configured (6, 6) covariance of a place that the arm goes to, `placing` that of the flange each time it comes to
     rest; `rests` (n, 6) the joint angles at the end of each motion, rad; `shots` the truth at each line of the cloud,
-    sweep after sweep. `wall_s` are seconds on the wall by stage.
+    sweep after sweep. `wall_s` are seconds on the wall by stage; `folder` is the run's, where it was kept.
     """
 
     seed: int
@@ -75,6 +77,7 @@ class JobRecord:
     rests: Vector | None = None
     shots: list[Shot] = field(default_factory=list)
     wall_s: dict[str, float] = field(default_factory=dict)
+    folder: Path | None = None
 
 
 def run_whole_job(
@@ -86,18 +89,19 @@ def run_whole_job(
     progress: Progress | None = None,
     calibrated: JobRecord | None = None,
     stood: float = 0.0,
+    runs: Path | None = None,
 ) -> JobRecord:
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
     `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s
-    before the job.
+    before the job. With `runs` its run's folder is kept there.
     """
     assert nominal.source is not None
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:
-        with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
+        with nullcontext(runs) if runs else tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
             Run("job", lambda run: whole.perform(run, Path(folder), calibrated, stood)).result()
     except CellError as error:
         failure = classify(error)
@@ -128,7 +132,7 @@ class _WholeJob:
             with _Timed(record, "calibrate"):
                 work = RecordedWork(run, "calibration", devices, folder, self.cell.facts)
                 record.calibration = work.perform(self._calibrate)
-        assert record.calibration is not None
+        assert record.calibration is not None and self.nominal.source is not None
         whereabouts = Whereabouts(devices.vehicle)
         whereabouts.say_at_start()
         workplace = Workplace(
@@ -143,14 +147,14 @@ class _WholeJob:
             self.job,
             self.nominal,
             record.calibration,
-            self.cell.facts,
+            {**self.cell.facts, "mesh": mesh_source(self.nominal.source)},
             PLACE,
             inline=(self._follow,),
             truth=self.cell.truth,
         )
         with _Timed(record, "job"):
             ended = job_run.perform(folder, whereabouts)
-        record.results = dict(ended.results)
+        record.results, record.folder = dict(ended.results), ended.folder
         if ended.outcome != "placed":
             record.outcome, record.reason = ended.outcome, ended.reason
         if "laser_sweep" in record.results:

@@ -1,0 +1,247 @@
+"""Records a run: listens at the gate, on the wires, to the frames, the log and the run's events, for `record.mcap`.
+
+Whoever is listened to only puts what it has into a queue. On the wall's clock times are nanoseconds since the epoch; on
+the virtual clock they are the cell's own, so that the same seed gives the same record.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.calibration.store import CellCalibration
+from cell.config import DEVICES, CellConfig
+from cell.devices.devices import Devices
+from cell.devices.interlocks import Command
+from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
+from cell.record.channels import CAMERAS, GATED
+from cell.record.file import FILE, RecordFile, missing
+from cell.record.seen import Lines, RailPath
+from cell.record.sketch import Sketch
+from cell.record.times import Times
+from cell.record.words import as_json, rtde, wire
+from cell.run.frames import Picture
+from cell.run.run import Run
+from cell.steps.moves import deck_plates, mounted
+from drivers.interfaces import ArmState, Frame, RailState
+from statemachine.step import Event
+
+LOGGERS = ("cell", "drivers", "statemachine")
+READINGS_S, PROGRESS_S, GROWN_S = 1 / 30, 0.2, 1.0
+"""Seconds on the wall, or of the virtual clock, between two readings of a device and two words of progress; seconds of
+a sweep between two clouds that grow."""
+
+log = logging.getLogger(__name__)
+_said: set[str] = set()
+
+
+@contextmanager
+def recorded(
+    folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
+) -> Iterator[Recorder | None]:
+    """While the context is open, all that happens goes to `record.mcap` in `folder`; None where nothing can."""
+    record = begin_record(folder, run, config, devices, calibration)
+    try:
+        yield record
+    finally:
+        if record is not None:
+            record.close()
+
+
+def begin_record(
+    folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
+) -> Recorder | None:
+    """Begin to record; None, said once in a process, when the packages for it are not installed."""
+    if absent := missing():
+        if "packages" not in _said:
+            _said.add("packages")
+            names = " ".join(name.replace("_", "-") for name in absent)
+            log.warning("runs leave no %s, all else works: %s not installed; pip install %s", FILE, names, names)
+        return None
+    return Recorder(folder, run, config, devices, calibration)
+
+
+class Recorder(logging.Handler):
+    """A record that is going on; `close` ends it."""
+
+    def __init__(
+        self,
+        folder: Path,
+        run: Run[Any],
+        config: CellConfig,
+        devices: Devices,
+        calibration: CellCalibration | None,
+    ) -> None:
+        super().__init__(logging.INFO)
+        self._run, self._devices = run, devices
+        self._times = Times(devices.clock)
+        self._sketch = Sketch(config, devices, calibration)
+        facts = {"run": folder.name, "cell": config.cell.name, "clock": self._times.name}
+        self.file = RecordFile(folder / FILE, facts, lossless=self._times.virtual)
+        self._due: dict[str, float] = {}
+        self._bodies: dict[str, Body] = {}
+        self._fixed = (
+            *arm_bodies(config.arm.model),
+            *tool_bodies(mounted=mounted(config)),
+            *vehicle_bodies(deck_plates(config)),
+        )
+        self._about: tuple[object, object] = (None, None)
+        self._listen()
+
+    def close(self) -> None:
+        """Listen no more, and end the file. A failure is told in the log; the run has ended as it has all the same."""
+        self._deafen()
+        self.file.close()
+        if self.file.failure is not None:
+            log.warning("%s is not whole: %s", self.file.path, self.file.failure)
+        elif self.file.dropped:
+            what = ", ".join(f"{count} of {topic}" for topic, count in sorted(self.file.dropped.items()))
+            log.warning("%s does not hold all, too much came at once: %s are missing", self.file.path, what)
+        super().close()
+
+    def _listen(self) -> None:
+        self._put("/tf", self._times.now(), self._sketch.frames)
+        self._look_around()
+        self._devices.gate.listener = self
+        self._run.record = self.event
+        for name in LOGGERS:
+            logging.getLogger(name).addHandler(self)
+        for device in self._devices:
+            if device.name in DEVICES:
+                device.statistics.traffic.listener = self._wire(device.name)
+
+    def _deafen(self) -> None:
+        for device in self._devices:
+            device.statistics.traffic.listener = None
+        for name in LOGGERS:
+            logging.getLogger(name).removeHandler(self)
+        self._run.record = None
+        self._devices.gate.listener = None
+
+    # --- who tells ---
+
+    def event(self, event: Event) -> None:
+        """The run tells something."""
+        if event.kind == "progress" and not self._is_due("progress", PROGRESS_S):
+            return
+        at, data = self._times.of_wall(event.at), dict(event.data)
+        if event.kind == "state":
+            self._json("/sequence/state", at, data)
+        self._json("/sequence/event", at, {"kind": event.kind, "step": event.step or "", "data": data})
+
+    def command(self, command: Command, refused: str | None) -> None:
+        """See `cell.devices.gate.Listener`."""
+        if command.device in GATED:
+            told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
+            self._json(f"/{command.device}/command", self._times.now(), told)
+
+    def reading(self, device: str, reading: object) -> None:
+        """See `cell.devices.gate.Listener`."""
+        if isinstance(reading, RailPath):
+            for stamp, position in reading.samples.tolist():
+                at = self._times.of(stamp)
+                self._json("/rail/state", at, {"stamp": stamp, "position": position})
+                self._rail_at(at, position)
+        elif isinstance(reading, Lines):
+            self._lines(reading)
+        elif self._is_due(device, READINGS_S):
+            stamp = getattr(reading, "stamp", None)
+            at = self._times.now() if stamp is None else self._times.of(stamp)
+            self._json(f"/{device}/state", at, reading)
+            if isinstance(reading, ArmState):
+                self._put("/tf", at, partial(self._sketch.arm_at, state=reading))
+                self._put("/joints", at, partial(self._sketch.joints, state=reading))
+                self._look_around()
+            elif isinstance(reading, RailState):
+                self._rail_at(at, reading.position)
+
+    def frame(self, what: str, frame: Frame, picture: Picture) -> None:
+        """A frame is kept, see `cell.run.frames.FrameStore`."""
+        camera = self._camera_of(what, frame)
+        at = self._times.of(frame.mid_exposure)
+        told = {
+            "file": picture.name,
+            "frame_id": frame.frame_id,
+            "exposure": frame.exposure,
+            "device_time": frame.device_time,
+            "host_time": frame.host_time,
+            "received": frame.received,
+            "lost_before": frame.lost_before,
+        }
+        self._json(f"/{camera}/frame", at, told)
+        self._put(f"/{camera}/calibration", at, partial(self._sketch.lens, camera=camera))
+        self._put(f"/{camera}/image", at, partial(self._sketch.image, camera=camera, picture=picture))
+
+    def _camera_of(self, what: str, frame: Frame) -> str:
+        """Which camera took it, by its size; where both have the same, by what it is kept as."""
+        there = {name: getattr(self._devices, name).shape for name in CAMERAS if name in self._devices}
+        fits = [name for name, shape in there.items() if shape == frame.image.shape]
+        named = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
+        return fits[0] if len(fits) == 1 else named
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler.emit`."""
+        at = self._times.of_wall(record.created)
+        self._put("/log", at, partial(self._sketch.log_line, record=record, text=record.getMessage()))
+
+    def _wire(self, device: str) -> Callable[[bool, object], None]:
+        topic = {"arm": "/arm/rtde", "vehicle": "/vehicle/can"}.get(device, f"/{device}/serial")
+        put, tell = self.file.put, rtde if device == "arm" else wire
+
+        def listen(sent: bool, what: object) -> None:
+            put(topic, time.time_ns(), partial(tell, sent, what))
+
+        return listen
+
+    # --- what is made of it ---
+
+    def _rail_at(self, at: int, position: float) -> None:
+        self._put("/tf", at, partial(self._sketch.rail_at, position=position))
+        self._put("/joints", at, self._sketch.joints)
+
+    def _lines(self, lines: Lines) -> None:
+        """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""
+        points, times, seen = lines.cloud.points.astype(np.float32), lines.times, lines.cloud.valid
+        order = np.argsort(times, kind="stable")
+        due = float(times[order[0]]) + GROWN_S
+        for done, k in enumerate(order.tolist(), 1):
+            at = self._times.of(float(times[k]))
+            self._put("/cloud/line", at, partial(self._sketch.line, points=points[k][seen[k]]))
+            if times[k] >= due or done == len(order):
+                due = float(times[k]) + GROWN_S
+                so_far = np.sort(order[:done])
+                grown = partial(self._sketch.grown, points=points, seen=seen, lines=so_far)
+                self._put("/cloud/grown", at, grown)
+
+    def _look_around(self) -> None:
+        """Draw the bodies again where the part or the station changed."""
+        situation = self._devices.interlocks.situation
+        about = situation.part, situation.station
+        if about[0] is self._about[0] and about[1] is self._about[1]:
+            return
+        self._about = about
+        bodies = {body.name: body for body in (*self._fixed, *situation.part, *situation.station)}
+        gone = [name for name in self._bodies if name not in bodies]
+        new = [body for name, body in bodies.items() if self._bodies.get(name) is not body]
+        self._bodies = bodies
+        self._put("/scene", self._times.now(), partial(self._sketch.scene, new=new, gone=gone))
+
+    def _is_due(self, what: str, period: float) -> bool:
+        now = self._devices.clock.now()
+        if now < self._due.get(what, -1.0):
+            return False
+        self._due[what] = now + period * self._devices.clock.rate
+        return True
+
+    def _json(self, topic: str, at: int, told: object) -> None:
+        self.file.put(topic, at, partial(as_json, told))
+
+    def _put(self, topic: str, at: int, make: Callable[[int], bytes | None]) -> None:
+        self.file.put(topic, at, partial(make, at))

@@ -1,0 +1,222 @@
+"""Perception once more, from what a run kept: the same pictures and readings have to give the same cloud and pose.
+
+The run's folder is the truth: its PNG files, `sweep.npz` (where the scan head was at each line, from the rail's or the
+arm's readings), the flange at the photograph, job, configuration and calibration. The pictures in `record.mcap` have to
+be the same bytes. Everything is compared bit for bit: a difference means other code, other libraries, or changed files.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pinocchio as pin
+
+from cell.calibration.store import read_calibration
+from cell.config import CellConfig
+from cell.devices.assembly import behind_gate
+from cell.geometry.poses import difference, from_matrix
+from cell.inversion import NominalSurface
+from cell.job import Job
+from cell.reconstruction.ply import read_cloud
+from cell.record.file import FILE as RECORD
+from cell.record.perception import CLOUD, REPLAYED, load, of_points, sha256
+from cell.record.reading import messages
+from cell.run.frames import FrameStore
+from cell.steps.board_photo import settled
+from cell.steps.invert_pose import inverted
+from cell.steps.photograph import BoardFix, photograph
+from cell.steps.reconstruct import reconstructed
+from cell.steps.stored_sweep import StoredSweep
+from cell.steps.sweep_record import SweepRecord
+from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
+from cell.toml_file import restored
+from drivers.camera.folder import read_image
+from drivers.clock import Clock
+from drivers.errors import ConfigError, RefusedError
+from drivers.interfaces import Arm, ArmSafety, ArmState, Camera, Frame, Vehicle
+from statemachine.journal import JournalError, read
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One thing that was made again: `difference` says how far it is from what the run made, "" where not at all."""
+
+    what: str
+    difference: str
+
+    @property
+    def same(self) -> bool:
+        """Bit for bit."""
+        return not self.difference
+
+
+def replay(folder: Path, progress: Progress = lambda fraction, text: None) -> list[Compared]:
+    """Do it again and compare. `ConfigError` when the run cannot be replayed, `CellError` for a file that is broken."""
+    kept = load(folder)
+    config, job = restored(CellConfig, folder / "configuration.json"), restored(Job, folder / "job.json")
+    calibration = read_calibration(folder / "calibration.json")
+    nominal = _nominal(folder, job)
+    with tempfile.TemporaryDirectory(prefix="cell-replay-") as name, FrameStore(Path(name) / "frames") as frames:
+        nobody = behind_gate(config, Clock())
+        here = Workplace(
+            config, job, nominal, calibration, nobody, frames, Path(name), Whereabouts(cast(Vehicle, None))
+        )  # fmt: skip
+        progress(0.05, "photograph")
+        fix = _photograph(here, folder, kept["photograph"])
+        compared = [_compare_fix(fix, kept["photograph"])]
+        progress(0.15, "sweep")
+        sweep = _sweep(here, folder, fix, resumed=bool(kept["earlier_sweep"]))
+        compared += _perceive(here, folder, kept, sweep, fix, progress)
+    progress(0.95, "pictures of the record")
+    return compared + _pictures(folder)
+
+
+def _nominal(folder: Path, job: Job) -> NominalSurface:
+    try:
+        mesh = read(folder).run.info["mesh"]
+        path, expected = Path(mesh["file"]), mesh["sha256"]
+    except (JournalError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{folder.name} cannot be replayed: its journal does not name a surface ({error})") from error
+    if sha256(path) != expected:
+        raise ConfigError(f"{folder.name} cannot be replayed: its surface {path} is gone or was changed since")
+    return NominalSurface.load(path, unit=job.surface.mesh_unit)
+
+
+class _Kept:
+    """An arm and a camera that tell what those of the run told."""
+
+    def __init__(self, folder: Path, told: dict[str, Any], shape: tuple[int, int]) -> None:
+        self._flange = np.array(told["flange"])
+        self._files = [folder / "frames" / name for name in told["files"]]
+        self._shape = shape
+        self._next = 0
+
+    def state(self, max_age: float = 0.1) -> ArmState:
+        """Where the flange was at the photograph."""
+        nothing = np.zeros(6)
+        return ArmState(0.0, nothing, nothing, self._flange, nothing, ArmSafety.NORMAL, False, 0, 0)
+
+    def grab(self, timeout: float = 2.0) -> Frame:
+        """The next of its pictures."""
+        path = self._files[self._next]
+        self._next += 1
+        return Frame(read_image(path, self._shape), self._next, 0.0, 0.0, 0.0, 0.0)
+
+
+def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix:
+    camera = here.calibration.target.camera
+    seen = _Kept(folder, told, (camera.height, camera.width))
+    fix = photograph(
+        cast(Arm, seen),
+        cast(Camera, seen),
+        here.calibration.target,
+        here.board,
+        here.job.photo,
+        here.repeatability,
+        len(told["files"]),
+    )
+    return settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
+
+
+def _sweep(here: Workplace, folder: Path, fix: BoardFix, *, resumed: bool) -> SweepRecord:
+    stored = StoredSweep.load(folder, here.calibration.scan, here.job.scan, here.config.laser.exit_point)
+    return stored.confirmed_by(fix) if resumed else stored.sweep
+
+
+def _perceive(
+    here: Workplace, folder: Path, kept: dict[str, Any], sweep: SweepRecord, fix: BoardFix, progress: Progress
+) -> list[Compared]:
+    """Cloud and pose, or their refusal."""
+    compared = []
+    refused: dict[str, str] | None = None
+    scan = pose = None
+    step = REPLAYED[0]
+    try:
+        progress(0.5, step)
+        scan = reconstructed(here, sweep)
+        step = REPLAYED[1]
+        if kept["pose"] is not None or kept["refused"] is not None:
+            progress(0.6, step)
+            pose = inverted(here, sweep, scan, fix)
+    except RefusedError as error:
+        refused = {"step": step, "reason": str(error)}
+    cloud = _cloud_difference(folder, here.folder, kept["cloud_sha256"])
+    if not cloud and scan is not None and of_points(scan) != kept["points_sha256"]:
+        cloud = "the same to single precision only"
+    compared.append(Compared("cloud", cloud))
+    if kept["refused"] is not None or refused is not None:
+        same = kept["refused"] == refused
+        compared.append(Compared("refusal", "" if same else f"{_refusal(kept['refused'])}; now {_refusal(refused)}"))
+    if pose is not None and kept["pose"] is not None:
+        found = pose.base_from_surface
+        compared.append(Compared("place pose", pose_difference(found, kept["pose"]["base_from_surface"])))
+        compared.append(Compared("its covariance", _array_difference(pose.covariance, kept["pose"]["covariance"])))
+    return compared
+
+
+def _refusal(refused: dict[str, str] | None) -> str:
+    return "it was not refused" if refused is None else f"{refused['step']} refused: {refused['reason']}"
+
+
+def _compare_fix(fix: BoardFix, told: dict[str, Any]) -> Compared:
+    off = pose_difference(fix.base_from_board, told["base_from_board"])
+    return Compared("board's pose", off or _array_difference(fix.covariance, told["covariance"]))
+
+
+def pose_difference(found: pin.SE3, told: list[list[float]]) -> str:
+    """How far a pose is from a matrix (4, 4), "" for the same bits."""
+    if np.array_equal(found.homogeneous, np.array(told)):
+        return ""
+    off = difference(found, from_matrix(np.array(told)))
+    return f"off by {1e3 * np.linalg.norm(off[:3]):.3g} mm and {1e3 * np.linalg.norm(off[3:]):.3g} mrad"
+
+
+def _array_difference(found: Any, told: Any) -> str:
+    before = np.array(told)
+    if np.array_equal(found, before):
+        return ""
+    return f"off by up to {100 * np.abs(found - before).max() / np.abs(before).max():.3g} % of its largest figure"
+
+
+def _cloud_difference(folder: Path, again: Path, expected: str | None) -> str:
+    before, now = folder / CLOUD, again / CLOUD
+    if sha256(before) != expected:
+        return f"{before} was changed since the run wrote it"
+    if sha256(now) == expected:
+        return ""
+    clouds = [read_cloud(path).points if path.exists() else np.empty((0, 3)) for path in (before, now)]
+    if len(clouds[0]) != len(clouds[1]):
+        return f"{len(clouds[0])} points; now {len(clouds[1])}"
+    off = np.linalg.norm(clouds[0] - clouds[1], axis=1)
+    if not off.any():
+        return "the same points, written otherwise"
+    return f"{np.count_nonzero(off)} of {len(off)} points are elsewhere, up to {1e3 * off.max():.3g} mm"
+
+
+def _pictures(folder: Path) -> list[Compared]:
+    """The pictures in the record against the files."""
+    path = folder / RECORD
+    if not path.exists():
+        return []
+    names: dict[tuple[str, int], str] = {}
+    count, other = 0, []
+    for topic, at, message in messages(path, ("/scan_camera/", "/target_camera/")):
+        device, what = topic.strip("/").split("/")
+        if what == "frame":
+            names[device, at] = message["file"]
+        elif what == "image":
+            name = names.get((device, at), "")
+            file = folder / "frames" / name
+            count += 1
+            if not name or not file.is_file() or file.read_bytes() != message.data:
+                other.append(name or f"{device} at {at} ns")
+    listed = ", ".join(other[:3]) + (" …" if len(other) > 3 else "")
+    return [Compared(f"{count} pictures of the record", f"not those in frames/: {listed}" if other else "")]
