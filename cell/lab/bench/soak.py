@@ -34,7 +34,7 @@ def soak(
     """Repeat the job for `minutes` on the wall, at least once; what was counted, the growth and a verdict."""
     until, begun = time.monotonic() + 60.0 * minutes, time.monotonic()
     rows: list[dict[str, Any]] = []
-    with Cell.open(sim="all", seed=seed, speed=speed, job=job) as cell:
+    with Cell.open(sim="all", seed=seed, speed=speed, job=job, confirm="simulated") as cell:
         try:
             cell.calibration()
         except CalibrationStale:
