@@ -211,6 +211,7 @@ def test_the_sequence_its_commands_and_its_log_can_be_read_back(read: Messages) 
     assert any(m["kind"] == "step_done" and m["step"] == "place" for _, m in read["/sequence/event"])
     assert [m["name"] for _, m in read["/claw/command"]] == ["release"]
     assert [m["name"] for _, m in read["/laser/command"]].count("lit") >= 1
+    assert [m["name"] for _, m in read["/scan_camera/command"]][-2:] == ["stream", "stream ended"]
     assert "sweep" in [m["name"] for _, m in read["/rail/command"]]
     assert {message.level for _, message in read["/log"]} <= {2, 3}
 

@@ -21,7 +21,7 @@ from cell.config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from cell.devices.interlocks import Command
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
-from cell.record.channels import CAMERAS, GATED
+from cell.record.channels import CAMERAS, COMMANDED
 from cell.record.file import FILE, RecordFile, missing
 from cell.record.seen import Lines, RailPath
 from cell.record.sketch import Sketch
@@ -138,7 +138,7 @@ class Recorder(logging.Handler):
 
     def command(self, command: Command, refused: str | None) -> None:
         """See `cell.devices.gate.Listener`."""
-        if command.device in GATED:
+        if command.device in COMMANDED:
             told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
             self._json(f"/{command.device}/command", self._times.now(), told)
 
