@@ -55,6 +55,7 @@ GROUPS = (
     (
         "test_virtual_door.py",
         "test_report.py",
+        "test_report_page.py",
         "test_end_screen.py",
         "test_direct_devices.py",
         "test_described_jobs.py",
@@ -74,35 +75,34 @@ GROUPS = (
     ("test_interlocks.py",),
     ("test_calibration.py",),
 )
-"""Groups of files in the order in which they begin. Other files over the wires end the first one; any other is a group
-of its own, after them."""
+"""Groups of files in the order in which they begin, the wires first. Other files over the wires end the first one,
+those of `SCREENS` the second; any other is a group of its own, after them."""
 
 VIRTUAL_JOB = 2
 """The group whose files share `placed_pot`."""
 
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
-NICE = (5, 0)
-COMPUTES = 19
-"""How much each group gives way, and those after them: a single device's times are compared to milliseconds, a whole
-cell keeps deadlines of seconds on the wall, and what only computes gets what the others leave."""
+SCREENS = (HERE / "browser", HERE / "console")
+WHOLE_CELL, COMPUTES = 5, 19
+"""How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
+deadlines of seconds on the wall, and what only computes gets what the others leave."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
 
 
 def place(file: Path) -> tuple[int, int]:
     """Which group a file belongs to, and where in it it comes."""
-    return PLACES.get(file, (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0))
+    if file in PLACES:
+        return PLACES[file]
+    if file.parent in SCREENS:
+        return 1, len(GROUPS[1])
+    return (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what lasts longest."""
     items.sort(key=lambda item: place(item.path))
-    for item in items:
-        if "placed_pot" in getattr(item, "fixturenames", ()) and place(item.path)[0] != VIRTUAL_JOB:
-            raise pytest.UsageError(
-                f"{item.path.name} uses placed_pot, which takes 20 s for each worker: add it to the third of GROUPS"
-            )
 
 
 class Grouped(LoadFileScheduling):
@@ -129,11 +129,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A worker gives way to those whose times matter more; it may not take that back, so the wires come first."""
+    """A worker gives way to those whose times matter more; it may not take that back, so its groups come in that order.
+
+    By the place of the file and not by its marker: a file that only computes may stand among devices.
+    """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     group, _ = place(item.path)
-    wanted = NICE[group] if group < len(NICE) else COMPUTES
+    if group >= VIRTUAL_JOB:
+        wanted = COMPUTES
+    else:
+        wanted = WHOLE_CELL if group == 0 or item.path.parent in SCREENS else 0
     if os.nice(0) < wanted:
         os.nice(wanted - os.nice(0))
 

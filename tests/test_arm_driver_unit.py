@@ -263,8 +263,19 @@ def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
     assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
 
 
-@pytest.mark.parametrize(("status", "unlocks"), [("REDUCED", True), ("PROTECTIVE_STOP", False)])
-def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, status, unlocks):
+@pytest.mark.parametrize("known", ["safetystatus", "safetymode"])
+@pytest.mark.parametrize(
+    ("status", "why"),
+    [
+        ("REDUCED", ""),
+        ("PROTECTIVE_STOP", "a person confirms"),
+        ("RECOVERY", "outside its safety limits"),
+        ("SYSTEM_THREE_POSITION_ENABLING_STOP", "the safeguard is open"),
+        ("VIOLATION", "reports a fault"),
+    ],
+)
+def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, status, why, known):
+    """Before PolyScope 5.4 a controller knows only the safety mode."""
     asked = []
 
     def serve():
@@ -273,16 +284,17 @@ def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, s
             client.sendall(b"Connected\n")
             for question in client.makefile("rb"):
                 asked.append(question.decode().strip())
-                client.sendall(f"Safetystatus: {status}\n".encode())
+                reply = f"Safetystatus: {status}" if asked[-1] == known else f"could not understand: '{asked[-1]}'"
+                client.sendall(f"{reply}\n".encode())
 
     threading.Thread(target=serve, daemon=True).start()
     dashboard = Dashboard("arm", server.getsockname()[0])
-    if unlocks:
+    if not why:
         unlock("arm", dashboard, Clock(), False, lambda: None)
     else:
-        with pytest.raises(DeviceFault, match="a person confirms"):
+        with pytest.raises(DeviceFault, match=why):
             unlock("arm", dashboard, Clock(), False, lambda: None)
-    assert asked == ["safetystatus"]
+    assert asked == ["safetystatus", "safetymode"][: 1 if known == "safetystatus" else 2]
     dashboard.close()
 
 

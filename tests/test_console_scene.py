@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
 from cell.config import load_config
 from cell.console.scene import MOST_TRIANGLES, coarser, scene
+from cell.console.scene_now import MOST_POINTS, SceneNow
+from cell.devices.interlocks import Situation
 from cell.job import load_job
+from cell.motion.bodies import BASE, PLACED, box, station_bodies
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 
 PAGE = Path(__file__).parent.parent / "cell" / "console" / "page"
@@ -95,6 +99,41 @@ def test_a_mesh_is_made_coarser_without_leaving_its_place() -> None:
     assert np.abs(off).max() < 1e-4
     normals = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
     assert (normals[:, 2] > 0).all()
+
+
+class Moving:
+    """A motion of the arm that goes on until it is told otherwise."""
+
+    done = contact = False
+
+    def wait(self, timeout: float) -> None:
+        raise AssertionError("whoever draws waits for nothing")
+
+
+def test_place_part_and_way_are_told_as_planner_and_steps_have_them() -> None:
+    arm, rotation = Kinematics(UR10E_DH), pin.rpy.rpyToMatrix(0.02, -0.01, 0.7)
+    situation = Situation(
+        arm=None, vehicle=None, laser=None, claw=None, outputs={}, clear=lambda *_: [], postures={}, configuration="",
+        forward=lambda joints: pin.SE3(arm.forward(np.asarray(joints))),
+    )  # fmt: skip
+    now = SceneNow()
+    assert now.as_dict(situation) == {"place": None, "part": None, "path": None}
+    base_from_place = pin.SE3(rotation, np.array([0.7, 0.1, 0.05]))
+    base_from_part = base_from_place * pin.SE3(np.eye(3), np.array([0.0, 0.01, 0.012]))
+    lying = base_from_part * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.010]))
+    board = pin.SE3(np.eye(3), np.array([0.1, 0.3, 0.12]))
+    situation.station = (*station_bodies(base_from_place, board), box(PLACED, BASE, lying, (0.07, 0.036, 0.02)))
+    motion = Moving()
+    situation.way, situation.last = np.linspace(POSTURES[0], POSTURES[1], 500), motion
+    told = json.loads(json.dumps(now.as_dict(situation)))
+    np.testing.assert_allclose(matrix(told["place"]), base_from_place.homogeneous, atol=1e-8)
+    np.testing.assert_allclose(matrix(told["part"]), base_from_part.homogeneous, atol=1e-8)
+    points = told["path"]["points"]
+    assert len(points) <= MOST_POINTS
+    for joints, point in ((POSTURES[0], points[0]), (POSTURES[1], points[-1])):
+        np.testing.assert_allclose(point, arm.forward(joints)[:3, 3], atol=1e-4)
+    motion.done = True
+    assert now.as_dict(situation)["path"] is None
 
 
 def test_without_a_job_there_is_neither_part_nor_station() -> None:

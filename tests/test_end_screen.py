@@ -232,3 +232,11 @@ def test_a_report_with_rows_that_are_none_is_refused(tmp_path: Path) -> None:
     write_json(tmp_path / "report.json", {"outcome": "placed", "steps": ["drive"]})
     with pytest.raises(CellError, match="not the report of a run"):
         read_report(tmp_path)
+
+
+def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
+    remedy = "Scan more of the surface, or photograph the board more often"
+    reason = f"{'; '.join(f'translation {k} is not determined: 0.181 mm > 0.1 mm' for k in range(9))}. {remedy}"
+    lines = end_screen({"outcome": "refused", "reason": reason}, tmp_path)
+    assert lines[2] == remedy
+    assert lines[1].endswith(" …")

@@ -19,7 +19,7 @@ from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.command import calibrate_folder
 from cell.calibration.recorded.folder import RecordedFrame, read_frames
 from cell.calibration.recorded.listing import list_folder
-from cell.calibration.recorded.series import match_series, read_series
+from cell.calibration.recorded.series import in_order_of_views, match_series, read_series
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
@@ -620,6 +620,27 @@ def test_three_pictures_of_one_place_are_one_frame(tmp_path, pictures):
     (used,) = [f for f in frames if f.reason is None]
     assert (used.name, used.stripe_from, used.stripe_off) == ("03_board.png", "03_laser_on.png", "03_laser_off.png")
     assert {f.reason.value for f in frames if f is not used} == {"laser_picture"}
+
+
+def test_pictures_that_a_program_made_of_others_are_set_aside_and_take_no_pose(tmp_path, pictures):
+    """Drawn and straightened copies beside the pictures: some by name, some by size; poses name none."""
+    (tmp_path / "poses.txt").write_text("\n".join(row([*p[:3, 3], *quaternion(p)]) for p in POSES[:5]))
+    made = []
+    for k, path in enumerate(sorted(pictures.iterdir())[:5]):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        (tmp_path / f"{k}.png").symlink_to(path)
+        made += [tmp_path / f"{k}_corners.png", tmp_path / f"Calibrated{k}.png"]
+        cv2.imwrite(str(made[-2]), image[::-1])
+        cv2.imwrite(str(made[-1]), image[6:-6, 8:-8])
+    listing = list_folder(tmp_path)
+    (poses,), _, _ = read_series(listing)
+    assert match_series([poses], listing, [])[0] == []
+    frames, _ = read_frames(listing, BOARD)
+    assert [f.name for f in frames if f.reason is None] == [f"{k}.png" for k in range(5)]
+    assert {f.reason.value for f in frames if f.path in made} == {"duplicate", "wrong_size"}
+    assert in_order_of_views(poses, frames)
+    found = attach_poses(frames, [poses], CAMERA, Options())
+    assert found.about["turn_deg"] < 0.1
 
 
 def test_a_copy_under_another_number_counts_once_and_with_another_pose_it_is_refused(recording):

@@ -112,7 +112,7 @@ def test_without_a_cell_or_a_terminal_the_commands_say_what_they_lack(
     begun = time.monotonic()
     told = CliRunner().invoke(app, ["watch", "--once"])
     assert told.exit_code == 0
-    assert told.stdout.count("where no device is") == 3
+    assert told.stdout.count("there is no cell.toml here") == 3
     assert time.monotonic() - begun < 20
     refused = CliRunner().invoke(app, ["jog"])
     assert "needs a terminal" in str(refused.exception)

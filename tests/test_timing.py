@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +14,16 @@ import pytest
 
 from cell.calibration import ScanCalibration
 from cell.calibration.collect.timing import collect_timing, look_at_shutter
+from cell.calibration.finding import find_calibration
+from cell.calibration.sessions import kept_if_refused
 from cell.calibration.solve.reference import Reference
-from cell.calibration.solve.results import KEPT, Quality
-from cell.calibration.store import CellCalibration
+from cell.calibration.solve.results import KEPT, Quality, TargetCalibration
+from cell.calibration.store import CellCalibration, save_calibration
 from cell.calibration.timing import Shutter, Timing, changed, link_of
 from cell.calibration.timing_fit import (
     TimedFrame,
     TimedSweep,
+    TimesRefused,
     find_shutter,
     find_timing,
     refuse_late,
@@ -37,7 +42,7 @@ from cell.run.run import Run
 from cell.steps.laser_sweep import times_known
 from cell.steps.moves import Mover
 from cell.vision import BoardView, parse_board
-from drivers.errors import RefusedError
+from drivers.errors import CalibrationStale, RefusedError
 from sim_backends.world import scene
 from tests.test_rail_sweep import ERRORS, sweep
 
@@ -195,6 +200,30 @@ def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_hol
     seen = look_at_shutter(short, cell.devices, mover, spoilt, lambda: None, lambda what, frame: None)
     assert seen.scan.shutter is None
     assert "whether the scan camera has a rolling shutter was not seen: the fine board stays" in seen.scan.notes[-1]
+
+
+@pytest.mark.parametrize("readout", [10e-3, 0.1e-3])
+def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(readout: float, tmp_path: Path) -> None:
+    """Else the job after a refused `cell calibrate` would go on with the calibration before it."""
+    head = replace(calibration(), bow_gain=np.zeros(KEPT))
+    target = TargetCalibration(CAMERA, pin.SE3.Identity(), np.eye(6), head.quality)
+    old = CellCalibration(head, target, {"scan_camera": "7"}, "as set up", time.time())
+    save_calibration(old, tmp_path / f"{old.name}.json")
+
+    def found() -> CellCalibration:
+        return find_calibration(tmp_path, old.identities, old.configuration, 60.0)
+
+    assert found().scan.refused == ""
+    rolls = readout > 1e-3
+    with suppress(TimesRefused), kept_if_refused(tmp_path, old.name):
+        refuse_rolling(readout, 1e-5)
+    if not rolls:
+        assert found().scan.refused == ""
+        return
+    with pytest.raises(CalibrationStale, match=r"holds no more.*rolling shutter: .*10\.0 ms.*cell calibrate"):
+        found()
+    save_calibration(replace(old, made=time.time()), tmp_path / f"{old.name}.json")
+    assert found().scan.refused == ""
 
 
 def test_it_is_stored_with_the_calibration() -> None:

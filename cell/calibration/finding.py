@@ -75,6 +75,11 @@ def find_calibration(
             f"the calibration of {newest.date} lies {-age / 3600:.1f} hours in the future, so its age is not known; "
             "set this machine's clock, or run `cell calibrate`"
         )
+    if newest.scan.refused:
+        raise CalibrationStale(
+            f"the calibration of {newest.date} holds no more, as was found since: {newest.scan.refused}. Then run "
+            "`cell calibrate`"
+        )
     return newest
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from cell.calibration.finding import find_calibration
 from cell.calibration.store import (
     CellCalibration,
     gathered,
+    read_calibration,
     save_calibration,
     save_with_observations,
     solve_observations,
 )
+from cell.calibration.timing_fit import TimesRefused
 from cell.calibration.verify.confirm import keep_confirmed
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
@@ -95,7 +98,8 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
         made = solve_observations(observations).calibration
         tell(0.98, "looking at the scan camera's shutter")
-        made = look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
+        with kept_if_refused(cell.calibrations_folder, made.name):
+            made = look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
         made = with_edge(config, devices, hands.keep, made)
         return replace(observations, witness=made.scan.witness), made
 
@@ -103,6 +107,22 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
     save_with_observations(calibration, observations, cell.calibrations_folder)
     tell(1.0, "stored")
     return calibration
+
+
+@contextmanager
+def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
+    """What is refused of the camera's times in this block holds for the stored calibration as well, and is kept there.
+
+    Else jobs would go on with one that was made before the camera was set otherwise.
+    """
+    try:
+        yield
+    except TimesRefused as refused:
+        path = folder / f"{name}.json"
+        if path.exists():
+            old = read_calibration(path)
+            save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
+        raise
 
 
 def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> Verification:
@@ -139,7 +159,8 @@ def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: 
         mover = cell.mover(job, hands.safe_point)
         cell.devices.interlocks.work_with(calibration.configuration)
         cell.devices.vehicle.recover()
-        timing = collect_timing(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
+        with kept_if_refused(cell.calibrations_folder, calibration.name):
+            timing = collect_timing(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
         return replace(calibration, scan=replace(calibration.scan, timing=timing))
 
     made = cell.recorded(run, "timing", work)

@@ -137,7 +137,7 @@ class CellCalibration:
             },
             "target_quality": _quality(target.quality),
             "shutter": None if scan.shutter is None else scan.shutter.summary(),
-            "notes": [*scan.notes, *scan.unread],
+            "notes": [*scan.notes, *scan.unread, *((scan.refused,) if scan.refused else ())],
         }
 
 

@@ -40,6 +40,10 @@ _TIME_S, _PLACE_M = 0.15e-3, 1e-6
 _ROUNDS = 3
 
 
+class TimesRefused(RefusedError):
+    """The scan camera's pictures do not show what was there when their stamps say: no calibration of it holds."""
+
+
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
     """A picture of the board from a moving rail: what it shows, and the rail's reading, m, at its stamped middle."""
@@ -134,9 +138,9 @@ def find_timing(
 
 
 def refuse_rolling(readout: float, sigma: float) -> None:
-    """Raise `RefusedError` for a last row that is exposed `readout` ± `sigma` s after the first one."""
+    """Raise `TimesRefused` for a last row that is exposed `readout` ± `sigma` s after the first one."""
     if abs(readout) > max(LEAST_READOUT_S, SURE * sigma):
-        raise RefusedError(
+        raise TimesRefused(
             f"the scan camera has a rolling shutter: its last row is exposed {1e3 * readout:.1f} ms after its "
             f"first one, allowed are {1e3 * LEAST_READOUT_S:g} ms. Switch it to a global shutter, or take another one",
             Measured("readout of the scan camera", 1e3 * readout, "ms", most=1e3 * LEAST_READOUT_S),
@@ -226,9 +230,9 @@ def _require(made: Timing, by_sigma: float, most_late: float) -> None:
 
 
 def refuse_late(late: float, sigma: float, most_late: float) -> None:
-    """Raise `RefusedError` for stamps that come `late` ± `sigma` s late, which is more than `most_late` s."""
+    """Raise `TimesRefused` for stamps that come `late` ± `sigma` s late, which is more than `most_late` s."""
     if abs(late) > most_late + 3 * sigma:
-        raise RefusedError(
+        raise TimesRefused(
             f"the scan camera's time stamps come {1e3 * late:.2f} ms late, scan_camera.late allows "
             f"{1e3 * most_late:g} ms: see the camera's and its driver's settings, or, if that is how this camera is, "
             f'write scan_camera.late = "{np.ceil(1e3 * abs(late)):g} ms", calibrate again and run `cell calibrate '

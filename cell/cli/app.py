@@ -7,7 +7,11 @@ from typing import Annotated
 
 import typer
 
+<<<<<<< HEAD
 from cell.cli import calibrate, commission, console, devices, export, new_job, record, run, runs, setup, sim, watch
+=======
+from cell.cli import calibrate, commission, console, devices, doctor, export, new_job, run, runs, setup, sim, watch
+>>>>>>> main
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
@@ -46,7 +50,11 @@ def _cell(
     console_log(verbose)
 
 
+<<<<<<< HEAD
 for group in (run, runs, record, export, calibrate, devices, commission, setup, new_job, console, watch):
+=======
+for group in (run, runs, export, calibrate, devices, doctor, commission, setup, new_job, console, watch):
+>>>>>>> main
     group.register(app)
 app.add_typer(sim.app, name="sim")
 

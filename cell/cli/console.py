@@ -56,6 +56,7 @@ def console(
     from cell.devices.mix import simulated_of
     from cell.supervisor import Cell
 
+    require_installed()
     address = Address(host, port, tuple(name or ()), token_file, certificate, key)
     address.checked()
     # At the wall's pace unless told otherwise: a person holds the buttons.
@@ -63,6 +64,16 @@ def console(
     with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job, speed=pace) as cell:
         ended = shown(cell, job, address, open_page=not no_open)
     raise typer.Exit(ended)
+
+
+def require_installed() -> None:
+    """`ConfigError` where the packages of the console are missing."""
+    from importlib.util import find_spec
+
+    from drivers.errors import ConfigError
+
+    if missing := [name for name in ("starlette", "uvicorn", "websockets") if find_spec(name) is None]:
+        raise ConfigError(f"the page's server needs {', '.join(missing)}; install: pip install -e '.[console]'")
 
 
 def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cell.cli import completing
 from cell.cli.options import (
     ConfigOption,
     JobOption,
@@ -37,7 +38,11 @@ def register(app: typer.Typer) -> None:
 
 def jog(
     device: Annotated[
-        str | None, typer.Argument(help="rail, arm or vehicle. Without it, a screen in this terminal, to jog by keys.")
+        str | None,
+        typer.Argument(
+            help="rail, arm or vehicle. Without it, a screen in this terminal, to jog by keys.",
+            autocompletion=completing.jogged,
+        ),
     ] = None,
     motion: Annotated[
         list[str] | None,
@@ -78,7 +83,9 @@ def jog(
 
 
 def home(
-    device: Annotated[str | None, typer.Argument(help="rail or arm alone; without it both.")] = None,
+    device: Annotated[
+        str | None, typer.Argument(help="rail or arm alone; without it both.", autocompletion=completing.homed)
+    ] = None,
     config: ConfigOption = None,
     sim: SimOption = None,
     seed: SeedOption = 1,
@@ -99,7 +106,10 @@ def home(
 
 def diag(
     device: Annotated[
-        list[str] | None, typer.Option("--device", "-d", help="Only this device; may be given more than once.")
+        list[str] | None,
+        typer.Option(
+            "--device", "-d", help="Only this device; may be given more than once.", autocompletion=completing.devices
+        ),
     ] = None,
     config: ConfigOption = None,
     sim: SimOption = None,

@@ -149,7 +149,14 @@ def _shown_path(folder: Path) -> str:
 
 def _cut_lines(text: str, width: int, most: int) -> list[str]:
     lines = textwrap.wrap(text, width, break_on_hyphens=False)
-    return lines if len(lines) <= most else [*lines[: most - 1], _cut(" ".join(lines[most - 1 :]), width)]
+    if len(lines) <= most:
+        return lines
+    # What to do about it stands at the end, and is not what is left out.
+    remedy = textwrap.wrap(text.rpartition(". ")[2], width, break_on_hyphens=False)
+    if not 0 < len(remedy) < most or ". " not in text:
+        return [*lines[: most - 1], _cut(" ".join(lines[most - 1 :]), width)]
+    head = most - len(remedy)
+    return [*lines[: head - 1], _cut(" ".join(lines[head - 1 :]), width), *remedy]
 
 
 def _cut(text: str, width: int) -> str:

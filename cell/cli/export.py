@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from cell.cli.options import ConfigOption, JsonOption, print_json
+from cell.cli.runs import RunArgument
 
 
 class Format(StrEnum):
@@ -26,7 +27,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    name: Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")] = None,
+    name: RunArgument = None,
     kind: Annotated[
         Format, typer.Option("--format", "-f", help="ply, e57: the points; stl, mesh: triangles (mesh: coloured PLY).")
     ] = Format.ply,

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from cell.cli import completing
+
 
 class Level(StrEnum):
     """How far the simulated world deviates from its nominal geometry."""
@@ -45,7 +47,10 @@ ConfigOption = Annotated[
 JobOption = Annotated[
     str,
     typer.Option(
-        "--job", "-j", help="A job file, or a name: NAME.toml of the present folder, else the job that ships."
+        "--job",
+        "-j",
+        help="A job file, or a name: NAME.toml of the present folder, else the job that ships.",
+        autocompletion=completing.jobs,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, nothing else.")]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from cell.cli import completing
 from cell.cli.options import (
     CellClock,
     ConfigOption,
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
     from cell.run.job_run import Observer, RunOutcome
     from cell.supervisor import Cell
 
-UntilOption = Annotated[str | None, typer.Option(help="End the run, done, after the step of this name.")]
+UntilOption = Annotated[
+    str | None,
+    typer.Option(help="End the run, done, after the step of this name.", autocompletion=completing.steps),
+]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -76,7 +80,11 @@ def dry_run(
     ] = CellClock.wall,
     inject: Annotated[
         list[str] | None,
-        typer.Option("--inject", help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.'),
+        typer.Option(
+            "--inject",
+            help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.',
+            autocompletion=completing.faults,
+        ),
     ] = None,
     confirm: Annotated[
         Confirm | None,
@@ -117,8 +125,9 @@ def dry_run(
         clock=clock.value,
     )
     if console:
-        from cell.cli.console import run_shown
+        from cell.cli.console import require_installed, run_shown
 
+        require_installed()
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
         _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)

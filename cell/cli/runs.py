@@ -7,9 +7,13 @@ from typing import Annotated
 
 import typer
 
+from cell.cli import completing
 from cell.cli.options import ConfigOption, JsonOption, print_json
 
-RunArgument = Annotated[str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.")]
+RunArgument = Annotated[
+    str | None,
+    typer.Argument(help="A run's folder, name or id. Without it, the newest.", autocompletion=completing.runs),
+]
 NoiseOption = Annotated[
     bool, typer.Option("--noise", help="Also show the noise that is assumed, and how several sweeps agree.")
 ]

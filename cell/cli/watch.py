@@ -45,7 +45,7 @@ def watch(
     source = find_config(config, simulated=True)
     loaded = load_config(source)
     console = Console(highlight=False)
-    with watching(loaded, beside(source) / loaded.cell.runs, whole) as cell:
+    with watching(loaded, beside(source) / loaded.cell.runs, whole, source is not None) as cell:
         if once or not sys.stdout.isatty():
             cell.lines()
             time.sleep(SETTLE_S)

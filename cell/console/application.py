@@ -25,6 +25,9 @@ from cell.console.pages import Pages
 MOST_BODY = 4096
 PAGE = Path(__file__).with_name("page")
 ENTER = "/enter"
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
 
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[tuple[int, Mapping[str, Any]]]]
 """What a page, by its id, wants done: status and answer."""
@@ -102,6 +105,7 @@ class Application:
             Route("/api/trend", self._trend),
             Route("/api/runs/{run}", self._run),
             Route("/api/runs/{run}/replay", self._replay),
+            Route("/api/runs/{run}/report.html", self._report),
             Route("/api/runs/{run}/pictures/{name}", self._picture),
             Route("/api/do", self._command, methods=["POST"]),
             WebSocketRoute("/live", self._live),
@@ -141,6 +145,11 @@ class Application:
 
     async def _replay(self, request: Request) -> Response:
         return _found(await run_in_threadpool(self._archive.replay, request.path_params["run"]))
+
+    async def _report(self, request: Request) -> Response:
+        page = await run_in_threadpool(self._archive.page, request.path_params["run"])
+        # It holds scripts and styles of its own: in a sandbox, from where it reaches nothing here.
+        return _found(None) if page is None else FileResponse(page, headers={"content-security-policy": REPORT_POLICY})
 
     async def _picture(self, request: Request) -> Response:
         path = self._archive.picture(request.path_params["run"], request.path_params["name"])

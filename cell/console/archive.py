@@ -5,6 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import subprocess
+import sys
+import tempfile
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,9 @@ RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
 TRACE = "trace.json"
 MOST_RUNS, MOST_PICTURES = 200, 60
+DRAW_S = 60.0
+_DRAW = "import sys; from pathlib import Path; from cell.report.page.make import write_page; "
+_DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
 class Archive:
@@ -25,6 +32,8 @@ class Archive:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._rows: dict[Path, dict[str, Any]] = {}
+        self._pages = tempfile.TemporaryDirectory(prefix="cell-console-")
+        self._drawing = threading.Lock()
 
     def runs(self) -> list[dict[str, Any]]:
         """Newest first; see docs/console.md."""
@@ -55,6 +64,27 @@ class Archive:
         if folder is None or not PICTURE.fullmatch(name):
             return None
         return next((path for path in (folder / name, folder / "frames" / name) if path.is_file()), None)
+
+    def page(self, name: str) -> Path | None:
+        """The report as one HTML file, drawn by a process of its own that gives way; None where it cannot be drawn."""
+        folder = self._folder(name)
+        if folder is None:
+            return None
+        page = Path(self._pages.name) / f"{name}.html"
+        with self._drawing:
+            if not page.exists() and not self._drawn(folder, page):
+                return None
+            if not (folder / "report.json").exists():
+                # A run that goes on is drawn anew each time.
+                return page.rename(page.with_suffix(".now.html"))
+        return page
+
+    def _drawn(self, folder: Path, page: Path) -> bool:
+        command = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)]
+        try:
+            return subprocess.run(command, capture_output=True, timeout=DRAW_S).returncode == 0
+        except (OSError, subprocess.TimeoutExpired):
+            return False
 
     def replay(self, name: str) -> dict[str, Any] | None:
         """How the cell moved in a run; None for one that left no trace."""

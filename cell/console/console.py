@@ -111,7 +111,7 @@ class Console:
         token = address.checked()
         self.link = ""
         self._cell = cell
-        self._told = told
+        self._told, self._gone = told, gone
         self._scheme = "http" if address.certificate is None else "https"
         self._names = address.hosts
         self._working = threading.BoundedSemaphore(MOST_AT_ONCE)
@@ -125,7 +125,7 @@ class Console:
             lambda fd: Setup(
                 fd, self.port, address.hosts, token, certificate, key, str(cell.runs_folder.resolve()), facts
             ),
-            bound, self._heard, self._stop, gone,
+            bound, self._heard, self._stop, self._left_alone,
         )  # fmt: skip
         self._look.start()
 
@@ -196,6 +196,12 @@ class Console:
             log.error("the stop from the page: %s", error)
             return str(error)
         return None
+
+    def _left_alone(self) -> None:
+        """The server has ended: with it all pages are gone."""
+        for row in self.desk.holders.rows():
+            self.desk.left(row["id"])
+        self._gone()
 
     def _say(self, client: str, words: dict[str, Any]) -> None:
         self._server.tell(Say(client, words))

@@ -15,6 +15,7 @@ from cell.console.messages import CloudPart, Happened, Picture, Show
 from cell.console.pictures import GrowingCloud, Pictures
 from cell.console.readings import Readings
 from cell.console.run_view import RunView
+from cell.console.scene_now import SceneNow
 from cell.console.trace import Trace, traced
 from cell.geometry.poses import from_ur
 from cell.job import load_job
@@ -48,6 +49,7 @@ class Look:
         self._named: tuple[Run[Any], str | None] | None = None
         self._pictures = Pictures()
         self._cloud = GrowingCloud()
+        self._now = SceneNow()
         self._last: dict[str, Any] | None = None
         self._faults: list[dict[str, Any]] = []
         self._count = 0
@@ -96,7 +98,8 @@ class Look:
         return {
             "type": "state", "n": self._count, "t": round(time.time(), 3),
             "cell_s": round(self._cell.devices.clock.now(), 3),
-            **readings.motion(), "run": told, "question": desk.questions.present(view if told is not None else None),
+            **readings.motion(), **self._now.as_dict(self._cell.devices.interlocks.situation), "run": told,
+            "question": desk.questions.present(view if told is not None else None),
             "last": self._last, "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
@@ -113,6 +116,8 @@ class Look:
         if self._view is None:
             return
         for event in self._view.news():
+            if (event["kind"], event["step"]) == ("step_started", "laser_sweep"):
+                self._cloud = GrowingCloud()
             self._tell(Happened(json.dumps(event, default=str)))
         if self._view.over:
             self._end_view()
@@ -158,8 +163,8 @@ class Look:
         arm = self._readings.arm
         flange = None if arm is None else from_ur(arm.flange).homogeneous
         rail = self._cell.devices.rail.motion if "rail" in self._cell.devices else None
-        part = self._cloud.increment(run, flange, rail)
-        if part is not None:
-            header, payload = part
-            folder = None if run.folder is None else run.folder.name
-            self._tell(CloudPart({**header, "run": folder}, payload))
+        folder = None if run.folder is None else run.folder.name
+        for part in (self._cloud.increment(run, flange, rail), self._cloud.final(run)):
+            if part is not None:
+                header, payload = part
+                self._tell(CloudPart({**header, "run": folder}, payload))

@@ -47,6 +47,7 @@ class Pages:
         self._numbers = itertools.count(1)
         self._pages: dict[str, Page] = {}
         self._cloud: list[bytes] = []
+        self._pictures: dict[str, bytes] = {}
 
     def by_key(self, key: object) -> Page | None:
         """The page that has this key."""
@@ -63,6 +64,12 @@ class Pages:
         """Something to one page, if it is still there."""
         if (page := self._pages.get(client)) is not None:
             page.mailbox.say(json.dumps(words))
+
+    def picture(self, camera: str, packed: bytes) -> None:
+        """A camera's newest, to all, and kept for those that come later."""
+        self._pictures[camera] = packed
+        for mailbox in self.mailboxes:
+            mailbox.show(camera, packed)
 
     def cloud(self, header: Mapping[str, Any], packed: bytes) -> None:
         """An increment of the cloud, to all, and kept for those that come later."""
@@ -89,6 +96,8 @@ class Pages:
         )
         for part in self._cloud:
             page.mailbox.cloud(part)
+        for camera, packed in self._pictures.items():
+            page.mailbox.show(camera, packed)
         sending = asyncio.create_task(self._send(page, socket))
         try:
             await self._hear(page, socket)

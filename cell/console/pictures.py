@@ -29,22 +29,27 @@ class Pictures:
 
     def __init__(self, target_names: tuple[str, ...] = ("board", "large", "target")) -> None:
         self._targets = target_names
-        self._given: Frame | None = None
+        self._given: tuple[Frame, object] | None = None
 
     def newest(self, run: Run[Any]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
         """Header and grey image (rows, columns), a copy; None when nothing new was looked at."""
         last = None if run.frames is None else run.frames.last
-        if last is None or last[1] is self._given:
+        if last is None or run.frames is None:
             return None
         what, frame = last
-        self._given = frame
+        found = run.frames.found
+        board = found[1] if found is not None and found[0] is frame else None
+        # Once more when the board was found in it.
+        if self._given == (frame, board is not None):
+            return None
+        self._given = frame, board is not None
         step = max(1, -(-frame.image.shape[1] // WIDTH))
         small = np.ascontiguousarray(frame.image[::step, ::step])
         header = {
             "type": "picture",
             "camera": "target_camera" if what.startswith(self._targets) else "scan_camera",
             "what": what, "width": small.shape[1], "height": small.shape[0], "scale": 1.0 / step,
-            "board": None, "stripe": None,
+            "board": None if board is None else (board / step).round(1).tolist(), "stripe": None,
         }  # fmt: skip
         if what == "stripe" and run.sweeping is not None:
             header["stripe"] = _stripe(run.sweeping.collector, frame, step)
@@ -71,6 +76,8 @@ class GrowingCloud:
         self._sweep = -1
         self._next = 0
         self._total = 0
+        self._points: list[NDArray[np.float32]] = []
+        self._told: object = None
 
     def increment(self, run: Run[Any], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
         """The lines that came since; `flange` (4, 4) is base_from_flange now and `rail` the rail's motion."""
@@ -102,7 +109,20 @@ class GrowingCloud:
         rows[:, :3] = points
         surface = present.base_from_surface
         rows[:, 3] = present.nominal.deviations((points - surface.translation) @ surface.rotation)
+        self._points.append(rows[:, :3])
         return {**header, "count": len(rows)}, rows.tobytes()
+
+    def final(self, run: Run[Any]) -> Sent | None:
+        """All points anew, with their distances from the surface where it was found; once, as soon as it was."""
+        found, present = run.registered, run.sweeping
+        if found is None or found is self._told or present is None or not self._points:
+            return None
+        self._told = found
+        points = np.concatenate(self._points)
+        deviations = present.nominal.deviations((points - found.translation) @ found.rotation)
+        rows = np.column_stack([points, deviations]).astype("<f4")
+        header = {"type": "cloud", "sweep": self._sweep, "from": 0, "reset": True, "final": True, "count": len(rows)}
+        return header, rows.tobytes()
 
 
 def _places(rail: object, times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,17 +39,28 @@ class Readings:
         self._rail_state: RailState | None = None
         self._rail_motion: object = None
         self._asked = 0.0
+        self._held: bool | None = None
         self._faults: dict[str, dict[str, str] | None] = {}
 
     def look(self, idle: bool) -> None:
-        """Take the newest readings; with `idle`, when nothing goes on, the rail is asked as well."""
+        """Take the newest readings; with `idle`, when nothing goes on, those with a line of their own are asked too."""
         devices, rate = self._devices, self._devices.clock.rate
         self.arm = self._of("arm", lambda: devices.arm.state(OLD_S * rate))
         self.vehicle = self._of("vehicle", lambda: devices.vehicle.state(OLD_S * rate))
-        self.laser = self._of("laser", lambda: devices.laser.is_on)
-        self._look_at_rail(idle)
+        resting = idle and time.monotonic() - self._asked > REST_S
+        if self._read_at_once("laser", resting):
+            self.laser = self._of("laser", lambda: devices.laser.is_on)
+        if self._read_at_once("claw", resting):
+            self._held = self._of("claw", lambda: devices.claw.holding)
+        self._look_at_rail(resting)
 
-    def _look_at_rail(self, idle: bool) -> None:
+    def _read_at_once(self, name: str, resting: bool) -> bool:
+        """Whether it is read now: what hangs on the arm is in the arm's state; another one has a line of its own."""
+        return name in self._devices and (resting or self._config.make(name).on_arm)
+
+    def _look_at_rail(self, resting: bool) -> None:
+        if resting:
+            self._asked = time.monotonic()
         if "rail" not in self._devices:
             return
         rail = self._devices.rail
@@ -57,8 +68,7 @@ class Readings:
         readings: Sequence[Any] = getattr(motion, "readings", ())
         if motion is not None and len(readings) and (not motion.done or motion is not self._rail_motion):
             self.rail = float(readings[-1][1])
-        if idle and time.monotonic() - self._asked > REST_S and (motion is None or motion.done):
-            self._asked = time.monotonic()
+        if resting and (motion is None or motion.done):
             self._rail_state = self._of("rail", rail.state)
             if self._rail_state is not None:
                 self.rail = self._rail_state.position
@@ -86,6 +96,7 @@ class Readings:
             "rail": None if self.rail is None else round(self.rail, 6),
             "vehicle": None if vehicle is None else _vehicle(vehicle),
             "laser": self.laser,
+            "holding": self._held,
         }
 
     def safety(self) -> dict[str, Any]:
@@ -136,9 +147,8 @@ class Readings:
                 return "homed" if self._rail_state.homed else "not homed"
             case "laser" if self.laser is not None:
                 return "on" if self.laser else "off"
-            case "claw":
-                held = self._of("claw", lambda: self._devices.claw.holding)
-                return "" if held is None else "holds a part" if held else "empty"
+            case "claw" if self._held is not None:
+                return "holds a part" if self._held else "empty"
         return ""
 
 

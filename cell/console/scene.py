@@ -52,8 +52,8 @@ def scene(config: CellConfig, job: str | Path | None = None, table: LinkTable | 
     return {
         "arm": {
             "model": config.arm.model,
-            "parent_from_joint": [_numbers(placement) for placement in placements],
-            "joint6_from_flange": _numbers(kinematics.joint6_from_flange),
+            "parent_from_joint": [numbers(placement) for placement in placements],
+            "joint6_from_flange": numbers(kinematics.joint6_from_flange),
             "home": HOME.round(6).tolist(),
         },
         "bodies": [_body(body) for body in (*arm_bodies(config.arm.model), *swept, *fixed)],
@@ -67,7 +67,7 @@ def scene(config: CellConfig, job: str | Path | None = None, table: LinkTable | 
             "target": _camera(config.target_camera, carried.target, SIGHT_M["target"]),
         },
         "sheet": _sheet(config, loaded),
-        "vehicle_from_base": _numbers(config.arm.vehicle_from_base.se3()),
+        "vehicle_from_base": numbers(config.arm.vehicle_from_base.se3()),
         "station": None if loaded is None or mesh is None else _station(config, loaded, mesh),
     }
 
@@ -86,13 +86,13 @@ def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, Any]:
     return {
         "bodies": [_body(body) for body in (*bodies, *station_obstacles(job.obstacle, pin.SE3.Identity()))],
         "surface": {
-            "place_from_surface": _numbers(place_from_surface),
+            "place_from_surface": numbers(place_from_surface),
             "vertices": vertices.round(6).ravel().tolist(),
             "triangles": triangles.ravel().tolist(),
         },
-        "surface_from_part": _numbers(job.place.surface_from_part.se3()),
-        "base_from_place": _numbers(base_from_place_at_target(config, job)),
-        "place_from_start": _numbers(job.approach.start.se3()),
+        "surface_from_part": numbers(job.place.surface_from_part.se3()),
+        "base_from_place": numbers(base_from_place_at_target(config, job)),
+        "place_from_start": numbers(job.approach.start.se3()),
     }
 
 
@@ -126,7 +126,7 @@ def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> 
     """Its mounting, and the half width and half height of what it sees at `depth` m."""
     half = 0.5 * depth * camera.pixel / camera.focal_length
     return {
-        "flange_from_camera": _numbers(flange_from_camera),
+        "flange_from_camera": numbers(flange_from_camera),
         "sight": [half * camera.width, half * camera.height, depth],
         "size": [camera.width, camera.height],
     }
@@ -137,13 +137,14 @@ def _body(body: Body) -> dict[str, Any]:
     return {
         "name": body.name,
         "parent": body.parent,
-        "placement": _numbers(body.placement),
+        "placement": numbers(body.placement),
         "size": _rounded(body.size),
         "radius": body.radius,
     }
 
 
-def _numbers(pose: pin.SE3) -> list[float]:
+def numbers(pose: pin.SE3) -> list[float]:
+    """The 16 numbers of its matrix, row after row."""
     return _rounded(pose.homogeneous.ravel())
 
 

@@ -193,8 +193,7 @@ class Server:
             case Answer():
                 self._answered(message)
             case (str() as camera, bytes() as picture):
-                for mailbox in self.pages.mailboxes:
-                    mailbox.show(camera, picture)
+                self.pages.picture(camera, picture)
             case (dict() as header, bytes() as part):
                 self.pages.cloud(header, part)
 

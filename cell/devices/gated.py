@@ -117,6 +117,7 @@ class GatedArm(Gated[Arm]):
         def begin() -> ArmMotion:
             # Should the start fail, the arm may move all the same: what its motion before ended with holds no more.
             situation.last = None
+            situation.way = command.arguments.get("joints") if command.name == "follow" else None
             situation.last = motion = start()
             return motion
 

@@ -44,9 +44,10 @@ class Situation:
     in rad, with these others about; `part` is what the claw holds and `station` what stands before the vehicle, as far
     as a run has told. `postures` are joint angles (6,) and `looks` base_from_flange in which the vehicle may drive, by
     name. `configuration` is the hash of this cell as configured, `calibrated` that of the calibration in use. `last` is
-    the newest motion of the arm, None when it is not known how that went; `purposes` what this thread lights the laser
-    for. `slowed(start, goal, speed, carried)` is the speed of a joint move that the tool speed allows. `clock` is the
-    one that the devices share.
+    the newest motion of the arm, None when it is not known how that went, and `way` the joint angles (n, 6) that it
+    follows, None for another kind of motion; `purposes` what this thread lights the laser for.
+    `slowed(start, goal, speed, carried)` is the speed of a joint move that the tool speed allows. `clock` is the one
+    that the devices share.
     """
 
     arm: Arm | None
@@ -61,6 +62,7 @@ class Situation:
     looks: dict[str, pin.SE3] = field(default_factory=dict)
     calibrated: str | None = None
     last: ArmMotion | None = None
+    way: Vector | None = None
     part: tuple[Body, ...] = ()
     station: tuple[Body, ...] = ()
     purposes: threading.local = field(default_factory=threading.local)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from drivers.errors import CellError
-from drivers.interfaces import Frame
+from drivers.interfaces import Frame, Vector
 
 CAPACITY = 64
 """Frames that may wait to be written; with more, the sweep is held up rather than a frame lost."""
@@ -56,7 +56,7 @@ class FrameStore:
     """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless.
 
     `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
-    there was looking at.
+    there was looking at. `found` is where the board was seen last: the frame, and its points (n, 2) in px.
     """
 
     def __init__(self, folder: Path, listener: Listener | None = None) -> None:
@@ -72,6 +72,7 @@ class FrameStore:
         """A step begins: what the steps before it looked at is no longer recent."""
         self.recent: deque[str] = deque(maxlen=RECENT)
         self.last: tuple[str, Frame] | None = None
+        self.found: tuple[Frame, Vector] | None = None
 
     def keep(self, what: str, frame: Frame) -> None:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""

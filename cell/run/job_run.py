@@ -162,6 +162,7 @@ class JobRun:
                 self.earlier,
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
+                registered=self._registered,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),
@@ -210,7 +211,11 @@ class JobRun:
         )
 
     def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
+        self.run.registered = None
         self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
+
+    def _registered(self, base_from_surface: pin.SE3) -> None:
+        self.run.registered = base_from_surface
 
     def _following(self, following: Following) -> dict[str, Any]:
         try:

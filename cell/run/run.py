@@ -24,6 +24,8 @@ from statemachine.step import Event, Observer
 from statemachine.watch import SignalInterrupt, SignalWatch, begin
 
 if TYPE_CHECKING:
+    import pinocchio as pin
+
     from cell.run.frames import FrameStore
     from cell.run.sweeping import Sweeping
 
@@ -39,8 +41,8 @@ class Run(Generic[Result]):
     """A run that was begun. Every method may be called from any thread.
 
     `kind` is job, calibration, verification, homing or jog. `folder` is where the run is recorded, None until then.
-    `frames` keeps what it looks at and `sweeping` its newest sweep, None before: whoever shows them
-    takes the newest from there.
+    `frames` keeps what it looks at and `sweeping` its newest sweep, None before, `registered` where the surface
+    was found in it (base_from_surface), None until then: whoever shows them takes the newest from there.
     """
 
     def __init__(self, kind: str, work: Callable[[Run[Result]], Result], observer: Observer | None = None) -> None:
@@ -49,6 +51,7 @@ class Run(Generic[Result]):
         self.folder: Path | None = None
         self.frames: FrameStore | None = None
         self.sweeping: Sweeping | None = None
+        self.registered: pin.SE3 | None = None
         self.control = RunControl()
         self.record: Observer | None = None
         """Told every event before the run goes on, progress as well; while the run is recorded."""

@@ -122,6 +122,7 @@ def _at(here: Workplace, context: StepContext) -> PlacePose:
     found = inverted(here, sweep, scan, fix)
     for note in found.notes:
         context.note(text=note)
+    here.registered(found.base_from_surface)
     return found
 
 

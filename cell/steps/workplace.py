@@ -41,7 +41,8 @@ class Workplace:
 
     `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `whereabouts` is
     kept over retries and runs: the vehicle may stand anywhere when a step is done again. `sweeping` is told who takes
-    the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface).
+    the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface),
+    `registered` where it was found.
     """
 
     config: CellConfig
@@ -55,6 +56,7 @@ class Workplace:
     earlier: StoredSweep | None = None
     needs_part: bool = True
     sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None
+    registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
     _photographs: int = field(default=0, init=False)
 
@@ -133,6 +135,7 @@ class Workplace:
             lambda frame: self.frames.keep(what, frame),
             lambda: self.devices.clock.sleep(APART_S),
         )
+        self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
         return replace(fix, number=self._photographs)

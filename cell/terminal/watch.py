@@ -105,8 +105,10 @@ class Watch:
 
 
 @contextmanager
-def watching(config: CellConfig, runs: Path, whole: bool) -> Iterator[Watch]:
+def watching(config: CellConfig, runs: Path, whole: bool, given: bool = True) -> Iterator[Watch]:
     """Look at the cell; with `whole` also what has one user only, which nobody else can use then.
+
+    No device is asked where the configuration is not one that somebody has `given`.
 
     Raises `InterlockError` when another process has a device that is to be looked at alone.
     """
@@ -116,7 +118,9 @@ def watching(config: CellConfig, runs: Path, whole: bool) -> Iterator[Watch]:
         for name in WATCHED:
             record = config.device(name)
             connect = partial(connect_one, config, name, clock, look=True)
-            if any(text.startswith(f"{name}.") for text in example_addresses(config)):
+            if not given:
+                connect = partial(_not_asked, "there is no cell.toml here; -c names your configuration")
+            elif any(text.startswith(f"{name}.") for text in example_addresses(config)):
                 connect = partial(_not_asked, "its address is the example's, where no device is")
             elif not shared(config, name) and not whole:
                 connect = partial(_alone, name, record.held)

@@ -16,6 +16,14 @@ from drivers.traffic import Traffic
 PORT = 29999
 
 
+_NOT_KNOWN = "could not understand"
+
+
+def unknown(reply: str) -> bool:
+    """Whether a server says so of a question that its version does not know."""
+    return reply.lower().startswith(_NOT_KNOWN)
+
+
 class Dashboard:
     """Asks the dashboard server of the arm at `address`; every call ends within `timeout` wall seconds."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.arm.dashboard import Dashboard
+from drivers.arm.dashboard import Dashboard, unknown
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 
@@ -81,7 +81,7 @@ def unlock(
     local control, and whatever `require_wanted` raises, which is asked before each try.
     """
     deadline = time.monotonic() + _UNLOCK_S
-    while (status := dashboard.ask("safetystatus").rpartition(":")[2].strip()) not in ("NORMAL", "REDUCED"):
+    while (status := _safety(dashboard)) not in ("NORMAL", "REDUCED"):
         if status != "PROTECTIVE_STOP":
             raise fault(device, next((code for word, code in _STATUS if word in status), "arm.safety_fault"), status)
         if not confirmed:
@@ -93,3 +93,9 @@ def unlock(
         if time.monotonic() > deadline:
             raise fault(device, "arm.protective_stop", f"it could not be unlocked: {reply}")
         clock.sleep(0.1 * clock.rate)
+
+
+def _safety(dashboard: Dashboard) -> str:
+    """The safety status in the maker's words; controllers before PolyScope 5.4 know it as the safety mode."""
+    reply = dashboard.ask("safetystatus")
+    return (dashboard.ask("safetymode") if unknown(reply) else reply).rpartition(":")[2].strip()

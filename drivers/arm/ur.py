@@ -19,6 +19,7 @@ import numpy as np
 
 from drivers.arm import health
 from drivers.arm.clock_latch import latch_clock
+from drivers.arm.dashboard import unknown
 from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
@@ -30,7 +31,7 @@ from drivers.clock_map import Latch
 from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
 from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, Reading, Vector
 from drivers.link_table import LinkTable
-from drivers.quantities import check_positive, shown
+from drivers.quantities import UNTOLD, check_positive, shown
 
 _FIRST_POINT = 0.02
 _WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45
@@ -109,11 +110,15 @@ class UrArm:
 
     def identity(self) -> Identity:
         """Model, serial number and controller version, asked of the dashboard server."""
-        dashboard = self._session.dashboard
-        version = dashboard.ask("PolyscopeVersion")
+        ask = self._session.dashboard.ask
+        # Versions before PolyScope 5.6 do not know all of these questions.
+        model, serial, version = (
+            UNTOLD if unknown(reply := ask(question)) else reply
+            for question in ("get robot model", "get serial number", "PolyscopeVersion")
+        )
         return Identity(
-            model=dashboard.ask("get robot model"),
-            serial=dashboard.ask("get serial number"),
+            model=model,
+            serial=serial,
             firmware=version.removeprefix("URSoftware").split("(")[0].strip(),
             address=self._session.setup.address,
         )

@@ -25,15 +25,6 @@ from tests.console.server import until
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
 
 
-@pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    folder = tmp_path_factory.mktemp("cell")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        with Cell.open(sim="all", seed=3, clock="virtual") as opened:
-            yield opened
-
-
 @pytest.fixture
 def desk(cell: Cell) -> Iterator[Desk]:
     made = Desk(cell, "pot", lambda client, words: None)
@@ -199,9 +190,10 @@ def test_nobody_is_asked_where_nobody_looks() -> None:
 
 
 def test_a_run_is_followed_by_its_own_events() -> None:
-    begun, end = threading.Event(), threading.Event()
+    seen, begun, end = threading.Event(), threading.Event(), threading.Event()
 
     def work(run: Run[Any]) -> None:
+        seen.wait(10)
         run.tell(Event("step_started", "board_photo", {"attempt": 1}))
         run.tell(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
         run.tell(
@@ -216,6 +208,7 @@ def test_a_run_is_followed_by_its_own_events() -> None:
 
     run: Run[Any] = Run("job", work)
     view = RunView(run, STEPS, "pot", {"board_photo": 10.0, "laser_sweep": 5.0, "reconstruct": 1.0})
+    seen.set()
     assert begun.wait(5)
     view.news()
     told = view.as_dict()

@@ -20,7 +20,7 @@ from cell.calibration.recorded.listing import Listing, list_folder
 from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
-from cell.calibration.recorded.series import Series, match_series, read_series
+from cell.calibration.recorded.series import Series, in_order_of_views, match_series, read_series
 from cell.calibration.recorded.solution import agreeing, camera_of, note_perhaps_no_laser, solve_frames
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
@@ -69,6 +69,9 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     frames, channel = read_frames(listing, spec, links, options.laser)
+    late = [one for one in series if not one.of and in_order_of_views(one, frames)]
+    belonging += late
+    strange = [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
     result = empty_result(spec)
     result["laser"] = channel_dict(channel)
     result["notes"] += _doubtful_lines(frames)

@@ -103,6 +103,9 @@ def decide(
             f"scatter; {_shifted(series, boards, wanted, setup, shifts)}"
         )
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
+    if rival is not None:
+        # The same poses in another file are no other meaning.
+        rival = next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
     if rival is not None and not clearly_worse(rival, best):
         raise RefusedError(_question(best, rival))
     return Decision(best, rival, by_name, sorted(own))

@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.listing import PICTURES, Listing
-from cell.calibration.recorded.matching import frame_key
+from cell.calibration.recorded.matching import frame_key, made_of_others
 from cell.calibration.recorded.places import Place, find_places, named_lit
 from cell.calibration.recorded.stripes import Channel, ReadStripe, Source, choose_channel, read_on_board
 from cell.geometry.camera import Array
@@ -71,7 +71,10 @@ def read_frames(
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
     frames = [RecordedFrame(path, listing.name(path)) for path in listing.pictures]
     seen: dict[str, RecordedFrame] = {}
+    _set_made_ones_aside(frames)
     for frame in frames:
+        if frame.reason is not None:
+            continue
         try:
             frame.view = find_board(read_picture(frame.path), spec)
         except PictureRefused as refused:
@@ -96,12 +99,29 @@ def read_frames(
     return frames, channel
 
 
+def _set_made_ones_aside(frames: Sequence[RecordedFrame]) -> None:
+    """Pictures that a program made of others beside them, by their names: they show no more, or another lens."""
+    plain: dict[str, RecordedFrame] = {}
+    for frame in frames:
+        if not made_of_others(frame.name):
+            plain.setdefault(frame_key(frame.name), frame)
+    for frame in frames:
+        key = frame_key(frame.name)
+        first = plain.get(key) if key and made_of_others(frame.name) else None
+        if first is not None:
+            frame.shows = first
+            frame.refuse(Reason.DUPLICATE, f"by its name it was made of {first.name}")
+
+
 def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
-    """One camera's pictures have one size: that of most pictures with a board."""
+    """One camera's pictures have one size: that of most pictures with a board.
+
+    Of two that are as frequent the larger: pictures whose lens somebody took out are cropped.
+    """
     sizes = Counter(f.view.size for f in frames if f.view is not None)
     if not sizes:
         return
-    usual = sizes.most_common(1)[0][0]
+    usual = max(sizes, key=lambda size: (sizes[size], size[0] * size[1]))
     for frame in frames:
         if frame.view is not None and frame.view.size != usual and frame.reason is None:
             frame.refuse(

@@ -18,6 +18,11 @@ ROLES = (
     "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
     "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
 )
+# Words for pictures that somebody's program made of others: with the board drawn in, or the lens taken out.
+MADE = (
+    "corners?|drawn|draw|detected|detections?|annotated|overlay|vis|visuali[sz]ed|visuali[sz]ations?|undist|undistorted|"
+    "rectified|remapped|debug"
+)
 CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
 
 
@@ -125,12 +130,18 @@ def _stem(name: str) -> str:
 def _plain(name: str) -> str:
     """The name without the words that say what is in a file."""
     words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
-    return "-".join(str(int(w)) if w.isdecimal() else w for w in words if w and not re.fullmatch(ROLES, w))
+    told = [w for w in words if w and not re.fullmatch(f"{ROLES}|{MADE}", w)]
+    return "-".join(str(int(w)) if w.isdecimal() else w for w in told)
 
 
 def series_name(name: str) -> str:
     """A file's name with its numbers taken out: files of one series have the same."""
     return re.sub(r"\d+", "N", name.lstrip("_"))
+
+
+def made_of_others(name: str) -> bool:
+    """True for a picture whose name or folder says that a program made it of another."""
+    return any(re.fullmatch(MADE, word) for word in re.split(r"[^a-z]+", name.lower()))
 
 
 def frame_key(name: str) -> str:

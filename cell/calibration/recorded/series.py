@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -15,9 +16,15 @@ from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
 from cell.calibration.recorded.numbers import read_content
 from cell.calibration.recorded.records import Content, Record
+from cell.vision.pictures import Reason
 from drivers.errors import ConfigError
 
+if TYPE_CHECKING:
+    from cell.calibration.recorded.folder import RecordedFrame
+
 LEAST = 2
+# Pictures that are no view of their own.
+ASIDE = (Reason.DUPLICATE, Reason.WRONG_SIZE, Reason.LASER_PICTURE, Reason.UNREADABLE)
 # A table whose rows are poses holds so many different rows.
 LEAST_ALONE = 3
 
@@ -135,6 +142,18 @@ def match_series(
         if not s.of
     ]
     return belonging, strange if names else []
+
+
+def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
+    """Give poses that name no picture to those that are left, in order, where there are as many; True where there are.
+
+    What is left are no copies, and none of another size: drawn or straightened pictures lie beside at times.
+    """
+    left = [k for k, f in enumerate(frames) if f.shows is None and f.reason not in ASIDE]
+    if len(left) != len(one.records):
+        return False
+    one.by, one.of, one.alone = "order", dict(zip(left, one.records, strict=True)), []
+    return True
 
 
 def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, str]:

@@ -101,9 +101,9 @@ def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequenc
         focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
         if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
             raise RefusedError(
-                f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from {names[at]} "
-                f"on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; give both parts "
-                "by themselves, each in a folder of its own"
+                f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from "
+                f"{names[at]} on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; "
+                "give both parts by themselves, each in a folder of its own"
             )
 
 

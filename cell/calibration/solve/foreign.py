@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.calibration.solve.blocks import FLANGE, SHARED
 from cell.calibration.solve.intrinsics import Intrinsics, adjustment_of
@@ -53,7 +54,7 @@ def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, fl
 
 
 def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
-    """Views from each of which on all may want another camera than those before; empty where none is. By the test alone.
+    """Views from each of which on all may want another camera than those before, by the test alone; else empty.
 
     Where any half of the views wants one, board or lens are not what the model has, and nothing was changed in between.
     """
@@ -69,7 +70,9 @@ def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
     return [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
 
 
-def own_cameras(found: Intrinsics, views: Sequence[BoardView], groups: Sequence[Array] | None = None) -> Array:
+def own_cameras(
+    found: Intrinsics, views: Sequence[BoardView], groups: Sequence[NDArray[np.bool_]] | None = None
+) -> Array:
     """For each view (n,) the F of focal lengths and a principal point of its own, with the lens that all share.
 
     Or for each of the groups, masks (n,) of views. The gain is that of one step from the adjustment of all views, as in

@@ -65,7 +65,7 @@ class ScanCalibration:
     `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
     camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the camera's
     time stamps were found to come, `shutter` how its rows are exposed; `unread` says what of these a file held that
-    cannot be read.
+    cannot be read, `refused` why a later look at the camera's times was refused, "" if none was.
     """
 
     camera: CameraModel
@@ -85,6 +85,7 @@ class ScanCalibration:
     timing: Timing | None = None
     shutter: Shutter | None = None
     unread: tuple[str, ...] = ()
+    refused: str = ""
 
     @classmethod
     def of(cls, joint: Joint) -> ScanCalibration:
@@ -149,23 +150,28 @@ class ScanCalibration:
     def as_dict(self) -> dict[str, Any]:
         """For storage. What was found out since the calibration has its key only where there is any."""
         found = {"confirmed": self.confirmed, "timing": self.timing, "shutter": self.shutter}
-        return {name: one.as_dict() for name, one in found.items() if one is not None} | {
-            "camera": _camera_dict(self.camera),
-            "light_plane": {
-                "normal": list(self.light_plane.normal),
-                "distance": self.light_plane.distance,
-                "bow": self.light_plane.bow,
-                "bow_sigma": self.bow_sigma,
-                "bow_gain": self.bow_gain.tolist(),
-            },
-            "rail_direction": self.rail_direction.tolist(),
-            "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
-            "covariance": self.covariance.tolist(),
-            "quality": vars(self.quality),
-            "reference": None if self.reference is None else self.reference.as_dict(),
-            "notes": list(self.notes),
-            "witness": None if self.witness is None else self.witness.as_dict(),
-        }
+        refused = {"refused": self.refused} if self.refused else {}
+        return (
+            {name: one.as_dict() for name, one in found.items() if one is not None}
+            | refused
+            | {
+                "camera": _camera_dict(self.camera),
+                "light_plane": {
+                    "normal": list(self.light_plane.normal),
+                    "distance": self.light_plane.distance,
+                    "bow": self.light_plane.bow,
+                    "bow_sigma": self.bow_sigma,
+                    "bow_gain": self.bow_gain.tolist(),
+                },
+                "rail_direction": self.rail_direction.tolist(),
+                "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
+                "covariance": self.covariance.tolist(),
+                "quality": vars(self.quality),
+                "reference": None if self.reference is None else self.reference.as_dict(),
+                "notes": list(self.notes),
+                "witness": None if self.witness is None else self.witness.as_dict(),
+            }
+        )
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ScanCalibration:
@@ -201,6 +207,7 @@ class ScanCalibration:
             timing=timing,
             shutter=shutter,
             unread=tuple(unread),
+            refused=str(data.get("refused", "")),
         )
 
 

@@ -2,21 +2,27 @@
 
 import { byId, el, remake, say, show, words } from './dom.js';
 
-const OLD_S = 0.5;
+const OLD_S = 0.5, LOUD_S = 30;
 
 export function devices(state) {
   const entries = Object.entries(state.devices);
-  remake(byId('device-list'), entries.map(([name, device]) => [name, device.simulated, device.fault, device.errors]), () => entries.map(row));
+  const faults = state.faults ?? [];
+  const last = (name) => faults.findLast((fault) => fault.device === name || fault.text.includes(name)) ?? null;
+  const rows = entries.map(([name, device]) => [name, device, last(name)]);
+  remake(byId('device-list'), rows.map(([name, device, met]) => [name, device.simulated, device.fault, device.errors, met]), () => rows.map(row));
   entries.forEach(([name, device], k) => refresh(byId('device-list').children[k], name, device));
-  const fault = state.faults?.at(-1) ?? null;
-  show(byId('fault'), fault !== null && !state.question);
-  if (fault) say(byId('fault'), `${words(fault.device)}: ${fault.text}${fault.remedy ? ` → ${fault.remedy}` : ''}`);
-  show(byId('stopped'), Boolean(state.safety?.stopped));
+  // The newest one loudly for half a minute; then it stays in its device's row.
+  const fault = faults.at(-1);
+  const fresh = fault !== undefined && state.t - fault.t < LOUD_S && !state.question;
+  show(byId('fault'), fresh);
+  if (fresh) say(byId('fault'), told(fault));
+  show(byId('stopped'), Boolean(state.safety?.stopped) && state.run === null);
 }
 
-function row([name, device]) {
+const told = (fault) => [fault.text, fault.remedy].filter(Boolean).join(' → ');
+
+function row([name, device, met]) {
   const errors = Object.entries(device.errors ?? {}).filter(([, count]) => count);
-  const fault = device.fault && (typeof device.fault === 'string' ? device.fault : [device.fault.text, device.fault.remedy].filter(Boolean).join(' → '));
   return el('li', {},
     el('span', { className: 'lamp', 'aria-hidden': 'true' }),
     el('strong', { textContent: words(name) }),
@@ -24,7 +30,8 @@ function row([name, device]) {
     el('span', { className: 'what' }),
     el('small', { className: 'link' }),
     ...(errors.length ? [el('small', { className: 'errors', textContent: errors.map(([what, count]) => `${count} ${words(what)}`).join(', ') })] : []),
-    ...(fault ? [el('p', { className: 'fault', textContent: fault })] : []));
+    ...(device.fault ? [el('p', { className: 'fault', textContent: told(device.fault) })] : []),
+    ...(met && !device.fault ? [el('p', { className: 'met', title: told(met), textContent: `last: ${told(met)}` })] : []));
 }
 
 function refresh(item, name, device) {

@@ -44,7 +44,7 @@ def measure(seconds: float, seed: int, progress: Callable[[float, str], None]) -
         for busy in (False, True):
             what = f"perception on {cores} cores" if busy else "nothing else"
             progress(0.5 * busy, what)
-            rows.append(_streamed(cell, seconds, pictures if busy else [], cores, what))
+            rows.append(streamed(cell, seconds, pictures if busy else [], cores, what))
     return {
         "seconds": seconds, "cores": cores, "rows": rows, "load": round(os.getloadavg()[0], 2),
         "limits": {"rate_hz": [RATE_HZ - RATE_OFF_HZ, RATE_HZ + RATE_OFF_HZ], "p99_ms": 1e3 * LONGEST_P99_S},
@@ -52,7 +52,8 @@ def measure(seconds: float, seed: int, progress: Callable[[float, str], None]) -
     }  # fmt: skip
 
 
-def _streamed(cell: Cell, seconds: float, pictures: list[Any], cores: int, what: str) -> dict[str, Any]:
+def streamed(cell: Cell, seconds: float, pictures: list[Any], cores: int, what: str) -> dict[str, Any]:
+    """Stream for `seconds` on the wall, beside perception of the `pictures`, if any; paces of stream and loop."""
     # The driver's own: how regularly it sent is its own business, no interface tells it.
     arm = getattr(cell.devices.arm, "bare", cell.devices.arm)
     if not isinstance(arm, UrArm):

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from cell.cli import completing
 from cell.cli.options import JobOption, JsonOption, print_json
 
 SHOWN = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "s": (1e3, "ms"), "rad/K": (1e6, "µrad/K")}
@@ -20,7 +21,12 @@ def register(app: typer.Typer) -> None:
 
 def realism(
     effect: Annotated[
-        list[str] | None, typer.Option("--effect", help="Just this one; may be repeated. All of them, then together.")
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            help="Just this one; may be repeated. All of them, then together.",
+            autocompletion=completing.effects,
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many worlds: seeds 1 to this.")] = 20,
     job: JobOption = "pot",
