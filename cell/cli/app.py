@@ -7,11 +7,21 @@ from typing import Annotated
 
 import typer
 
-<<<<<<< HEAD
-from cell.cli import calibrate, commission, console, devices, export, new_job, record, run, runs, setup, sim, watch
-=======
-from cell.cli import calibrate, commission, console, devices, doctor, export, new_job, run, runs, setup, sim, watch
->>>>>>> main
+from cell.cli import (
+    calibrate,
+    commission,
+    console,
+    devices,
+    doctor,
+    export,
+    new_job,
+    record,
+    run,
+    runs,
+    setup,
+    sim,
+    watch,
+)
 from cell.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
@@ -50,11 +60,7 @@ def _cell(
     console_log(verbose)
 
 
-<<<<<<< HEAD
-for group in (run, runs, record, export, calibrate, devices, commission, setup, new_job, console, watch):
-=======
-for group in (run, runs, export, calibrate, devices, doctor, commission, setup, new_job, console, watch):
->>>>>>> main
+for group in (run, runs, record, export, calibrate, devices, doctor, commission, setup, new_job, console, watch):
     group.register(app)
 app.add_typer(sim.app, name="sim")
 
