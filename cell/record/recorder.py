@@ -65,7 +65,12 @@ def begin_record(
             names = " ".join(name.replace("_", "-") for name in absent)
             log.warning("runs leave no %s, all else works: %s not installed; pip install %s", FILE, names, names)
         return None
-    return Recorder(folder, run, config, devices, calibration)
+    try:
+        return Recorder(folder, run, config, devices, calibration)
+    # Whatever keeps it from being recorded keeps no run from going on.
+    except Exception as error:
+        log.warning("this run leaves no %s: %s: %s", FILE, type(error).__name__, error)
+        return None
 
 
 class Recorder(logging.Handler):
