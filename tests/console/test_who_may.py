@@ -214,8 +214,8 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served) -> No
                 page.send('{"type": "jog", "press": 1}')
                 time.sleep(0.0005)
     heard = []
-    assert until(lambda: heard.append(server.heard.get(timeout=1)) or heard[-1] == Left(client))
-    assert heard[0] == Joined(client)
+    assert until(lambda: heard.append(server.heard.get(timeout=10)) or heard[-1] == Left(client))
+    assert Joined(client) in heard
     assert sum(isinstance(message, Beat) for message in heard) < 300
 
 
