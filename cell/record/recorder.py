@@ -112,7 +112,8 @@ class Recorder(logging.Handler):
         super().close()
 
     def _listen(self) -> None:
-        self._put("/tf", self._times.now(), self._sketch.frames)
+        self._put("/tf", self._times.now(), self._sketch.arm_frames)
+        self._put("/tf", self._times.now(), partial(self._sketch.rail_at, position=0.0))
         self._look_around()
         self._devices.gate.listener = self
         self._run.record = self.event
@@ -162,7 +163,7 @@ class Recorder(logging.Handler):
             self._json(f"/{device}/state", at, reading)
             if isinstance(reading, ArmState):
                 self._put("/tf", at, partial(self._sketch.arm_at, state=reading))
-                self._put("/joints", at, partial(self._sketch.joints, state=reading))
+                self._put("/joints", at, partial(self._sketch.arm_joints, state=reading))
                 self._look_around()
             elif isinstance(reading, RailState):
                 self._rail_at(at, reading.position)
@@ -209,7 +210,7 @@ class Recorder(logging.Handler):
 
     def _rail_at(self, at: int, position: float) -> None:
         self._put("/tf", at, partial(self._sketch.rail_at, position=position))
-        self._put("/joints", at, self._sketch.joints)
+        self._put("/joints", at, self._sketch.rail_joint)
 
     def _lines(self, lines: Lines) -> None:
         """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""
