@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import shutil
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction.ply import write_cloud
 from cell.report.page.make import MOST_BYTES, make_page, write_page
 from cell.report.page.maps import MOST_POINTS
-from cell.report.page.timeline import timeline
+from cell.report.page.timeline import timeline, timeline_svg
 from cell.report.page.trend import past_runs
 from cell.run.folder import write_json
 from cell.steps.reconstruct import Reconstruction
@@ -160,6 +161,23 @@ def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(folder: 
     assert course is not None
     assert [(bar.begin, bar.end, bar.state) for bar in course.bars] == [(0.0, 2.0, "failed"), (2.0, 6.0, "done")]
     assert [mark.at for mark in course.marks] == [2.0]
+
+
+def test_steps_and_faults_stand_where_the_wall_had_them(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {})
+    key = journal.step_started("laser_sweep", 1)
+    journal.event("confirm_needed", "laser_sweep", {"number": 1, "reason": "look at the arm"})
+    journal.step_ended(key, 1.0, None, "protective stop")
+    journal.close()
+    at = time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(time.time() + 3600))
+    fault = {"at": at, "step": "laser_sweep", "attempt": 1, "code": "c", "reason": "r", "remedy": "ended the run"}
+    course = timeline(tmp_path, {"clock": "wall", "faults": [fault]})
+    assert course is not None
+    assert [(bar.step, bar.state) for bar in course.bars] == [("laser_sweep", "failed")]
+    assert [mark.text.split(":")[0] for mark in course.marks] == ["confirm needed", "c in laser_sweep"]
+    # A date of another clock does not leave the drawing.
+    assert all(0.0 <= mark.at <= course.length < 60.0 for mark in course.marks)
+    assert timeline_svg(course).count("<rect") == 1
 
 
 def test_the_trend_holds_the_runs_of_the_job_before_this_one(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
         case "done":
             return f"cell report {name}: what was measured; nothing was placed"
         case "placed":
-            return f"cell report {name} --noise: what was assumed; cell export: the cloud"
+            return f"cell report {name} --html: all of it as a page; cell export: the cloud"
         case "refused" if report.get("code") == "CalibrationStale":
             return f"cell calibrate, then {again} -j {_job(report)}"
         case "refused":

@@ -169,8 +169,10 @@ def test_a_cell_that_another_process_runs_is_watched(cell: tuple[Path, str]) -> 
             seen: list[str] = []
             until(lambda: seen.append("\n".join(watch.lines())) or "homing" in seen[-1], 90.0, "the run")
             until(lambda: seen.append("\n".join(watch.lines())) or home.poll() is not None, 90.0, "its end")
-            assert home.poll() == 0
-            last = "\n".join(watch.lines())
+            assert home.poll() == 0, home.communicate()[1]
+            until(lambda: seen.append("\n".join(watch.lines())) or "nothing goes on" in seen[-1], 10.0, "rest")
+            until(lambda: seen.append("\n".join(watch.lines())) or "  deg" in seen[-1], 10.0, "the arm")
+            last = seen[-1]
         joints = [float(value) for value in re.findall(r"  deg +(.*)", last)[0].split()]
         assert joints == pytest.approx([90.0, -100.0, 100.0, -90.0, -90.0, 0.0], abs=0.02)
         # It was seen on its way, beside its limits, and the rail was left to its only user.
