@@ -66,9 +66,16 @@ def open_devices(
     world: SimulatedCell | None = None
     if whole:
         from cell.devices.described import Described
+        from cell.vision.stripe.rehearsal import read_drawn
 
         world = SimulatedCell(
-            true, Described.of(job), seed=seed, level=level, speed=speed or SIM_SPEED, gige=on_gige(loaded)
+            true,
+            Described.of(job),
+            seed=seed,
+            level=level,
+            speed=speed or SIM_SPEED,
+            gige=on_gige(loaded),
+            meanwhile=read_drawn if set(only) == set(DEVICES) else None,
         )
         undo.callback(world.close)
         loaded = with_endpoints(loaded, world.endpoints)

@@ -22,6 +22,7 @@ GROUPS = (
         "wire/test_serve.py",
         "wire/test_one_authority.py",
         "wire/test_whole_job.py",
+        "browser/test_screen.py",
     ),
     # One device at a time.
     (

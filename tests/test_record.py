@@ -94,10 +94,11 @@ def test_times_are_the_virtual_clocks(read: Messages, placed_pot: JobRecord) -> 
 
 def test_frames_lead_from_the_root_to_where_the_arm_itself_says_that_its_flange_is(read: Messages) -> None:
     """The arm computes its flange from its own table; the chain is the joints' through the product's kinematics."""
-    chains = {stamp: {t.child_frame_id: t for t in message.transforms} for stamp, message in read["/tf"]}
+    chains = [(stamp, {t.child_frame_id: t for t in message.transforms}) for stamp, message in read["/tf"]]
+    arms = {stamp: chain for stamp, chain in chains if "flange" in chain}
     checked = 0
     for stamp, state in read["/arm/state"]:
-        chain = chains[stamp]
+        chain = arms[stamp]
         pose, name = np.eye(4), "flange"
         while name != "tf#/":
             step = chain[name]
@@ -107,7 +108,7 @@ def test_frames_lead_from_the_root_to_where_the_arm_itself_says_that_its_flange_
         assert np.allclose(pose[:3, :3], Rotation.from_rotvec(told[3:]).as_matrix(), atol=1e-7)
         checked += 1
     assert checked > 100
-    root = next(iter(chains.values()))["base"]
+    root = chains[0][1]["base"]
     assert root.parent_frame_id == "tf#/" and np.array_equal(matrix(root), np.eye(4))
 
 
@@ -158,10 +159,11 @@ def first(pair: tuple[int, Any]) -> int:
 
 def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Messages) -> None:
     """Frames, lens, picture and cloud tell one story: by OpenCV's projection and the bright line in the picture."""
-    chains = [
-        (stamp, {t.child_frame_id: t for t in message.transforms}) for stamp, message in sorted(read["/tf"], key=first)
-    ]
-    poses = [(stamp, base_from_camera(chain)) for stamp, chain in chains if "flange" in chain]
+    poses, chain = [], {}
+    for stamp, message in sorted(read["/tf"], key=first):
+        chain |= {t.child_frame_id: t for t in message.transforms}
+        if "flange" in chain and any(t.child_frame_id == "scan_camera" for t in message.transforms):
+            poses.append((stamp, base_from_camera(chain)))
     pictures = dict(read["/scan_camera/image"])
     lens = read["/scan_camera/calibration"][0][1]
     lines = read["/cloud/line"]
@@ -176,6 +178,9 @@ def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Mes
         seen = (points - pose[:3, 3]) @ pose[:3, :3]
         pixels, _ = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), np.array(lens.K).reshape(3, 3), np.array(lens.D))
         columns, rows = np.rint(pixels[:, 0]).astype(int).T
+        inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1] - 8)
+        assert np.count_nonzero(inside) > 0.98 * len(points)
+        columns, rows = columns[inside], rows[inside]
         brightness = image[rows, columns]
         assert np.median(brightness) > 5 * max(1.0, float(np.median(image)))
         # Half a millimetre beside it there is none.
@@ -211,6 +216,7 @@ def test_the_sequence_its_commands_and_its_log_can_be_read_back(read: Messages) 
     assert any(m["kind"] == "step_done" and m["step"] == "place" for _, m in read["/sequence/event"])
     assert [m["name"] for _, m in read["/claw/command"]] == ["release"]
     assert [m["name"] for _, m in read["/laser/command"]].count("lit") >= 1
+    assert [m["name"] for _, m in read["/scan_camera/command"]][-2:] == ["stream", "stream ended"]
     assert "sweep" in [m["name"] for _, m in read["/rail/command"]]
     assert {message.level for _, message in read["/log"]} <= {2, 3}
 

@@ -23,7 +23,7 @@ from cell.calibration.recorded.series import in_order_of_views, match_series, re
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
-from cell.vision.pictures import read_picture
+from cell.vision.pictures import looks_raw, read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -491,6 +491,18 @@ def test_rows_that_are_sorted_as_words_are_found_out_and_said(tmp_path, pictures
     frames, understood, _ = understand(tmp_path, dict(zip(names, seen.values(), strict=True)))
     assert "sorted as words (1, 10, 2)" in understood.notes[0]
     assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
+
+
+def test_a_raw_picture_of_a_colour_camera_is_called_so(tmp_path, pictures):
+    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
+    mosaic = image.astype(np.float64)
+    mosaic[0::2, 0::2] *= 0.55
+    mosaic[1::2, 1::2] *= 0.65
+    cv2.imwrite(str(tmp_path / "raw.png"), mosaic.astype(np.uint8))
+    (frame,), _ = read_frames(list_folder(tmp_path), BOARD)
+    assert frame.view is None
+    assert "a Bayer mosaic" in frame.text
+    assert not looks_raw(image)
 
 
 def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration.collect.edge import look_at_edge, require_edge
+from cell.calibration.collect.edge import SPEED, look_at_edge, require_edge
 from cell.calibration.collect.witness import require_witness
 from cell.calibration.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
 from cell.calibration.witness import Witness
@@ -59,7 +59,8 @@ def test_the_edge_is_where_the_world_has_it(cell) -> None:
         scene.rail_direction @ scene.light_plane_normal
     )
     assert before.edge.place == pytest.approx(way / (1 + scene.rail_lead_error), abs=2e-5)
-    assert abs(before.edge.lag) < 5e-3
+    # What comes later here is the carriage, by the play of its screw.
+    assert before.edge.lag == pytest.approx(scene.rail_backlash / (2 * SPEED), abs=2e-3)
 
 
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
@@ -107,14 +108,14 @@ def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
 def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
     virtual, before, since = cell
     spec = virtual.scan_camera.model.spec
-    virtual.scan_camera.model.spec = replace(spec, latency=spec.latency + 1 / 60)
+    virtual.scan_camera.model.spec = replace(spec, latency=spec.latency + 1 / 30)
     try:
         slip = since(looked(virtual, before))
     finally:
         virtual.scan_camera.model.spec = spec
-    assert slip.lag == pytest.approx(1 / 60, abs=3e-3)
+    assert slip.lag == pytest.approx(1 / 30, abs=3e-3)
     assert abs(slip.along) < 2.5e-5
-    with pytest.raises(RefusedError, match=r"pictures come \+1\d\.\d ms later"):
+    with pytest.raises(RefusedError, match=r"pictures come \+3\d\.\d ms later"):
         slip.require()
 
 

@@ -77,7 +77,8 @@ def info(name: RunArgument = None, config: ConfigOption = None, json: JsonOption
     if data["cpu_s"] is not None and data["span_s"]:
         typer.echo(f"writing it took {data['cpu_s']:.2f} s of a core, {100 * data['cpu_s'] / data['span_s']:.1f} %")
     if data["dropped"] is None:
-        typer.echo("it was cut off before it told what was let go; `cell record repair` closes it")
+        closing = "" if data["whole"] else "; `cell record repair` closes it"
+        typer.echo(f"it was cut off before it told what was let go{closing}")
     for topic, count in (data["dropped"] or {}).items():
         typer.echo(f"let go, because too much came at once: {count} of {topic}")
 

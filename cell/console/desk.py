@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from cell.calibration.verify.verdict import Verification
 from cell.console.holders import Holders
 from cell.console.holding import Press, Presses
 from cell.console.manual import Manual
@@ -58,6 +59,7 @@ class Desk:
         self._say = say
         self._began = began
         self._beginning = threading.Lock()
+        self._found: tuple[str, str] | None = None
         self.manual = Manual(cell, load_job(job)[0], self._pressed)
         self._doing: dict[str, Callable[[str, Words], Answer | str]] = {
             "hold": lambda client, words: self.holders.hold(client, _text(words, "name", "")),
@@ -130,6 +132,12 @@ class Desk:
             return None
         return {"device": press.device, "axis": press.axis, "sign": press.sign}
 
+    def told(self, last: dict[str, Any] | None) -> dict[str, Any] | None:
+        """How the last run ended; a verification with what it found."""
+        if last is None or self._found is None or last["run"] != self._found[0]:
+            return last
+        return {**last, "reason": self._found[1]}
+
     def close(self) -> None:
         """The console ends: what is held stops."""
         self.presses.end_all("the console ends")
@@ -180,11 +188,15 @@ class Desk:
 
     def _long(self, what: str, work: Callable[[], object]) -> str:
         """Begin work that lasts, and give what refuses it at once."""
-        begun, failed = threading.Event(), []
+        begun = threading.Event()
+        failed: list[CellError] = []
+        runs: list[Run[Any]] = []
 
         def perform() -> None:
             try:
-                work()
+                made = work()
+                if isinstance(made, Verification) and runs and runs[0].folder is not None:
+                    self._found = runs[0].folder.name, str(made.summary()["reason"])
             except CellError as error:
                 failed.append(error)
                 log.info("%s: %s", what, error)
@@ -201,6 +213,7 @@ class Desk:
                 if begun.wait(0.01) or self.cell.current is not None:
                     break
         if (run := self.cell.current) is not None:
+            runs.append(run)
             self.questions.hold(run)
             self._began(run, None)
         elif failed:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cell.config import DEVICES
-from cell.console.manual import HOLD_SPEED, HOLD_TURN
+from cell.console.manual import HOLD_SPEED, HOLD_TURN, rail_hold_speed
 from cell.console.scene import scene
 from cell.devices.gate import Gated
 from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
@@ -73,7 +73,7 @@ def _jogs(cell: Cell, name: str) -> list[dict[str, Any]]:
     angle = {"device": name, "unit": "rad", "most": MAX_ANGLE_DEG * DEG, "steps": ANGLES}
     match name:
         case "rail":
-            return [{**length, "axis": "", "hold": attended, "speed": 0.008}]
+            return [{**length, "axis": "", "hold": attended, "speed": rail_hold_speed(cell.config.rail)}]
         case "arm":
             lines = [{**length, "axis": axis, "hold": attended, "speed": HOLD_SPEED} for axis in "xyz"]
             turns = [{**angle, "axis": f"r{axis}", "hold": False, "speed": None} for axis in "xyz"]

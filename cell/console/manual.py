@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cell.config import RailConfig
 from cell.console.holding import Press
 from cell.devices.gate import Gated
 from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, moved
@@ -33,7 +34,7 @@ HOLD_SPEED = 0.05
 HOLD_TURN = 0.15
 """rad/s of a joint."""
 TURN_ACCELERATION, LINE_ACCELERATION = 1.0, 0.4
-RAIL_BRAKING_S = 0.04
+RAIL_BRAKING_S = 0.03
 """A held rail goes as fast as it can brake within this time."""
 LINES_M = (0.2, 0.1, 0.05, 0.02, 0.01)
 TURNS_RAD = (0.6, 0.3, 0.1, 0.05)
@@ -222,8 +223,7 @@ class Manual:
     def _begin_rail(self, sign: int, rail: Any) -> Motion:
         if not rail.state().homed:
             raise InterlockError("rail", "is not homed, so its limits are not known; home it first")
-        config = self._cell.config.rail
-        speed = self.speed * min(0.25 * config.max_speed, RAIL_BRAKING_S * config.acceleration)
+        speed = self.speed * rail_hold_speed(self._cell.config.rail)
         motion: Motion = rail.move_to(rail.travel[1] if sign > 0 else rail.travel[0], speed)
         return motion
 
@@ -259,6 +259,11 @@ class Manual:
     def _require_on(self) -> None:
         if not self.on:
             raise InterlockError("cell", "is not in manual mode, in which alone something is jogged; switch it on")
+
+
+def rail_hold_speed(config: RailConfig) -> float:
+    """How fast a rail moves at most by holding, m/s."""
+    return min(0.25 * config.max_speed, RAIL_BRAKING_S * config.acceleration)
 
 
 def _require_small(wish: Jog) -> None:

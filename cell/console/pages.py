@@ -7,6 +7,7 @@ import itertools
 import json
 import secrets
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -119,7 +120,8 @@ class Pages:
             # One that takes nothing any more: its button is not held, either.
             self._tell(Left(page.id))
             self._pages.pop(page.id, None)
-            await socket.close(TOO_MANY)
+            with suppress(RuntimeError, WebSocketDisconnect, OSError):
+                await socket.close(TOO_MANY)
 
     async def _hear(self, page: Page, socket: WebSocket) -> None:
         while True:

@@ -29,20 +29,23 @@ class Pictures:
 
     def __init__(self, target_names: tuple[str, ...] = ("board", "large", "target")) -> None:
         self._targets = target_names
-        self._given: tuple[Frame, object] | None = None
+        self._given: Frame | None = None
+        self._found: object = None
 
     def newest(self, run: Run[Any]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
         """Header and grey image (rows, columns), a copy; None when nothing new was looked at."""
         last = None if run.frames is None else run.frames.last
-        if last is None or run.frames is None:
+        found = None if run.frames is None else run.frames.found
+        board = None
+        if found is not None and found is not self._found:
+            # Once more, with the board, which was found in it since.
+            self._found = found
+            what, (frame, board) = "board", found
+        elif last is not None and last[1] is not self._given:
+            what, frame = last
+        else:
             return None
-        what, frame = last
-        found = run.frames.found
-        board = found[1] if found is not None and found[0] is frame else None
-        # Once more when the board was found in it.
-        if self._given == (frame, board is not None):
-            return None
-        self._given = frame, board is not None
+        self._given = frame
         step = max(1, -(-frame.image.shape[1] // WIDTH))
         small = np.ascontiguousarray(frame.image[::step, ::step])
         header = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import logging
 import os
 import resource
 import signal
@@ -97,7 +98,7 @@ class Server:
             self._of_job,
         )
         config = uvicorn.Config(
-            _entering(application.asgi(), self._renew),
+            application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),
             http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",
             log_config=None, access_log=False, server_header=False, date_header=False, proxy_headers=False,
             ws_max_size=MOST_BYTES, ws_max_queue=8, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
@@ -239,6 +240,8 @@ def main(pipe: int, stops: int) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = MOST_FILES if hard == resource.RLIM_INFINITY else min(MOST_FILES, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
+    # Pages that are open when it ends are no error.
+    logging.getLogger("uvicorn.error").addFilter(lambda record: "graceful shutdown" not in str(record.msg))
     cv2.setNumThreads(1)
     ends = Connection(pipe), Connection(stops)
     setup: Setup = ends[0].recv()

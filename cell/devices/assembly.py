@@ -11,6 +11,7 @@ from cell.devices.built_in import OnArm
 from cell.devices.devices import Devices
 from cell.devices.gate import Gate
 from cell.devices.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
+from cell.devices.gated_camera import GatedCamera
 from cell.devices.gated_laser import GatedLaser
 from cell.devices.interlocks import Interlocks, Situation
 from cell.devices.make import Surroundings
@@ -144,8 +145,8 @@ def behind_gate(
         arm=None if arm is None else GatedArm(arm, gate),
         rail=None if rail is None else GatedRail(rail, gate),
         vehicle=None if vehicle is None else GatedVehicle(vehicle, gate),
-        scan_camera=scan_camera,
-        target_camera=target_camera,
+        scan_camera=None if scan_camera is None else GatedCamera(scan_camera, gate),
+        target_camera=None if target_camera is None else GatedCamera(target_camera, gate),
         laser=None if laser is None else GatedLaser(laser, gate, clock),
         claw=None if claw is None else GatedClaw(claw, gate),
     )

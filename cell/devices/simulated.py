@@ -12,8 +12,9 @@ import select
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -77,8 +78,13 @@ class SimulatedCell:
         gige: Collection[str] = (),
         simulated: tuple[str, ...] = tuple(DEVICES),
         follow: Collection[str] = (),
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so."""
+        """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so.
+
+        `meanwhile` is done while the world starts, which takes as long, and waited for. Not by this thread: a signal
+        that came inside the compiler would be lost.
+        """
         self._config, self.simulated = config, simulated
         command = [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin"]
         command += ["--seed", str(seed), "--level", level, "--speed", repr(speed)]
@@ -94,8 +100,11 @@ class SimulatedCell:
             stderr=self._messages,
             start_new_session=True,  # Ctrl-C goes to the supervisor, which stops the devices before their world ends
         )
+        beside = threading.Thread(target=meanwhile, name="meanwhile")
+        beside.start()
         try:
             self.endpoints: dict[str, Any] = self._read_endpoints()
+            beside.join()
         except BaseException:
             self.close()
             raise

@@ -33,6 +33,7 @@ class Channel:
 
 GATED = ("arm", "rail", "vehicle", "laser", "claw")
 CAMERAS = ("scan_camera", "target_camera")
+COMMANDED = (*GATED, *CAMERAS)
 CHANNELS = (
     Channel("/tf", "foxglove.FrameTransforms", "base, arm's joints, flange, cameras; `tf#/` → `base` is identity"),
     Channel("/joints", "foxglove.JointStates", "the arm's six joints in rad, the rail in m"),
@@ -45,7 +46,7 @@ CHANNELS = (
     Channel("/sequence/state", "cell.State", "the sequence goes from one state to another"),
     Channel("/sequence/event", "cell.Event", "all that the run tells; progress at most five times a second"),
     Channel("/log", "foxglove.Log", "what the modules log"),
-    Channel("/{device}/command", "cell.Command", "what it was asked to do, and why that was refused, if it was", GATED),
+    Channel("/{device}/command", "cell.Command", "what it was asked to do; why that was refused, if it was", COMMANDED),
     Channel("/{device}/state", "cell.Reading", "what the cell has read of it, at most 30 times a second", GATED),
     Channel("/vehicle/can", "cell.Can", "each CAN frame that the driver sent or heard, its data in hex"),
     Channel("/{device}/serial", "cell.Bytes", "bytes on its serial line or socket, in hex", ("rail", "laser", "claw")),

@@ -59,26 +59,36 @@ class Frames:
         self._mounts = mounts
         self._rail_direction = rail_direction
 
-    def transforms(self, at: int) -> bytes:
-        """All frames, with the joints where they were read last; none of the arm before that."""
+    def arm(self, at: int) -> bytes:
+        """Root, base, joints, flange and target camera; nothing of the rail, whose readings have other times."""
         message = FrameTransforms()
         self._add(message, at, ROOT, BASE, pin.SE3.Identity())
         if self.joints is not None:
             for k, placement in enumerate(self._kinematics.placements(self.joints)):
                 self._add(message, at, PARENTS[k], PARENTS[k + 1], placement)
-        for name, mount in self._mounts.items():
-            carried = self.rail * self._rail_direction if name == "scan_camera" else np.zeros(3)
-            self._add(message, at, "flange", name, mount * pin.SE3(np.eye(3), carried))
+        self._add(message, at, "flange", "target_camera", self._mounts["target_camera"])
         return bytes(message.SerializeToString())
 
-    def joint_states(self, at: int, speeds: Vector | None = None) -> bytes:
-        """The joints and the rail as they were read last."""
+    def scan_camera(self, at: int) -> bytes:
+        """The scan camera on the flange, with the rail where it was read last."""
+        message = FrameTransforms()
+        carried = self.rail * self._rail_direction
+        mount = self._mounts["scan_camera"] * pin.SE3(np.eye(3), carried)
+        self._add(message, at, "flange", "scan_camera", mount)
+        return bytes(message.SerializeToString())
+
+    def arm_joints(self, at: int, speeds: Vector) -> bytes:
+        """The arm's joints as they were read last."""
         message = JointStates()
         stamp(message, at)
-        for k, angle in enumerate([] if self.joints is None else self.joints):
-            joint = message.joints.add(name=JOINTS[k], position=float(angle))
-            if speeds is not None:
-                joint.velocity = float(speeds[k])
+        for name, angle, speed in zip(JOINTS, [] if self.joints is None else self.joints, speeds, strict=False):
+            message.joints.add(name=name, position=float(angle), velocity=float(speed))
+        return bytes(message.SerializeToString())
+
+    def rail_joint(self, at: int) -> bytes:
+        """The rail as it was read last."""
+        message = JointStates()
+        stamp(message, at)
         message.joints.add(name="rail", position=self.rail)
         return bytes(message.SerializeToString())
 

@@ -21,7 +21,7 @@ from cell.config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from cell.devices.interlocks import Command
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
-from cell.record.channels import CAMERAS, GATED
+from cell.record.channels import CAMERAS, COMMANDED
 from cell.record.file import FILE, RecordFile, missing
 from cell.record.seen import Lines, RailPath
 from cell.record.sketch import Sketch
@@ -65,7 +65,12 @@ def begin_record(
             names = " ".join(name.replace("_", "-") for name in absent)
             log.warning("runs leave no %s, all else works: %s not installed; pip install %s", FILE, names, names)
         return None
-    return Recorder(folder, run, config, devices, calibration)
+    try:
+        return Recorder(folder, run, config, devices, calibration)
+    # Whatever keeps it from being recorded keeps no run from going on.
+    except Exception as error:
+        log.warning("this run leaves no %s: %s: %s", FILE, type(error).__name__, error)
+        return None
 
 
 class Recorder(logging.Handler):
@@ -107,7 +112,8 @@ class Recorder(logging.Handler):
         super().close()
 
     def _listen(self) -> None:
-        self._put("/tf", self._times.now(), self._sketch.frames)
+        self._put("/tf", self._times.now(), self._sketch.arm_frames)
+        self._put("/tf", self._times.now(), partial(self._sketch.rail_at, position=0.0))
         self._look_around()
         self._devices.gate.listener = self
         self._run.record = self.event
@@ -138,7 +144,7 @@ class Recorder(logging.Handler):
 
     def command(self, command: Command, refused: str | None) -> None:
         """See `cell.devices.gate.Listener`."""
-        if command.device in GATED:
+        if command.device in COMMANDED:
             told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
             self._json(f"/{command.device}/command", self._times.now(), told)
 
@@ -157,7 +163,7 @@ class Recorder(logging.Handler):
             self._json(f"/{device}/state", at, reading)
             if isinstance(reading, ArmState):
                 self._put("/tf", at, partial(self._sketch.arm_at, state=reading))
-                self._put("/joints", at, partial(self._sketch.joints, state=reading))
+                self._put("/joints", at, partial(self._sketch.arm_joints, state=reading))
                 self._look_around()
             elif isinstance(reading, RailState):
                 self._rail_at(at, reading.position)
@@ -204,7 +210,7 @@ class Recorder(logging.Handler):
 
     def _rail_at(self, at: int, position: float) -> None:
         self._put("/tf", at, partial(self._sketch.rail_at, position=position))
-        self._put("/joints", at, self._sketch.joints)
+        self._put("/joints", at, self._sketch.rail_joint)
 
     def _lines(self, lines: Lines) -> None:
         """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""

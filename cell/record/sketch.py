@@ -56,22 +56,26 @@ class Sketch:
         return Frames(kinematics, dict(zip(CAMERAS, mounts, strict=True)), direction)
 
     def arm_at(self, at: int, state: ArmState) -> bytes:
-        """All frames, with the arm as it is in this state."""
+        """The arm's frames, as it is in this state."""
         self._frames.joints = state.joints
-        return self._frames.transforms(at)
+        return self._frames.arm(at)
 
     def rail_at(self, at: int, position: float) -> bytes:
-        """All frames, with the rail at this position."""
+        """The scan camera's frame, with the rail at this position."""
         self._frames.rail = position
-        return self._frames.transforms(at)
+        return self._frames.scan_camera(at)
 
-    def frames(self, at: int) -> bytes:
-        """All frames as they are known."""
-        return self._frames.transforms(at)
+    def arm_joints(self, at: int, state: ArmState) -> bytes:
+        """The arm's joints as they are in this state."""
+        return self._frames.arm_joints(at, state.joint_speeds)
 
-    def joints(self, at: int, state: ArmState | None = None) -> bytes:
-        """All joints as they are known, with the speeds of this state."""
-        return self._frames.joint_states(at, None if state is None else state.joint_speeds)
+    def rail_joint(self, at: int) -> bytes:
+        """The rail as it was told last."""
+        return self._frames.rail_joint(at)
+
+    def arm_frames(self, at: int) -> bytes:
+        """The arm's frames as they are known."""
+        return self._frames.arm(at)
 
     def scene(self, at: int, new: Sequence[Body], gone: Sequence[str]) -> bytes:
         """Bodies that are new, or elsewhere, and those that are gone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from drivers.clock import Clock
@@ -22,7 +23,9 @@ class Times:
         return self.of(self._clock.now())
 
     def of(self, host_time: float) -> int:
-        """A time of the cell's clock, in s."""
+        """A time of the cell's clock, in s; one that nobody knows is now."""
+        if not math.isfinite(host_time):
+            host_time = self._clock.now()
         if self.virtual:
             return max(0, round(1e9 * host_time))
         return self._epoch + round(1e9 * self._clock.wall(host_time - self._begun))

@@ -61,6 +61,7 @@ class FrameStore:
 
     def __init__(self, folder: Path, listener: Listener | None = None) -> None:
         self.begin()
+        self.found: tuple[Frame, Vector] | None = None
         self._folder = folder
         self._listener = listener
         self._waiting: queue.Queue[tuple[Picture, Frame] | None] = queue.Queue(CAPACITY)
@@ -72,7 +73,6 @@ class FrameStore:
         """A step begins: what the steps before it looked at is no longer recent."""
         self.recent: deque[str] = deque(maxlen=RECENT)
         self.last: tuple[str, Frame] | None = None
-        self.found: tuple[Frame, Vector] | None = None
 
     def keep(self, what: str, frame: Frame) -> None:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""

@@ -15,9 +15,9 @@ from drivers.traffic import Traffic
 Vector = NDArray[np.float64]
 """Array of shape (n,), float64."""
 
-ATTENDED_S = 0.16
-"""Wall seconds of silence after which a motion that somebody attends is stopped: two beats of 80 ms that do not come.
-With what it takes to brake a slow motion the device stands within 250 ms."""
+ATTENDED_S = 0.15
+"""Wall seconds of silence after which a motion that somebody attends is stopped: nearly two beats of 80 ms. With what
+braking a slow motion takes the device stands within 250 ms."""
 
 
 @dataclass(frozen=True)

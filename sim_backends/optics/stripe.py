@@ -7,17 +7,18 @@ sees it on the slope, widened by point spread and defocus, integrated over pixel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.pattern import grain_parameters
 from sim_backends.optics.profile import expose
-from sim_backends.optics.scene import LaserOptics, MeshInstance, SceneObject
+from sim_backends.optics.scene import LaserOptics, MeshInstance, PlaneInstance, SceneObject
 from sim_backends.optics.sheet import bend, light_at
 from sim_backends.optics.visibility import laser_frame, lit
 
@@ -98,12 +99,16 @@ def render_stripe(
         [optics.focal, optics.f_number, optics.focus_distance, optics.pixel, optics.psf_px, optics.vignetting]
     )
     for instance in scene:
-        found = crossings(optics, laser, instance)
+        found, share = crossings(optics, laser, instance), None
+        if isinstance(instance, PlaneInstance):
+            found = crossings(optics, laser, _with_rim(instance, laser))
         if len(found.rows):
             found = found.keep(lit(found.points, found.normals, instance, scene, laser))
         if not len(found.rows):
             continue
         grain = None
+        if isinstance(instance, PlaneInstance):
+            share = share_on(instance, laser, found.points)
         if isinstance(instance, MeshInstance):
             grain = instance.grain
             pose = np.asarray(instance.camera_from_mesh, dtype=np.float64)
@@ -119,7 +124,7 @@ def render_stripe(
             found.slopes,
             points,
             normals,
-            light_at(points, normals, laser, grain),
+            light_at(points, normals, laser, grain) * (1.0 if share is None else share),
             optics.intrinsics,
             camera,
             normal,
@@ -130,6 +135,30 @@ def render_stripe(
             pattern,
         )
     return touched
+
+
+RIM = 3.0
+"""Standard deviations of the sheet's thickness by which its middle may pass a plate that its flank still meets."""
+
+
+def share_on(instance: PlaneInstance, laser: LaserOptics, points: Vector) -> Vector:
+    """How much (n,) of a sheet with its thickness meets a rectangle where its middle meets the plane, points (n, 3)."""
+    pose, spread = np.asarray(instance.camera_from_plane, dtype=np.float64), _spread(instance, laser)
+    local = (points - pose[:3, 3]) @ pose[:3, :2]
+    beyond = np.abs(local) - np.array(instance.size) / 2
+    return np.asarray(ndtr(-beyond / np.maximum(spread, 1e-9)).prod(axis=1))
+
+
+def _spread(instance: PlaneInstance, laser: LaserOptics) -> Vector:
+    """How far (2,) along the rectangle's axes the line moves with the sheet, for one standard deviation of it, m."""
+    normal, _, _ = laser_frame(laser)
+    across = np.asarray(instance.camera_from_plane, dtype=np.float64)[:3, :2].T @ normal
+    return np.asarray(laser.width * np.abs(across) / max(float(across @ across), 1e-6))
+
+
+def _with_rim(instance: PlaneInstance, laser: LaserOptics) -> PlaneInstance:
+    width, height = np.array(instance.size) + 2 * RIM * _spread(instance, laser)
+    return replace(instance, size=(float(width), float(height)))
 
 
 @compiled

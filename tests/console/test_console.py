@@ -94,8 +94,10 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         assert console.desk.holders.holder is None
 
 
-def test_the_server_ends_with_its_program(console: Console) -> None:
-    """Its pipes end, as they do when it is killed."""
+def test_the_server_ends_with_its_program(cell: Cell, console: Console) -> None:
+    """Its pipes end, as they do when it is killed. While it was there, nobody else could have its port."""
+    with pytest.raises(ConfigError, match="cannot listen"):
+        Console(cell, "pot", Address(port=console.port))
     server = console._server
     for pipe in (server._pipe, server._stops):
         socket.socket(fileno=os.dup(pipe.fileno())).shutdown(socket.SHUT_RDWR)
@@ -123,8 +125,3 @@ def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path: Pa
     with pytest.raises(ConfigError) as refused:
         Address(token_file=token).checked()
     assert not text or text not in str(refused.value)
-
-
-def test_a_port_that_is_taken_is_told_so(console: Console, cell: Cell) -> None:
-    with pytest.raises(ConfigError, match="cannot listen"):
-        Console(cell, "pot", Address(port=console.port))

@@ -16,23 +16,27 @@ from cell.geometry.camera import Array
 from drivers.errors import LimitError, RefusedError
 from drivers.interfaces import Frame
 
-SPEED = 3e-3
-SEARCH_SPEED = 15e-3
-RATES_HZ = 60.0, 30.0, 15.0
+SPEED = 2e-3
+SEARCH_SPEED = 5e-3
+RATES_HZ = 30.0, 15.0
 """The first that the camera can."""
 ROOM_M = 1e-3
 """To an end of the rail's travel, beyond what it takes to gain speed."""
 REACH_M = 10e-3
 """So far from the witness an edge is searched."""
-BESIDE_M = 0.75e-3
+BESIDE_M = 0.6e-3
 """To either side of where the edge is expected."""
 INNER_PX, OUTER_PX = 8, 14
 """Half widths of the line as it shows on the plate, and of its surroundings."""
 LEAST_FRAMES = 8
 BRIGHTEST, LEAST_LIGHT_DN = 3, 2.0
-"""So many pictures say how bright a row of the line is; with less than that over its surroundings it is none."""
+"""So many pictures say about how bright a row of the line is; with less than that over its surroundings it is none."""
+UNSEEN = (
+    "whether the scan head slips on its mount will not be seen: the plate on the claw has no edge that the laser's "
+    "line passes within 10 mm of laser.witness"
+)
 ALL, NONE = 0.85, 0.15
-"""Share of the rows that show the line on the plate, and beside it."""
+"""Share of the line's light on the plate, and beside it."""
 
 
 def with_edge(
@@ -44,7 +48,8 @@ def with_edge(
         return calibration
     devices.interlocks.work_with(calibration.configuration)
     edge = look_at_edge(config, devices, keep, scan.witness, None)
-    return replace(calibration, scan=replace(scan, witness=replace(scan.witness, edge=edge)))
+    notes = scan.notes if edge is not None else (*scan.notes, UNSEEN)
+    return replace(calibration, scan=replace(scan, witness=replace(scan.witness, edge=edge), notes=notes))
 
 
 def require_edge(
@@ -95,7 +100,7 @@ def _passed(
     ends: tuple[float, float],
     speed: float,
 ) -> tuple[Array, Array]:
-    """Places (n,) of the rail, m, rising, and the share (n,) of the witness's rows that show the line there."""
+    """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
     _configure(devices, config.calibration.stripe_exposure)
@@ -118,8 +123,10 @@ def _passed(
         return np.zeros(0), np.zeros(0)
     places = np.array([sweep.position_at(times[k]) for k in inside])
     lit = np.array(light)[inside]
-    # Each row against its own brightest pictures: the plate's colour and the laser's profile fall out.
-    lit = lit > np.maximum(0.5 * np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0), LEAST_LIGHT_DN)
+    # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
+    bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
+    whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
+    lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
     order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
 

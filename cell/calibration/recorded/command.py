@@ -21,7 +21,13 @@ from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, in_order_of_views, match_series, read_series
-from cell.calibration.recorded.solution import agreeing, camera_of, note_perhaps_no_laser, solve_frames
+from cell.calibration.recorded.solution import (
+    CameraChanged,
+    agreeing,
+    camera_of,
+    note_perhaps_no_laser,
+    solve_frames,
+)
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
@@ -123,7 +129,9 @@ def _from_frames(
     try:
         found = camera_of(frames, options.camera)
     except RefusedError as error:
-        result["refused"]["intrinsics"] = f"no intrinsics: {error}"
+        notes.append(f"no intrinsics: {error}")
+        if isinstance(error, CameraChanged):
+            result["refused"]["intrinsics"] = notes.pop()
     understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
     result["poses"] = understood.about
     notes += understood.notes

@@ -39,11 +39,18 @@ from drivers.errors import RefusedError
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
 OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
-CHANGED_SIGMAS, CHANGED_SHARE = 4.0, 0.005
-"""Two parts of the pictures are of two cameras where their focal lengths differ by more than both."""
+CHANGED_SIGMAS, CHANGED_SHARE = 4.0, 0.02
+"""Two parts of the pictures are of two cameras where their focal lengths differ by more than both.
+
+A bent board and views from one side move that of few pictures by up to a hundredth.
+"""
 LIKELY_LASER = 0.5
 """Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
+
+
+class CameraChanged(RefusedError):
+    """The pictures are of two cameras, or of one whose zoom or focus was changed."""
 
 
 def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None) -> tuple[Intrinsics, Intrinsics]:
@@ -94,13 +101,13 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
 
 
 def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:
-    """RefusedError where the pictures from one on are of another camera than those before, by the cameras of both."""
+    """CameraChanged where the pictures from one on are of another camera than those before, by the cameras of both."""
     roomy = replace(found, model=replace(found.model, k1=True, k2=True, one_focal=False))
     for at in parted_at(roomy, views):
         before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
         focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
         if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
-            raise RefusedError(
+            raise CameraChanged(
                 f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from "
                 f"{names[at]} on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; "
                 "give both parts by themselves, each in a folder of its own"

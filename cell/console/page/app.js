@@ -32,7 +32,10 @@ const sequence = new Sequence(link, ask);
 const jog = new Jog(link, ask);
 const question = new Question(ask);
 const runs = new Runs(link);
-const replay = new Replay(link, (pose) => scene?.pose(pose), () => { if (link.state) live(link.state); });
+const replay = new Replay(link, (pose) => scene?.pose(pose), () => {
+  scene?.showPresent(true);
+  if (link.state) live(link.state);
+});
 new Pictures(link);
 
 // A command of the holder; a refusal is shown in the cell's own words.
@@ -128,6 +131,8 @@ link.on('replay', async (wish) => {
   try {
     if (wish.job && wish.job !== sceneOf) await meet(wish.job);
     await replay.open(wish);
+    scene?.showPresent(false);
+    byId('view').scrollIntoView({ block: 'nearest' });
   } catch (problem) {
     notice({ ok: false, text: problem.message });
   }

@@ -20,9 +20,9 @@ export class Jog {
     for (const [target, type] of [[window, 'blur'], [window, 'pagehide'], [document, 'visibilitychange'], [document, 'freeze']]) {
       target.addEventListener(type, () => this.end(type));
     }
-    // A second finger, or another button of the mouse, anywhere.
+    // A second finger, anywhere.
     document.addEventListener('pointerdown', (event) => {
-      if (this.held && (event.pointerId !== this.held.pointer || event.button > 0)) this.end('second touch');
+      if (this.held && event.pointerId !== this.held.pointer) this.end('second touch');
     }, true);
     document.addEventListener('touchstart', (event) => { if (event.touches.length > 1) this.end('second touch'); }, true);
     link.on('closed', () => this.end('lost link'));
@@ -111,6 +111,8 @@ export class Jog {
       const box = button.getBoundingClientRect();
       const inside = event.clientX >= box.left && event.clientX <= box.right && event.clientY >= box.top && event.clientY <= box.bottom;
       if (!inside) this.end('slid off');
+      // Another button of a mouse that is down already comes as a move.
+      if (event.buttons > 1) this.end('second button');
     });
     button.addEventListener('contextmenu', (event) => event.preventDefault());
     button.addEventListener('keydown', (event) => this.key(event, button, entry, sign));

@@ -210,6 +210,13 @@ export class CellScene {
     return matrix(station.place_from_start).multiply(driven).multiply(matrix(this.scene.vehicle_from_base)).invert();
   }
 
+  // What belongs to the present only: not shown beside an earlier run.
+  showPresent(visible) {
+    this.cloud.points.visible = visible;
+    if (this.way) this.way.visible = visible;
+    this.wake();
+  }
+
   // The way that was planned: points in the base, m.
   path(points) {
     if (!this.way) return;

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from cell.supervisor import Cell
-from drivers.errors import CalibrationStale
+from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError
 
 WARM_UP = 2
 """Jobs that are not counted: caches fill, compiled code is loaded."""
+PAUSE_S = 5.0
+"""Of the clock, before the next try of a job that could not be begun."""
 LEAST = 3
 """Jobs after those that a verdict needs."""
 MOST_GROWTH = {"memory_mb": 0.5, "threads": 0.1, "handles": 0.1}
@@ -32,24 +34,37 @@ def soak(
     """Repeat the job for `minutes` on the wall, at least once; what was counted, the growth and a verdict."""
     until, begun = time.monotonic() + 60.0 * minutes, time.monotonic()
     rows: list[dict[str, Any]] = []
-    with Cell.open(sim="all", seed=seed, speed=speed, job=job) as cell:
+    with Cell.open(sim="all", seed=seed, speed=speed, job=job, confirm="simulated") as cell:
         try:
             cell.calibration()
         except CalibrationStale:
             progress(0.0, "calibration")
             cell.calibrate(job=job)
         while not rows or time.monotonic() < until:
-            outcome = cell.run(job, at_start=True)
+            outcome, reason = _job(cell, job)
             rows.append({
-                "job": len(rows) + 1, "outcome": outcome.outcome, "reason": outcome.reason,
+                "job": len(rows) + 1, "outcome": outcome, "reason": reason,
                 "minutes": round((time.monotonic() - begun) / 60.0, 2), "processes": counted(os.getpid()),
             })  # fmt: skip
-            if outcome.outcome == "aborted":
+            if outcome == "aborted":
                 # Somebody wants the end.
                 break
-            progress(min(1.0, (time.monotonic() - begun) / (60.0 * minutes)), f"job {len(rows)}: {outcome.outcome}")
+            progress(min(1.0, (time.monotonic() - begun) / (60.0 * minutes)), f"job {len(rows)}: {outcome}")
     growth = growth_of(rows)
     return {"speed": speed, "jobs": rows, "growth_a_job": growth, "limits": MOST_GROWTH, "verdict": verdict(growth)}
+
+
+def _job(cell: Cell, job: str) -> tuple[str, str]:
+    """Outcome and reason of one job; one that could not be begun, on a busy machine, is a job that faulted."""
+    try:
+        outcome = cell.run(job, at_start=True)
+    except (Aborted, ConfigError):
+        raise
+    except CellError as error:
+        # Whatever was late is given a moment.
+        cell.devices.clock.sleep(PAUSE_S)
+        return "not begun", " ".join(str(error).split())
+    return outcome.outcome, outcome.reason
 
 
 def counted(owner: int) -> dict[str, dict[str, float]]:
