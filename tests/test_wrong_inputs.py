@@ -511,7 +511,7 @@ def test_a_file_that_is_none_is_refused(
         (("jog", "arm", "z", "5deg"), ("write it like",)),
         (("jog", "tower", "5mm"), ("cannot jog", "write it like")),
         (("jog", "vehicle", "+9m"), ("outside the allowed range", "-0.5 to 0.5 m")),
-        (("jog", "rail"), ("cell jog --help",)),
+        (("jog", "rail"), ("cannot jog", "write it like")),
         (("home", "--sim", "some"), ('"all"',)),
         (("diag", "--sim", "some"), ('"all"',)),
         (("dry-run", "--seed", "-1"), ("--seed",)),

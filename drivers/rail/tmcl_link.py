@@ -199,6 +199,7 @@ class TmclLink:
         Everything this driver sends means the same when it is heard twice, so a lost or damaged reply is asked for
         once more. `issued` is the count of stops when the caller decided to move.
         """
+        failure: TelegramError | None = None
         for attempt in range(_ATTEMPTS):
             with self._lock:
                 if self._closed:
@@ -208,7 +209,8 @@ class TmclLink:
                 try:
                     return self._once(request, decode)
                 except TelegramError as error:
-                    failure = error
+                    # The first says most: the others may only not be in step any more.
+                    failure = failure or error
                     self._in_step = False
                 except (serial.SerialException, OSError) as error:
                     self._statistics.count("link_lost")

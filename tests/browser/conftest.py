@@ -12,7 +12,7 @@ from tests.browser.screen import Console, Screen, browser_path, console_of, open
 from tests.browser.watcher import Watcher  # noqa: E402
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browsers() -> Iterator[playwright.Playwright]:
     if browser_path() is None:
         pytest.skip("no Chromium is installed on this system (apt-get install chromium)")
@@ -20,7 +20,7 @@ def browsers() -> Iterator[playwright.Playwright]:
         yield made
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(browsers: playwright.Playwright) -> Iterator[playwright.Browser]:
     """Draws no 3-D, which would keep the processor busy."""
     made = opened_browser(browsers)
@@ -28,13 +28,13 @@ def browser(browsers: playwright.Playwright) -> Iterator[playwright.Browser]:
     made.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def console(tmp_path_factory: pytest.TempPathFactory, browsers: object) -> Iterator[Console]:
     with console_of(tmp_path_factory.mktemp("screen")) as going:
         yield going
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def watcher(console: Console) -> Iterator[Watcher]:
     """Somebody else who looks on, without a browser."""
     with Watcher(console.link()) as made:

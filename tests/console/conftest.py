@@ -9,7 +9,7 @@ import pytest
 from cell.supervisor import Cell
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     """Its runs lie in a folder of its own."""
     folder = tmp_path_factory.mktemp("cell")

@@ -64,10 +64,11 @@ def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where
             camera.grab()
             told = world.truth()["rail"]
             assert told["carriage"] == pytest.approx(0.02 * told["scale"], abs=5e-5)
-            assert isinstance(camera, FollowedCamera)
+            followed = camera.bare
+            assert isinstance(followed, FollowedCamera)
             moving = rail.move_to(0.06)
             with pytest.raises(DeadlineError):
-                camera.bare.grab(0.4)
+                followed.bare.grab(0.4)
             camera.grab()
             assert camera.statistics.errors["picture asked for again"] >= 1, "into the gap once more, then after it"
             moving.wait(10.0)
