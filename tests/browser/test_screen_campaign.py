@@ -39,7 +39,7 @@ def test_a_whole_dry_run_is_seen_and_decided_upon(browsers: Playwright, tmp_path
         page.click("#question [data-choice=confirm]")
         screen.shows("run-text", "last job: placed", timeout=300.0)
         # Both cameras were seen, and a cloud grew.
-        screen.shows("legend-count", "[1-9][\\\\d,.]{3,} points")
+        screen.shows("legend-count", r"[1-9][\d,.]{3,} points")
         for camera in ("target_camera", "scan_camera"):
             assert "no picture" not in page.inner_text(f"[data-camera={camera}] output")
         page.click("#tab-runs")
