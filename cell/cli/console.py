@@ -77,7 +77,7 @@ def require_installed() -> None:
 
 
 def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
-    """Show a cell until Ctrl-C, or until the server ends: then it is stopped, and the exit code is 1."""
+    """Show a cell until Ctrl-C: 0, or 130 where that cuts short what goes on. Until the server ends: stopped, and 1."""
     import threading
 
     from cell.console.console import Console
@@ -91,7 +91,7 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
             typer.echo("the page's server has ended, so nobody sees the cell any more: it is stopped", err=True)
             cell.stop()
             return 1
-    return 0
+        return 0 if cell.current is None else 130
 
 
 def run_shown(

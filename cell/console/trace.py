@@ -92,6 +92,9 @@ class Trace:
 def traced(devices: Devices, run: Run[Any], trace: Trace) -> None:
     """Note a run until its end, and write the trace into its folder. Blocks; for a thread of its own on the wall."""
     with trace.taken():
+        events = run.events()
+        while (event := events.take()) is not None:
+            trace(event)
         run.ended(LONGEST_S)
     if run.folder is not None:
         trace.write(run.folder)

@@ -52,8 +52,8 @@ def test_a_whole_dry_run_is_seen_and_decided_upon(browsers: Playwright, tmp_path
         assert screen.complaints == []
         assert screen.hosts <= LOCAL
         browser.close()
-    (report,) = (tmp_path / "runs").glob("*/report.json")
-    assert "nothing lies in its way" in report.read_text(encoding="utf-8")
+    reports = [report.read_text(encoding="utf-8") for report in (tmp_path / "runs").glob("*/report.json")]
+    assert any("nothing lies in its way" in report for report in reports)
 
 
 ENDS: dict[str, Callable[[Screen], None]] = {

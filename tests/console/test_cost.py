@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -13,25 +12,13 @@ import numpy as np
 import pytest
 
 from cell.console.messages import CloudPart, Picture, Show
+from cell.lab.bench.pages import READING, cpu
 from tests.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign
 
 ALLOWED = 0.05
 SECONDS, PERIOD_S = 12.0, 0.05
-READING = """
-import sys, threading
-from websockets.sync.client import connect
-host, cookie, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
-def look():
-    with connect(f"ws://{host}/live", additional_headers={"cookie": cookie}, origin=f"http://{host}",
-                 max_size=None, compression=None) as page:
-        for _ in page:
-            pass
-for _ in range(count):
-    threading.Thread(target=look, daemon=True).start()
-sys.stdin.read()
-"""
 
 
 @pytest.mark.parametrize("pages", [1, 5])
@@ -63,9 +50,3 @@ def show(server: Served, picture: np.ndarray) -> None:
             server.process.tell(Picture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
             server.process.tell(CloudPart({"type": "cloud", "reset": n % 100 == 0}, b"\0" * 6400))
         time.sleep(max(0.0, begun + (n + 1) * PERIOD_S - time.monotonic()))
-
-
-def cpu(pid: int) -> float:
-    """Seconds of a core that the process has had."""
-    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")

@@ -6,7 +6,7 @@ pictures a second. A bare loop beside it shows what this machine lets anybody do
 
 from __future__ import annotations
 
-import json
+import http.client
 import os
 import subprocess
 import sys
@@ -30,13 +30,10 @@ FRAME_RATE_HZ, EXPOSURE_S = 50.0, 1e-3
 START_S = 20.0
 TICKS = os.sysconf("SC_CLK_TCK")
 
-_CLIENT = """
-import http.client, re, sys, threading
+READING = """
+import sys, threading
 from websockets.sync.client import connect
-host, link, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
-asked = http.client.HTTPConnection(host)
-asked.request("GET", link)
-cookie = asked.getresponse().headers["set-cookie"].partition(";")[0]
+host, cookie, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
 def look():
     with connect(f"ws://{host}/live", additional_headers={"cookie": cookie}, origin=f"http://{host}",
                  max_size=None, compression=None) as page:
@@ -46,6 +43,7 @@ for _ in range(count):
     threading.Thread(target=look, daemon=True).start()
 sys.stdin.read()
 """
+"""A program of its own that looks as so many pages do: host, cookie, count."""
 
 
 def measure(seconds: float, rounds: int, seed: int, progress: Callable[[float, str], None]) -> dict[str, Any]:
@@ -64,11 +62,11 @@ def measure(seconds: float, rounds: int, seed: int, progress: Callable[[float, s
 def _row(cell: Cell, seconds: float, what: str, pages: int | None, folder: Path) -> dict[str, Any]:
     with nullcontext() if pages is None else Console(cell) as console, _looking(console, pages or 0):
         with _shown(cell, folder) as frames:
-            before = None if console is None else _cpu(console.server_pid)
+            before = None if console is None else cpu(console.server_pid)
             begun = time.monotonic()
             row = streamed(cell, seconds, [], 1, what)
             took = time.monotonic() - begun
-            share = None if console is None or before is None else (_cpu(console.server_pid) - before) / took
+            share = None if console is None or before is None else (cpu(console.server_pid) - before) / took
         return {**row, "load": round(os.getloadavg()[0], 1), "frames": frames[0], "lost": frames[1], "server": share}
 
 
@@ -104,7 +102,11 @@ def _looking(console: Console | None, pages: int) -> Iterator[None]:
         yield
         return
     host, link = console.link.split("/", 3)[2:]
-    client = subprocess.Popen([sys.executable, "-c", _CLIENT, host, f"/{link}", str(pages)], stdin=subprocess.PIPE)
+    asked = http.client.HTTPConnection(host, timeout=START_S)
+    asked.request("GET", f"/{link}")
+    cookie = asked.getresponse().headers["set-cookie"].partition(";")[0]
+    asked.close()
+    client = subprocess.Popen([sys.executable, "-c", READING, host, cookie, str(pages)], stdin=subprocess.PIPE)
     try:
         end = time.monotonic() + START_S
         while len(console.desk.holders.rows()) < pages:
@@ -117,11 +119,7 @@ def _looking(console: Console | None, pages: int) -> Iterator[None]:
         client.communicate()
 
 
-def _cpu(pid: int) -> float:
+def cpu(pid: int) -> float:
     """Seconds of a core that the process has had, user and system."""
     words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / TICKS
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure(10.0, 1, 3, lambda part, text: None), indent=2))
