@@ -12,16 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.arm.rtde_link import PORT, RATE_HZ, VERSION, RtdeLink
+from drivers.arm.rtde_link import PORT, RATE_HZ, VARIABLES, VERSION, RtdeLink
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
 
-VARIABLES = (
-    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
-    "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
-    "payload", "payload_cog",
-)  # fmt: skip
-"""What the driver reads of the arm."""
 SIZES = {
     "BOOL": 1, "UINT8": 1, "INT32": 4, "UINT32": 4, "UINT64": 8, "DOUBLE": 8, "VECTOR3D": 24, "VECTOR6D": 48,
     "VECTOR6INT32": 24, "VECTOR6UINT32": 24,

@@ -13,6 +13,12 @@ from drivers.traffic import Traffic
 
 PORT = 30004
 VERSION, RATE_HZ = 2, 500.0
+VARIABLES = (
+    "timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_force", "actual_digital_input_bits",
+    "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
+    "payload", "payload_cog",
+)  # fmt: skip
+"""What the driver reads of the arm. Here, since the child process reads them too and starts without `numpy`."""
 _HEADER = struct.Struct(">HB")
 
 

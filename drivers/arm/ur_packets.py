@@ -6,8 +6,8 @@ import time
 
 from rtde_receive import RTDEReceiveInterface
 
-from drivers.arm.first_look import VARIABLES
 from drivers.arm.messages import Snapshot
+from drivers.arm.rtde_link import VARIABLES
 
 
 class Packets:

@@ -118,6 +118,7 @@ class ArmModel:
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
+        self._untold: tuple[Vector, tuple[float, Vector], Vector] | None = None
         self._truth = self._true_pose(params.dh)
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
@@ -320,14 +321,24 @@ class ArmModel:
 
     def _untold_weight(self) -> Vector:
         """Wrench (6,) at the flange in base axes of the weight that the controller was not told of."""
-        mass, centre = self.payload
+        q, payload = self.drive.q, self.payload
+        known = self._untold
+        # Several packets of a tick tell it, and it changes only when the arm turns or is told of another load.
+        if known is not None and known[0] is q and known[1] is payload:
+            return known[2]
+        wrench = self._weight_beyond(payload)
+        self._untold = (q, payload, wrench)
+        return wrench
+
+    def _weight_beyond(self, payload: tuple[float, Vector]) -> Vector:
+        mass, centre = payload
         params = self.params
         if mass == params.carried and tuple(centre) == params.carried_centre:
             return np.zeros(6)
         moment = params.carried * np.array(params.carried_centre) - mass * np.asarray(centre)
-        down = np.array([0.0, 0.0, -GRAVITY])
-        arm = self.reported_flange()[:3, :3] @ moment
-        return np.concatenate([(params.carried - mass) * down, np.cross(arm, down)])
+        x, y, _ = (self.reported_flange()[:3, :3] @ moment).tolist()
+        # That arm crossed with the weight, which points straight down.
+        return np.array([0.0, 0.0, -(params.carried - mass) * GRAVITY, -y * GRAVITY, x * GRAVITY, 0.0])
 
     def _true_pose(self, table: Matrix) -> TruePose:
         """Where the flange of an arm truly is whose controller computes with `table` (6, 4)."""

@@ -44,10 +44,50 @@ def running():
         yield bench
 
 
-@pytest.fixture
-def bench(running):
+class Shared:
+    """The one connection that tests share: most leave an arm behind that goes on, or that can be recovered."""
+
+    def __init__(self, address):
+        self._address = address
+        self._arm = None
+
+    def ready(self):
+        """The driver, connected, with a program that moves the arm, which stands where it began."""
+        if self._arm is None:
+            self._arm = connect(self._address)
+        try:
+            stand_at_home(self._arm)
+        except CellError:
+            self._arm.recover(confirmed=True)
+            stand_at_home(self._arm)
+        return self._arm
+
+    def close(self):
+        if self._arm is not None:
+            self._arm.close()
+            self._arm = None
+
+
+def stand_at_home(arm):
+    assert soon(lambda: np.abs(arm.state().joints - HOME).max() < 1e-9)
+    arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
+
+
+@pytest.fixture(scope="module")
+def shared(running):
+    shared = Shared(running.address)
+    yield shared
     running.ask("clear")
-    dashboard(running, "stop")
+    shared.close()
+
+
+@pytest.fixture
+def bench(request, running, shared):
+    """The arm back where it began; in use by nobody where the test does not take it with `arm`."""
+    running.ask("clear")
+    if "arm" not in request.fixturenames:
+        shared.close()
+        dashboard(running, "stop")
     running.ask("reset")
     return running
 
@@ -57,11 +97,15 @@ def connect(address, **options):
 
 
 @pytest.fixture
-def arm(bench):
-    arm = connect(bench.address)
-    yield arm
-    bench.ask("clear")
-    arm.close()
+def arm(bench, shared):
+    return shared.ready()
+
+
+@pytest.fixture
+def closes(shared):
+    """For a test that closes the driver."""
+    yield
+    shared.close()
 
 
 def dashboard(bench, command):
@@ -95,7 +139,7 @@ def swinging(arm, bench, kind="joints", speed=0.5):
     return motion
 
 
-def stands_still(bench, seconds=0.6):
+def stands_still(bench, seconds=0.3):
     """Whether the arm itself knows of no motion for that long."""
     before = np.array(bench.ask("show")["q"])
     clock = Clock()
@@ -210,7 +254,7 @@ def test_a_stop_of_an_arm_that_nobody_reaches_says_so_within_the_time_of_a_safe_
     assert not bench.ask("show")["moving"]
 
 
-def course_after(bench, pull, seconds=1.0):
+def course_after(bench, pull, seconds=0.5):
     """What the arm does after `pull()`: seconds until it stands, its way in rad, seconds until the laser is off."""
     before = bench.ask("show")
     pull()
@@ -329,6 +373,7 @@ def test_a_motion_that_a_protective_stop_ended_does_not_go_on_when_it_is_unlocke
 
 
 @pytest.mark.parametrize("ended_by", ["stop", "close"])
+@pytest.mark.usefixtures("closes")
 def test_a_recovery_that_is_stopped_neither_unlocks_nor_starts_anything(arm, bench, ended_by):
     swinging(arm, bench)
     bench.ask("protective_stop")
@@ -351,32 +396,32 @@ def test_a_recovery_that_is_stopped_neither_unlocks_nor_starts_anything(arm, ben
     assert dashboard(bench, "running") == "Program running: false"
 
 
-@pytest.mark.parametrize("after", np.linspace(0.1, 0.9, 5))
-def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_process(arm, bench, after):
+def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_process(arm, bench):
     before = children() - {arm._session.link.pid}
-    failures = []
-
-    def recover():
-        try:
-            arm.recover()
-        except CellError as error:
-            failures.append(error)
-
     begun = time.monotonic()
     arm.recover()
     lasts = time.monotonic() - begun
-    recovery = threading.Thread(target=recover)
-    recovery.start()
-    Clock().sleep(after * lasts)
-    arm.stop()
-    recovery.join(5.0)
-    if failures:
-        assert [type(failure) for failure in failures] == [Aborted]
-        assert soon(lambda: children() <= before)
-        assert stands_still(bench, 0.3)
-        assert dashboard(bench, "running") == "Program running: false"
-    arm.recover()
-    arm.move_joints(HOME, 1.0, 2.0).wait(5.0)
+    for after in np.linspace(0.1, 0.9, 5):
+        failures = []
+
+        def recover(failures=failures):
+            try:
+                arm.recover()
+            except CellError as error:
+                failures.append(error)
+
+        recovery = threading.Thread(target=recover)
+        recovery.start()
+        Clock().sleep(after * lasts)
+        arm.stop()
+        recovery.join(5.0)
+        if failures:
+            assert [type(failure) for failure in failures] == [Aborted]
+            assert soon(lambda: children() <= before)
+            assert stands_still(bench)
+            assert dashboard(bench, "running") == "Program running: false"
+        arm.recover()
+        arm.move_joints(HOME, 1.0, 2.0).wait(5.0)
 
 
 # --- programs of others ---
@@ -437,20 +482,19 @@ def test_a_connection_that_is_refused_leaves_the_one_that_has_the_arm_alone(arm,
 # --- signals ---
 
 
-def test_a_storm_of_signals_does_not_end_the_child_before_it_has_switched_off():
+def test_a_storm_of_signals_does_not_end_the_child_before_it_has_switched_off(bench):
     for _ in range(3):
-        with ArmBench() as bench:
-            arm = connect(bench.address)
-            arm.set_digital_output(LASER, True)
-            process = arm._session.link._process
-            for count in itertools.count():
-                if process.poll() is not None or count > 5000:
-                    break
-                process.send_signal((signal.SIGTERM, signal.SIGHUP)[count % 2])
-                Clock().sleep(0.0003)
-            assert process.wait(5.0) == 0, "it ended in its own good order"
-            assert not bench.ask("show")["outputs"] & 1 << LASER
-            arm.close()
+        arm = connect(bench.address)
+        arm.set_digital_output(LASER, True)
+        process = arm._session.link._process
+        for count in itertools.count():
+            if process.poll() is not None or count > 5000:
+                break
+            process.send_signal((signal.SIGTERM, signal.SIGHUP)[count % 2])
+            Clock().sleep(0.0003)
+        assert process.wait(5.0) == 0, "it ended in its own good order"
+        assert not bench.ask("show")["outputs"] & 1 << LASER
+        arm.close()
 
 
 # --- the wrong arm ---
