@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cell.calibration.store import nominal_camera
+from cell.check.depths import CALIBRATION_DEPTHS
 from cell.check.place import mesh_box, place_problems, surface_problems, way_problems
 from cell.check.reach import reach_problems
 from cell.config import CellConfig
@@ -31,8 +32,6 @@ PLATE = (0.21, 0.17)
 LEAST_PITCH_PX = 8.0
 HIGHEST_PLATE = 0.3
 """How high above the deck a calibration board may be, m."""
-CALIBRATION_DEPTHS = {"fine": (0.120, 0.130, 0.142), "large": (0.560, 0.650, 0.700)}
-"""Nearest, usual and farthest distance of the calibration's views, m."""
 LONGEST_DRIVE_S, LONGEST_DESCENT_S = 150.0, 150.0
 """The steps that drive and place have 180 s."""
 

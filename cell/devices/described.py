@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.check.fit import CALIBRATION_DEPTHS
+from cell.check.depths import CALIBRATION_DEPTHS
 from cell.config import DEVICES, CellConfig
 from cell.device_config import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
@@ -23,8 +23,8 @@ from cell.devices.rail_makes import ModbusRailConfig
 from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
 from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.geometry.poses import from_parts, transform
-from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job, shipped_mesh
+from cell.surface_file import read_mesh
 from drivers.errors import ConfigError
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
