@@ -268,7 +268,8 @@ def test_more_pages_than_there_is_room_for_are_told_so(server: Served) -> None:
 def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) -> None:
     """The state and pictures: the newest. The cloud: every increment, up to a bound."""
     big = "x" * 60_000
-    slow = server.live(max_queue=1)
+    # What it never reads would keep its close waiting.
+    slow = server.live(max_queue=1, close_timeout=0.1)
     quick = server.live()
     try:
         for page in (slow, quick):

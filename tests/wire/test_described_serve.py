@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,15 @@ import pytest
 from cell.config import load_config
 from tests.described_cells import described, write_saddle
 from tests.test_described_jobs import SADDLE
-from tests.wire.cells import ask, cell, served
+from tests.wire.cells import ask, served
 
 pytestmark = pytest.mark.wire
 
 
-def test_a_cell_of_ones_own_is_served_and_filled_again(tmp_path: Path) -> None:
+def test_a_cell_of_ones_own_is_served_and_filled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     config, own = described(tmp_path, {"rail": {"lead": '"5 mm"'}, "cell": {"name": '"Zelle é"'}}, SADDLE)
     write_saddle(tmp_path / "saddle.ply")
     with served(tmp_path, "-c", config.name, "-j", own.name) as endpoints:
@@ -23,12 +27,12 @@ def test_a_cell_of_ones_own_is_served_and_filled_again(tmp_path: Path) -> None:
         assert (told.rail.lead, told.cell.name) == (0.005, "Zelle é")
         assert told.arm.place == endpoints["arm"]["address"]
         assert told.calibration_hash() == load_config(config).calibration_hash()
-        filled = cell("sim", "fill", "-c", "sim.toml", "-j", "pot", folder=tmp_path)
-        assert filled.returncode == 0, filled.stderr
+        code, _, error = typed("sim", "fill", "-c", "sim.toml", "-j", "pot")
+        assert code == 0, error
         truth = ask(endpoints, op="truth")["truth"]
         assert (truth["surface"]["name"], truth["part"]["held"]) == ("pot", True)
         text = (tmp_path / "sim.toml").read_text(encoding="utf-8")
         (tmp_path / "other.toml").write_text(text.replace('lead = "5 mm"', 'lead = "4 mm"'), encoding="utf-8")
-        other = cell("sim", "fill", "-c", "other.toml", folder=tmp_path)
-    assert other.returncode == 1
-    assert "another cell than the one that is simulated" in other.stderr
+        code, _, error = typed("sim", "fill", "-c", "other.toml")
+    assert code == 1
+    assert "another cell than the one that is simulated" in error

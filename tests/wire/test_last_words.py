@@ -5,7 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,29 +45,43 @@ clock.sleep(1e6)
 """
 
 
+@pytest.fixture(scope="module")
+def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """A folder with the configuration of a served cell, and its endpoints.
+
+    At the wall's speed: the vehicle's own watchdog would only begin to stop it after half a second.
+    """
+    folder = tmp_path_factory.mktemp("cell")
+    with served(folder, "--seed", "3", "--speed", "1") as endpoints:
+        yield folder, endpoints
+
+
 @pytest.mark.parametrize(
     ("script", "moving"),
     [
         (DRIVE, lambda truth: truth["vehicle"]["speed"] > 0.2),
-        (MOVE, lambda truth: truth["rail_moving"] and truth["rail"]["carriage"] > 0.001),
         (SEARCH, lambda truth: truth["rail_moving"]),
+        (MOVE, lambda truth: truth["rail_moving"] and truth["rail"]["carriage"] > 0.001),
     ],
-    ids=["vehicle", "rail", "rail searching its switch"],
+    ids=["vehicle", "rail searching its switch", "rail"],
 )
-def test_half_a_second_after_the_kill_nothing_moves(tmp_path: Path, script: str, moving) -> None:
-    # At the wall's speed: the vehicle's own watchdog would only begin to stop it after that time.
-    with served(tmp_path, "--seed", "3", "--speed", "1") as endpoints:
-        owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=tmp_path)
-        try:
-            deadline = time.monotonic() + 60
-            while not moving(ask(endpoints, op="truth")["truth"]):
-                assert owner.poll() is None
-                assert time.monotonic() < deadline
-                Clock().sleep(0.02)
-        finally:
-            owner.kill()
-            owner.wait(10)
-        Clock().sleep(0.5)
-        truth = ask(endpoints, op="truth")["truth"]
-        assert truth["vehicle"]["stopped"]
-        assert not truth["rail_moving"]
+def test_half_a_second_after_the_kill_nothing_moves(
+    serving: tuple[Path, dict[str, Any]], script: str, moving: Callable[[dict[str, Any]], bool]
+) -> None:
+    folder, endpoints = serving
+    # Someone may have been killed here before: the rail must not be on its way already.
+    assert not moving(ask(endpoints, op="truth")["truth"])
+    owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=folder)
+    try:
+        deadline = time.monotonic() + 60
+        while not moving(ask(endpoints, op="truth")["truth"]):
+            assert owner.poll() is None
+            assert time.monotonic() < deadline
+            Clock().sleep(0.02)
+    finally:
+        owner.kill()
+        owner.wait(10)
+    Clock().sleep(0.5)
+    truth = ask(endpoints, op="truth")["truth"]
+    assert truth["vehicle"]["stopped"]
+    assert not truth["rail_moving"]

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -127,28 +128,47 @@ def test_closing_the_cell_ends_the_run(place: Path, monkeypatch: pytest.MonkeyPa
             made.start("pot")
 
 
-def test_cell_abort_ends_a_calibration(tmp_path: Path) -> None:
-    with served(tmp_path, "--seed", "3") as endpoints:
-        with started("calibrate", "-c", "sim.toml", folder=tmp_path) as work:
-            _when_it_goes_on(tmp_path)
-            asked = cell("abort", "-c", "sim.toml", folder=tmp_path)
-            _, error = work.communicate(timeout=60)
-        assert asked.returncode == 0, asked.stderr
-        assert work.returncode == 1, error
-        assert "cell abort" in error
-        assert_safe(endpoints)
+@pytest.fixture(scope="module")
+def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """A folder with the configuration of a served cell that moves at the wall's speed, and its endpoints."""
+    folder = tmp_path_factory.mktemp("served")
+    with served(folder, "--seed", "3", "--speed", "1") as endpoints:
+        yield folder, endpoints
+
+
+@pytest.fixture
+def endpoints(serving: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str, Any]:
+    """Those of the served cell; the test's own folder has its `sim.toml`."""
+    folder, endpoints = serving
+    (tmp_path / "sim.toml").write_text((folder / "sim.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    return endpoints
+
+
+def test_cell_abort_ends_a_calibration(
+    endpoints: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: Callable[..., tuple[int, str, str]],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with started("calibrate", "-c", "sim.toml", folder=tmp_path) as work:
+        _when_it_goes_on(tmp_path)
+        code, _, said = typed("abort", "-c", "sim.toml")
+        _, error = work.communicate(timeout=60)
+    assert code == 0, said
+    assert work.returncode == 1, error
+    assert "cell abort" in error
+    assert_safe(endpoints)
     assert [read_report(run)["outcome"] for run in list_runs(tmp_path / "runs")] == ["aborted"]
 
 
-def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(tmp_path: Path) -> None:
-    with served(tmp_path, "--seed", "3", "--speed", "1") as endpoints:
-        with started("jog", "arm", "j1", "+80deg", "-c", "sim.toml", folder=tmp_path) as work:
-            request(_when_it_goes_on(tmp_path), "abort", "enough")
-            _, error = work.communicate(timeout=60)
-        assert work.returncode == 1, error
-        assert "enough" in error
-        truth = ask(endpoints, op="truth")["truth"]
-        assert not truth["arm"]["moving"]
+def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, Any], tmp_path: Path) -> None:
+    with started("jog", "arm", "j1", "+80deg", "-c", "sim.toml", folder=tmp_path) as work:
+        request(_when_it_goes_on(tmp_path), "abort", "enough")
+        _, error = work.communicate(timeout=60)
+    assert work.returncode == 1, error
+    assert "enough" in error
+    assert not ask(endpoints, op="truth")["truth"]["arm"]["moving"]
     (folder,) = list_runs(tmp_path / "runs")
     assert read_report(folder)["outcome"] == "aborted"
 
@@ -163,7 +183,9 @@ def _when_it_goes_on(folder: Path, timeout: float = 60.0) -> Path:
     raise AssertionError(f"nothing went on within {timeout} s")
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign), signal.SIGINT]
+)
 def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
     with started("dry-run", "--seed", "3", folder=tmp_path) as run:
         deadline = time.monotonic() + 60

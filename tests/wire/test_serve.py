@@ -34,6 +34,7 @@ class Served:
         )
         assert self.process.stdout is not None
         self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())
+        self._ended: tuple[int, str] | None = None
 
     def ask_truth(self, **request: Any) -> dict[str, Any]:
         host, port = self.endpoints["truth"]["address"].split(":")
@@ -42,10 +43,15 @@ class Served:
             reply: dict[str, Any] = json.loads(connection.makefile().readline())
         return reply
 
-    def end(self) -> tuple[int, str]:
-        """Close its input; exit code and what it wrote to stderr."""
-        _, error = self.process.communicate(timeout=15)
-        return self.process.returncode, error
+    def end(self, number: signal.Signals | None = None) -> tuple[int, str]:
+        """Send it a signal, or close its input; exit code and what it wrote to stderr."""
+        if self._ended is None:
+            if number is not None:
+                self.process.send_signal(number)
+                self.process.wait(15)
+            _, error = self.process.communicate(timeout=15)
+            self._ended = self.process.returncode, error
+        return self._ended
 
     def close(self) -> None:
         if self.process.poll() is None:
@@ -177,18 +183,6 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
     assert "can.bus_off" in refused["error"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_cleanly(number: signal.Signals) -> None:
-    served = Served()
-    try:
-        served.process.send_signal(number)
-        assert served.process.wait(15) == 0
-        assert served.process.stderr is not None
-        assert served.process.stderr.read() == ""
-    finally:
-        served.close()
-
-
 def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
     served = Served()
     try:
@@ -216,3 +210,9 @@ def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
         main(options)
     assert ended.value.code == 2
     assert says in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("which", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
+def test_a_signal_ends_it_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals) -> None:
+    """The last of this file: it ends those that the others ask."""
+    assert pair[which].end(number) == (0, "")
