@@ -75,16 +75,17 @@ def _tree_order(centres: Vector) -> NDArray[np.int64]:
         leaves *= 2
     order = np.full(leaves * LEAF, -1, dtype=np.int64)
     order[: len(centres)] = np.arange(len(centres))
-    padded = np.full((leaves * LEAF, 3), np.inf)
-    padded[: len(centres)] = centres
+    # An axis a row: numpy's reductions along a run of three numbers are many times slower than along long ones.
+    padded = np.full((3, leaves * LEAF), np.inf)
+    padded[:, : len(centres)] = centres.T
     blocks = 1
     while blocks < leaves:
-        points = padded.reshape(blocks, -1, 3)
-        finite = np.isfinite(points)
-        spans = np.where(finite, points, -np.inf).max(axis=1) - np.where(finite, points, np.inf).min(axis=1)
-        keys = np.take_along_axis(points, spans.argmax(axis=1)[:, None, None], axis=2)[:, :, 0]
+        points = padded.reshape(3, blocks, -1)
+        # Places without a triangle are infinite, and never the least, but never to be the greatest either.
+        spans = np.where(np.isfinite(points), points, -np.inf).max(axis=2) - points.min(axis=2)
+        keys = np.take_along_axis(points, spans.argmax(axis=0)[None, :, None], axis=0)[0]
         inner = keys.argsort(axis=1, kind="stable")
-        padded = np.take_along_axis(points, inner[:, :, None], axis=1).reshape(-1, 3)
+        padded = np.take_along_axis(points, inner[None], axis=2)
         order = np.take_along_axis(order.reshape(blocks, -1), inner, axis=1).ravel()
         blocks *= 2
     return order
