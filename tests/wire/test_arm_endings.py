@@ -45,7 +45,7 @@ def running():
 
 
 class Shared:
-    """The one connection that tests share: most leave an arm behind that goes on, or that can be recovered."""
+    """The one connection that tests share as long as the arm can be moved over it: most leave one behind that can."""
 
     def __init__(self, address):
         self._address = address
@@ -53,12 +53,13 @@ class Shared:
 
     def ready(self):
         """The driver, connected, with a program that moves the arm, which stands where it began."""
+        if self._arm is not None:
+            try:
+                stand_at_home(self._arm)
+            except CellError:
+                self.close()
         if self._arm is None:
             self._arm = connect(self._address)
-        try:
-            stand_at_home(self._arm)
-        except CellError:
-            self._arm.recover(confirmed=True)
             stand_at_home(self._arm)
         return self._arm
 
