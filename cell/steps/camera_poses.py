@@ -8,21 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
+from cell.calibration import ScanCalibration, TargetCalibration
 from cell.config import CellConfig
 from cell.geometry.poses import from_parts, transform
 from cell.job import Job
 from cell.vision import BoardSpec
 from drivers.errors import CalibrationStale, RefusedError
 from drivers.interfaces import Vector
-
-if TYPE_CHECKING:
-    # A jog needs these poses and no calibration, which brings half a second of imports.
-    from cell.calibration import ScanCalibration, TargetCalibration
 
 
 @dataclass(frozen=True)

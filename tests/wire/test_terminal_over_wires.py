@@ -110,7 +110,7 @@ def stood_after(truth: str, since: float) -> float:
             stood = None
         elif stood is None:
             stood = now
-        Clock().sleep(0.01)
+        Clock().sleep(0.005)
     assert stood is not None
     return stood
 
