@@ -6,7 +6,8 @@ foot lies on the rim say nothing about the surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -22,6 +23,9 @@ from drivers.errors import ConfigError
 SPACING = 0.0004
 """Distance of the samples, m; a larger triangle carries several."""
 MOST_SAMPLES = 400_000
+WHOLE = (".stl", ".ply")
+"""Files that refer to no others."""
+UNREADABLE = "nominal surface {} cannot be read as a mesh; give an STL or PLY"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +81,7 @@ class NominalSurface:
 
         The last few are kept: one job after another is placed on the same surface, and preparing it takes a while.
         """
-        try:
-            content = sha256(path.read_bytes()).digest()
-        except OSError:
-            content = b""
-        return _prepared(path, content, unit, rim)
+        return _prepared(path, _MeshFile.of(path), unit, rim)
 
     @property
     def extent(self) -> tuple[Array, Array]:
@@ -135,25 +135,58 @@ class NominalSurface:
         return np.asarray(self.areas[self.sample_triangles] / counts[self.sample_triangles])
 
 
+@dataclass(frozen=True)
+class _MeshFile:
+    """A mesh file by its content: a copy of it is the same. `place` is where others lie that it may refer to."""
+
+    path: Path = field(compare=False)
+    suffix: str
+    place: Path | None
+    content: bytes
+
+    @classmethod
+    def of(cls, path: Path) -> _MeshFile:
+        """The file as it is now; `ConfigError` when it cannot be read."""
+        suffix = path.suffix.lower()
+        try:
+            content = sha256(path.read_bytes()).digest()
+        except OSError as error:
+            raise ConfigError(UNREADABLE.format(path)) from error
+        return cls(path, suffix, None if suffix in WHOLE else path.parent, content)
+
+
 @lru_cache(maxsize=4)
-def _prepared(path: Path, content: bytes, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
-    """The surface in a file of this content."""
-    vertices, faces = read_mesh(path, unit)
-    return NominalSurface(vertices, faces, rim, path)
+def _prepared(path: Path, file: _MeshFile, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
+    """The surface in a file, of which there may be copies."""
+    found = copy(_built(file, unit, rim))
+    found.source = path
+    return found
+
+
+@lru_cache(maxsize=4)
+def _built(file: _MeshFile, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
+    return NominalSurface(*_read(file, unit), rim, file.path)
 
 
 def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (n, 3) in m and triangles (m, 3) of a mesh file in `unit`, "m" or "mm".
 
-    Raises `ConfigError` when it is no mesh, or none of a size that a part can be placed onto.
+    Raises `ConfigError` when it is no mesh, or none of a size that a part can be placed onto. The last few are kept, as
+    a job's mesh is looked at before it is used: none of the arrays may be written to.
     """
+    return _read(_MeshFile.of(path), unit)
+
+
+@lru_cache(maxsize=4)
+def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
     import trimesh
 
+    path = file.path
     try:
         mesh = trimesh.load_mesh(path, process=True)
-        vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # every reader of trimesh raises its own
-        raise ConfigError(f"nominal surface {path} cannot be read as a mesh; give an STL or PLY") from error
+        raise ConfigError(UNREADABLE.format(path)) from error
     if vertices.ndim != 2 or not len(faces) or not np.isfinite(vertices).all():
         raise ConfigError(
             f"nominal surface {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY "
@@ -166,6 +199,7 @@ def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:
             f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
             "check surface.mesh_unit in the job"
         )
+    vertices.flags.writeable = faces.flags.writeable = False
     return vertices, faces
 
 
