@@ -139,6 +139,12 @@ def test_rays_at_the_vanishing_line_are_rejected():
     assert np.isnan(LightPlane.from_baseline(0.035, THETA).intersect(rays)).all()
 
 
+def test_a_plane_that_was_kept_comes_back_to_the_last_bit():
+    for normal in np.random.default_rng(3).normal(size=(2000, 3)):
+        plane = LightPlane.of(normal, 0.0333)
+        assert LightPlane.of(list(plane.normal), plane.distance) == plane
+
+
 def test_plane_fit_finds_the_plane_of_its_points():
     truth = LightPlane.of((0.3, -0.2, 0.9), 0.4)
     rays = CAMERA.rays(np.random.default_rng(1).uniform(0, 480, (30, 2)))
