@@ -144,9 +144,7 @@ def _tags(
 
 
 @compiled
-def _shade(
-    x: float, y: float, shape: Whole, size: Scalars, markers: NDArray[np.uint8]
-) -> float:  # pragma: no cover
+def _shade(x: float, y: float, shape: Whole, size: Scalars, markers: NDArray[np.uint8]) -> float:  # pragma: no cover
     """Albedo at a place of the board; −1 beside the sheet."""
     pitch, radius, marker, white, black = size[0], size[1], size[2], size[7], size[8]
     if x < size[3] or x > size[4] or y < size[5] or y > size[6]:
