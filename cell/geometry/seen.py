@@ -11,6 +11,9 @@ import numpy as np
 from cell.compiled import compiled
 from cell.geometry.camera import Array
 
+UNDISTORT_STEPS = 20
+UNDISTORT_TOLERANCE = 1e-13
+
 
 @compiled
 def distorted(lens: Array, x: float, y: float) -> tuple[float, float, float, float, float]:  # pragma: no cover
@@ -27,6 +30,27 @@ def distorted(lens: Array, x: float, y: float) -> tuple[float, float, float, flo
         xy * slope + 2 * p1 * x + 2 * p2 * y,
         radial + yy * slope + 6 * p1 * y + 2 * p2 * x,
     )
+
+
+@compiled
+def undistort(lens: Array, distant: Array, ideal: Array, off: Array, determinant: Array) -> None:  # pragma: no cover
+    """Newton's method on `distorted`: writes the `ideal` coordinates (n, 2) of distorted ones (n, 2).
+
+    And by how much each is `off` (n,) still, and the `determinant` (n,) of the last step: not positive past a fold.
+    """
+    for i in range(len(distant)):
+        x, y = distant[i, 0], distant[i, 1]
+        determinant[i] = 1.0
+        for _ in range(UNDISTORT_STEPS):
+            u, v, by_x, both, by_y = distorted(lens, x, y)
+            off_x, off_y = u - distant[i, 0], v - distant[i, 1]
+            off[i] = max(abs(off_x), abs(off_y))
+            if not off[i] >= UNDISTORT_TOLERANCE:
+                break
+            determinant[i] = by_x * by_y - both * both
+            x -= (by_y * off_x - both * off_y) / determinant[i]
+            y -= (by_x * off_y - both * off_x) / determinant[i]
+        ideal[i, 0], ideal[i, 1] = x, y
 
 
 @compiled
