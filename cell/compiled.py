@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 try:
@@ -35,6 +36,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 def compiled_fast(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `compiled`, with sums in any order: for loops over pixels that hold no NaN."""
     return _compile(function, fastmath=True)
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Whether what `compiled` gave lies compiled on disk, in some version; True where nothing can be compiled."""
+    if not AVAILABLE:
+        return True
+    folder = function.stats.cache_path  # type: ignore[attr-defined]
+    return folder is None or any(Path(folder).glob(f"*.{function.__name__}-*.nbi"))
 
 
 def _compile(function: Callable[..., Any], fastmath: bool) -> Callable[..., Any]:

@@ -16,6 +16,7 @@ from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane
+from cell.steps.laser_sweep import unwatched
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame
 
@@ -141,6 +142,13 @@ def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
     columns[before.rows[-25:]] = np.nan
     slip = since(replace(before, columns=columns))
     assert slip.hidden and slip.across == 0.0 and "covered" in slip.notes[0]
+
+
+def test_a_job_says_what_its_plate_does_not_show(cell) -> None:
+    whole = cell[1]
+    assert unwatched(whole) == ()
+    assert "no edge" in " ".join(unwatched(replace(whole, edge=None)))
+    assert "laser.witness" in " ".join(unwatched(None))
 
 
 def test_it_is_kept_with_the_calibration(cell) -> None:

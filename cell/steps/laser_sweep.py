@@ -11,7 +11,7 @@ from cell.calibration.collect.edge import require_edge
 from cell.calibration.collect.witness import require_witness
 from cell.calibration.slip import Slip, slip_since
 from cell.calibration.timing import Timing, changed, link_of
-from cell.calibration.witness import Pointing
+from cell.calibration.witness import Pointing, Witness
 from cell.calibration.witness import pointing as pointing_since
 from cell.config import CellConfig
 from cell.devices.devices import Devices
@@ -147,7 +147,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         context.progress,
         lambda collector: here.sweeping(collector, base_from_surface),
     )
-    record = replace(record, pointing=pointing, slip=slip, doubts=(*doubts, *here.notes))
+    record = replace(record, pointing=pointing, slip=slip, doubts=(*unwatched(head.witness), *doubts, *here.notes))
     for note in record.notes:
         context.note(text=note)
     return record
@@ -170,6 +170,21 @@ def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | Non
             "a sweep does not show it. Run `cell calibrate timing`"
         )
     return timing, tuple(doubts)
+
+
+def unwatched(witness: Witness | None) -> tuple[str, ...]:
+    """For people, what a look at the plate on the claw cannot tell, of which the calibration saw this."""
+    if witness is None:
+        return (
+            "whether the laser has turned or the scan head has slipped since the calibration is not seen: it looked at "
+            "no plate on the claw. Mount one and configure laser.witness",
+        )
+    if witness.edge is None:
+        return (
+            "whether the scan head has slipped since the calibration is not seen: the plate on the claw has no edge "
+            "that the laser's line passes within 10 mm of laser.witness",
+        )
+    return ()
 
 
 def _seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:

@@ -22,7 +22,7 @@ SPEED = "3"
 
 @dataclass(frozen=True)
 class Supervised:
-    """What the README's script printed in `folder`, where it calibrated the simulated cell of seed 3 and placed."""
+    """What the README's script printed in `folder`, where it placed in the simulated cell of seed 3."""
 
     folder: Path
     printed: str

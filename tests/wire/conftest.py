@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cell import Cell
 from cell.cli import main
 from cell.run.folder import list_runs
 from cell.run.reading import read_report
@@ -26,8 +27,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def supervised(tmp_path_factory: pytest.TempPathFactory) -> Supervised:
-    """A first run on a fresh machine, by the script that the README prints, over the wires."""
+    """The script that the README prints, over the wires, where the cell of seed 3 was calibrated without wires."""
     folder = tmp_path_factory.mktemp("cell")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        with Cell.open(sim="all", seed=3, clock="virtual") as virtual:
+            virtual.calibrate()
+    return supervise(folder)
+
+
+def supervise(folder: Path) -> Supervised:
+    """Run the script that the README prints in `folder`; without a calibration there it calibrates first."""
     (folder / "supervise.py").write_text(block("python"), encoding="utf-8")
     done = subprocess.run([sys.executable, "supervise.py"], cwd=folder, capture_output=True, text=True, timeout=900.0)
     assert done.returncode == 0, done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import time
@@ -16,8 +17,11 @@ from can.io.canutils import CanutilsLogReader
 
 from cell.record.export import as_candump
 from cell.record.information import information
+from cell.run.folder import list_runs
+from cell.run.reading import read_report
 from drivers.vehicle.agilex_link import load_database
-from tests.wire.cells import Supervised, assert_safe, cell, served, started, wait_for_step
+from tests.wire.cells import Supervised, assert_safe, served, started, wait_for_step
+from tests.wire.conftest import supervise
 
 pytestmark = pytest.mark.wire
 
@@ -37,6 +41,15 @@ def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(placed: d
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
     assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
+
+
+@pytest.mark.campaign
+def test_a_first_run_over_the_wires_calibrates_and_places_within_the_same_bounds(tmp_path: Path) -> None:
+    first = supervise(tmp_path)
+    assert first.printed.startswith("placed")
+    test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(first.report)
+    kinds = [read_report(run)["kind"] for run in list_runs(tmp_path / "runs")]
+    assert kinds == ["calibration", "job"]
 
 
 def test_the_report_keeps_its_contract(placed: dict[str, Any]) -> None:
@@ -88,8 +101,14 @@ def test_the_record_holds_what_passed_on_the_wires(place: Path, placed: dict[str
     assert "SystemState" in {names.get(frame.arbitration_id) for frame in frames if frame.is_rx}
 
 
-def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
+def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
+    place: Path, tmp_path: Path, typed: Callable[..., tuple[int, str, str]]
+) -> None:
     with served(place, "--seed", "3") as endpoints:
+        # No calibration lies beside this copy.
+        shutil.copy(place / "sim.toml", tmp_path)
+        code, _, error = typed("run", "-c", str(tmp_path / "sim.toml"))
+        assert (code, "calibrat" in error) == (1, True), error
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "laser_sweep")
             os.kill(run.pid, signal.SIGINT)
@@ -102,15 +121,15 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130(place: Path) -> None:
         assert_safe(endpoints)
 
 
-def test_cell_abort_ends_a_run_from_another_shell(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
+def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "drive_to_target")
             code, _, error = typed("jog", "rail", "+1mm", "-c", str(place / "sim.toml"))
-            asked = cell("abort", "-c", "sim.toml", folder=place)
+            asked, _, trouble = typed("abort", "-c", str(place / "sim.toml"))
             out, err = run.communicate(timeout=30)
         assert (code, "held by process" in error) == (1, True), error
-        assert asked.returncode == 0, asked.stderr
+        assert asked == 0, trouble
         assert run.returncode == 1, err
         assert json.loads(out)["outcome"] == "aborted"
         assert_safe(endpoints)
@@ -143,10 +162,3 @@ def test_two_dry_runs_at_once_do_not_disturb_each_other(place: Path) -> None:
     for (out, err), run in zip(texts, (first, second), strict=True):
         assert run.returncode == 0, err
         assert json.loads(out)["outcome"] == "done"
-
-
-def test_a_run_without_a_calibration_of_this_cell_is_refused(tmp_path: Path) -> None:
-    with served(tmp_path, "--seed", "4"):
-        done = cell("run", "-c", "sim.toml", folder=tmp_path)
-    assert done.returncode == 1
-    assert "calibrat" in done.stderr

@@ -1,0 +1,64 @@
+"""Compiles, in a second process beside a first calibration, the loops that it and the job after it come to use.
+
+On a fresh machine that is some 20 s of work for a core that has nothing to do. The loops are kept on disk: from then on
+there is nothing to compile, and no second process.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pinocchio as pin
+
+from cell.compiled import is_kept
+from cell.inversion import NominalSurface
+from cell.inversion.closest import closest
+from cell.inversion.search import candidates
+from cell.reconstruction import Cloud, fill_holes
+from cell.reconstruction.outliers import find_outliers
+from cell.vision.stripe.rehearsal import read_drawn
+
+LINES = 40
+"""Lines and rows of the drawn cloud."""
+GIVING_WAY = 19
+"""How nice the second process is: nothing that moves waits for it."""
+
+
+def begin() -> None:
+    """Compile in a second process what is not kept on disk yet. It ends with this one, if not before."""
+    if is_kept(closest):
+        return
+    mine, nowhere = [sys.executable, "-m", "cell.ahead"], subprocess.DEVNULL
+    # Nothing is written to the pipe; it closes when this process ends, in whatever way.
+    subprocess.Popen(mine, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere)
+
+
+def compile_all() -> None:
+    """What reads a stripe, makes a cloud, and finds a surface in it, in the order in which they come to be used."""
+    read_drawn()
+    x, y = np.meshgrid(np.linspace(0.0, 0.02, LINES), np.linspace(0.0, 0.02, LINES))
+    points = np.dstack([x, y, 20.0 * x * y])
+    holed = points.copy()
+    holed[LINES // 2, 3:-3] = np.nan
+    find_outliers(holed[:, :, 2], np.full(x.shape, 1e-5))
+    spread = np.zeros(points.shape, dtype=np.float32) + np.float32(1e-5)
+    fill_holes(Cloud(holed, spread, np.zeros((LINES, 3)), x, y[:, 0], np.zeros(x.shape, dtype=np.bool_)))
+    flat, corners = points.reshape(-1, 3), np.arange(LINES**2).reshape(x.shape)[:-1, :-1].ravel()
+    surface = NominalSurface(flat, np.stack([corners, corners + 1, corners + LINES], axis=1))
+    candidates(pin.SE3.Identity(), flat, surface, 0.002, 0.05, 1)
+    surface.feet(flat)
+
+
+def _end_with_the_other() -> None:
+    sys.stdin.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    os.nice(GIVING_WAY)
+    threading.Thread(target=_end_with_the_other, daemon=True).start()
+    compile_all()
