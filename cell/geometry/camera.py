@@ -50,26 +50,6 @@ class CameraModel:
         normalised = self.distort(p[:, :2] / z[:, None])
         return normalised * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def project_with_jacobians(self, points: ArrayLike) -> tuple[Array, Array, Array]:
-        """Pixels (n, 2), ∂pixel/∂point (n, 2, 3) and ∂pixel/∂parameter (n, 2, 9) for points (n, 3) in front."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        x, y = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
-        distorted = self._distorted(x, y)
-        pixels = distorted * (self.fx, self.fy) + (self.cx, self.cy)
-        return pixels, self._by_point(x, y, p[:, 2]), self._by_parameters(x, y, distorted)
-
-    def point_jacobian(self, points: ArrayLike) -> Array:
-        """∂pixel/∂point (n, 2, 3) for points (n, 3) in front."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        return self._by_point(p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], p[:, 2])
-
-    def _by_point(self, x: Array, y: Array, z: Array) -> Array:
-        made = np.empty((len(x), 2, 3))
-        focal = np.array([[self.fx], [self.fy]])
-        made[:, :, :2] = focal * self._distortion_jacobian(x, y) / z[:, None, None]
-        made[:, :, 2] = -(made[:, :, 0] * x[:, None] + made[:, :, 1] * y[:, None])
-        return made
-
     def parameter_jacobian(self, points: ArrayLike) -> Array:
         """∂pixel/∂parameter (n, 2, 9) for points (n, 3) in front."""
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
