@@ -65,6 +65,8 @@ class CellSection(Table):
     time_scale: Annotated[float, number(0.01, 100)] = 1.0
     truth: Annotated[str, AfterValidator(lambda text: text and checked_endpoint(text))] = ""
     confirm: Confirm = "person"
+    record: bool = True
+    """Whether runs leave `record.mcap`."""
     sim: Annotated[tuple[str, ...], AfterValidator(lambda names: _devices(names))] = ()
     """The devices that are simulated beside real ones."""
 

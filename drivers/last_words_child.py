@@ -12,14 +12,14 @@ BEAT, REST, GOODBYE = b"+", b"-", b"b"
 def main(pipe: int, port: int, pause: float, silence: float, words: list[bytes]) -> None:
     """Wait for the end of `pipe`; write `words` to `port`, unless the owner has said goodbye.
 
-    From a beat until a rest they are also written when nothing was heard for `silence` s.
+    From a beat until a rest they are also written each time that nothing was heard for `silence` s: an owner that hung
+    may begin a motion afterwards.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     attended = False
     while True:
         if attended and not select.select([pipe], [], [], silence)[0]:
-            attended = False
             if not say(port, pause, words):
                 return
             continue

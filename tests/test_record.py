@@ -330,6 +330,14 @@ def test_a_disk_that_takes_nothing_costs_the_record_and_not_the_run(tmp_path: Pa
     assert out.failure is not None and "nowhere" in out.failure
 
 
+def test_a_configuration_can_do_without_records(tmp_path: Path) -> None:
+    quiet = CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update={"record": False})})
+    run: Run[None] = Run("jog", lambda run: None)
+    with recorder.recorded(tmp_path, run, quiet, VirtualCell(CONFIG, 1, "ideal").devices) as record:
+        assert record is None
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_without_the_packages_that_is_said_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -46,7 +46,7 @@ _said: set[str] = set()
 def recorded(
     folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
 ) -> Iterator[Recorder | None]:
-    """While the context is open, all that happens goes to `record.mcap` in `folder`; None where nothing can."""
+    """While the context is open, all that happens goes to `record.mcap` in `folder`; None where nothing does."""
     record = begin_record(folder, run, config, devices, calibration)
     try:
         yield record
@@ -58,7 +58,9 @@ def recorded(
 def begin_record(
     folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
 ) -> Recorder | None:
-    """Begin to record; None, said once in a process, when the packages for it are not installed."""
+    """Begin to record; None where the configuration says so or, said once in a process, packages are not installed."""
+    if not config.cell.record:
+        return None
     if absent := missing():
         if "packages" not in _said:
             _said.add("packages")

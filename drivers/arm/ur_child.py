@@ -58,7 +58,7 @@ class Child:
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
         self._outbox = Outbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
-        self._attended_until = math.inf
+        self._attended_until, self._silence = math.inf, 0.0
         self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
 
@@ -117,8 +117,8 @@ class Child:
                 elif request.name == "safe_off":
                     self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
                 elif request.name == "attend":
-                    silence = request.arguments[0]
-                    self._attended_until = time.monotonic() + silence if silence > 0 else math.inf
+                    self._silence = request.arguments[0]
+                    self._attended_until = time.monotonic() + self._silence if self._silence > 0 else math.inf
                 else:
                     self._control.submit(request)
         self.shut_down(closing)
@@ -173,7 +173,8 @@ class Child:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
             if time.monotonic() > self._attended_until:
-                self._attended_until = math.inf
+                # Again and again: an owner that hung may begin a motion afterwards.
+                self._attended_until = time.monotonic() + self._silence
                 self._control.submit(Request(UNANSWERED, "stop"))
             if not self._packets.connected:
                 self._lose("the arm closed the connection")

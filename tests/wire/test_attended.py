@@ -40,6 +40,8 @@ for line in sys.stdin:
     goal = start + (0.5 if start[0] < 0.3 else -0.5) * np.eye(6)[0]
     far = 0.09 if rail.state().position < 0.05 else 0.01
     with arm.attended() as arm_beat, rail.attended() as rail_beat:
+        if not beats:
+            clock.sleep(0.4)
         motions = arm.move_joints(goal, 0.2, 1.0), rail.move_to(far, 0.008)
         for _ in range(beats):
             arm_beat()
@@ -61,7 +63,7 @@ class Bench:
         self.arm, self.rail, self.world, self.program = arm, rail, world, program
 
     def say(self, beats: int) -> None:
-        """Have it begin both motions, and attend them for so many beats of 80 ms."""
+        """Have it begin both motions, and attend them for so many beats of 80 ms; for none after a silence."""
         assert self.program.stdin is not None
         self.program.stdin.write(f"{beats}\n")
         self.program.stdin.flush()
@@ -114,6 +116,11 @@ def test_arm_and_rail_stand_soon_after_silence_and_after_the_program_froze(bench
     # The last beat was 80 ms before.
     assert max(bench.stands_after(time.monotonic() - 0.08)) < WITHIN_S
     # The program is told, and the rail has kept its zero.
+    assert bench.hear() == "True True 1"
+    # What begins only after a silence ends as soon.
+    bench.say(0)
+    assert bench.hear() == "silent"
+    assert max(bench.stands_after(time.monotonic())) < WITHIN_S
     assert bench.hear() == "True True 1"
     _end(bench, signal.SIGSTOP)
 
