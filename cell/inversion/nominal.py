@@ -92,14 +92,18 @@ class NominalSurface:
         """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""
         p = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         grid, walk = self.grid, self._walk
-        feet, hit = closest(p, grid.low, grid.cell, grid.owner, self._corners, walk.corner_of, walk.start, walk.fan)
-        way = p - feet
-        chosen = np.flatnonzero(np.einsum("ni,ni->n", way, way) <= within * within)
-        feet, hit, way = feet[chosen], hit[chosen], way[chosen]
-        normals = self.normals[hit]
-        heights = np.einsum("ni,ni->n", way, normals)
-        aside = np.linalg.norm(way - heights[:, None] * normals, axis=1)
-        inner = aside <= 2e-5 + 0.3 * np.abs(heights)
+        chosen, hit, feet, normals, heights, inner = closest(
+            p,
+            float(within),
+            grid.low,
+            grid.cell,
+            grid.owner,
+            self._corners,
+            self.normals,
+            walk.corner_of,
+            walk.start,
+            walk.fan,
+        )
         if self._border is not None:
             doubtful = np.flatnonzero(self._maybe_rim[hit])
             inner[doubtful] &= self._border.query(feet[doubtful], distance_upper_bound=self._rim)[0] > self._rim
