@@ -10,6 +10,8 @@ import pytest
 from cell.geometry import poses
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane, closed_form, closed_form_jacobian, triangulate
+from cell.geometry.poses import from_parts, perturbed, transform
+from cell.geometry.seen import pose_equations, seen_points
 
 CAMERA = CameraModel(640, 480, 1666.0, 1670.0, 322.0, 236.0, (-0.12, 0.21, 1.1e-3, -0.7e-3, -0.05))
 THETA = np.arctan(3.5)
@@ -66,18 +68,37 @@ def test_a_point_behind_the_camera_has_no_pixel():
     assert np.isnan(CAMERA.project([[0.0, 0.0, -1.0]])).all()
 
 
-def test_projection_jacobians_are_those_of_finite_differences():
+def test_parameter_jacobian_is_that_of_finite_differences():
     points = points_in_front(5)
-    _, by_point, by_parameter = CAMERA.project_with_jacobians(points)
     scale = np.maximum(np.abs(CAMERA.parameters), 1.0)
-    for p, jp, jq in zip(points, by_point, by_parameter, strict=True):
-        np.testing.assert_allclose(jp, numerical(lambda q: CAMERA.project(q)[0], p), rtol=1e-5, atol=1e-3)
+    for p, jacobian in zip(points, CAMERA.parameter_jacobian(points), strict=True):
 
         def by_scaled(q, p=p):
             return CAMERA.with_parameters(q * scale).project(p)[0]
 
         expected = numerical(by_scaled, CAMERA.parameters / scale)
-        np.testing.assert_allclose(jq * scale, expected, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(jacobian * scale, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_boards_points_are_seen_where_the_camera_projects_them():
+    pose = from_parts((0.01, -0.02, 0.3), pin.exp3(np.array([0.4, -0.3, 1.0])))
+    points = np.column_stack([np.random.default_rng(4).uniform(-0.05, 0.05, (30, 2)), np.zeros(30)])
+    pixels = np.empty((30, 2))
+
+    def seen(at: pin.SE3) -> np.ndarray:
+        seen_points(CAMERA.parameters, at.rotation, at.translation, points, 0.0, pixels)
+        return pixels.copy()
+
+    np.testing.assert_allclose(seen(pose), CAMERA.project(transform(pose, points)), atol=1e-9)
+    behind = from_parts(-pose.translation, pose.rotation)
+    assert np.isnan(seen(behind)).all()
+    # The equations that bring a pose to the pixels: those of the derivatives by finite differences.
+    residual, factor = np.random.default_rng(5).normal(0, 1, (30, 2)), np.linspace(1, 3, 30)
+    normal, right = np.empty((6, 6)), np.empty(6)
+    pose_equations(CAMERA.parameters, pose.rotation, pose.translation, points, factor, residual, normal, right)
+    slopes = numerical(lambda d: seen(perturbed(pose, d)).ravel(), np.zeros(6)) * np.repeat(factor, 2)[:, None]
+    np.testing.assert_allclose(normal, slopes.T @ slopes, rtol=1e-5, atol=1e-5 * normal.max())
+    np.testing.assert_allclose(right, slopes.T @ (factor[:, None] * residual).ravel(), rtol=1e-4, atol=1e-2)
 
 
 def test_ray_jacobian_is_that_of_finite_differences():
@@ -137,6 +158,12 @@ def test_rays_at_the_vanishing_line_are_rejected():
     rays = np.array([[vanishing, 0.0, f], [vanishing * 1.2, 0.0, f]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     assert np.isnan(LightPlane.from_baseline(0.035, THETA).intersect(rays)).all()
+
+
+def test_a_plane_that_was_kept_comes_back_to_the_last_bit():
+    for normal in np.random.default_rng(3).normal(size=(2000, 3)):
+        plane = LightPlane.of(normal, 0.0333)
+        assert LightPlane.of(list(plane.normal), plane.distance) == plane
 
 
 def test_plane_fit_finds_the_plane_of_its_points():

@@ -719,11 +719,11 @@ def lit(image: np.ndarray, red: float) -> np.ndarray:
 
 
 def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(tmp_path, pictures):
-    for path in sorted(pictures.iterdir())[:3]:
+    for path in sorted(pictures.iterdir())[:2]:
         cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
     frames, channel = read_frames(list_folder(tmp_path), BOARD)
     assert channel.chosen is not Laser.GREY
-    assert sum(channel.votes.values()) == 3
+    assert sum(channel.votes.values()) == 2
     for frame in frames:
         assert frame.profile is not None, frame.stripe_text
         rows = frame.profile.rows

@@ -227,8 +227,8 @@ def documented() -> set[str]:
 
 @pytest.fixture(scope="module")
 def two_sweeps(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """The pot in two sweeps side by side."""
-    job, nominal = pot(swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
+    """The middle of the pot in two sweeps side by side."""
+    job, nominal = pot(length=0.036, swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
     record = run_whole_job(CONFIG, job, nominal, 2, "nominal", calibrated=placed_pot)
     assert (record.outcome, record.reason) == ("placed", "")
     return report_runs.placed(record, tmp_path_factory.mktemp("two") / "runs")

@@ -133,6 +133,8 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
         run.tell = lambda event: (push(event), tell(event))[1]  # type: ignore[method-assign]
         outcome = run.result(120.0)
     assert outcome.outcome == "refused"
+    assert outcome.report["refusal"]["step"] == "laser_sweep"
+    require_safe(dict(outcome.report))
     assert re.search(r"the board has moved by \d+\.\d+ mm .* since it was photographed", outcome.reason)
 
 
@@ -237,6 +239,7 @@ def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
     assert (outcome.outcome, outcome.reason) == ("aborted", "enough waited")
 
 
+@pytest.mark.campaign
 def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
     text = (folder / "pot.toml").read_text(encoding="utf-8")
     assert 'tolerance = "0.6 mm"' in text
@@ -251,7 +254,7 @@ def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
 def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str) -> None:
     with opened() as cell:
         run = cell.start("pot.toml")
-        upto(run, StepStarted, "drive_to_target" if way in ("journal", "close") else "laser_sweep")
+        upto(run, StepStarted, "laser_sweep" if way == "stop" else "drive_to_target")
         assert run.folder is not None
         match way:
             case "handle":

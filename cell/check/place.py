@@ -13,11 +13,11 @@ import pinocchio as pin
 
 from cell.config import CellConfig
 from cell.geometry.poses import from_parts, transform
+from cell.inversion.nominal import read_mesh
 from cell.job import Job
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
 from cell.steps.approach import MAX_HEADING, Planar, wrap
 from cell.steps.camera_poses import centre_of
-from cell.surface_file import read_mesh
 from cell.vision import parse_board
 from drivers.interfaces import Vector
 

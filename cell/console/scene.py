@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from cell.config import CellConfig
 from cell.device_config import CameraConfig
+from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.steps.camera_poses import base_from_place_at_target, centre_of
 from cell.steps.moves import HOME, deck_plates, mounted
-from cell.surface_file import read_mesh
 from cell.vision import parse_board
 from drivers.link_table import LinkTable
 

@@ -24,7 +24,6 @@ from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConf
 from cell.devices.vehicle_makes import CanopenVehicleConfig
 from cell.geometry.poses import from_parts, transform
 from cell.job import Job, load_job, shipped_mesh
-from cell.surface_file import read_mesh
 from drivers.errors import ConfigError
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
@@ -289,6 +288,8 @@ def _table(job: Job, mesh: Path) -> Iterator[str]:
         vertices = np.array([[sx * x, sy * y, 0.0] for sx in (-1, 1) for sy in (-1, 1)])
         faces = np.array([[0, 2, 1], [1, 2, 3]])
     else:
+        from cell.inversion.nominal import read_mesh  # half a second of imports
+
         vertices, faces = read_mesh(mesh, job.surface.mesh_unit)
     on_place = transform(job.surface.place_from_surface.se3(), vertices)
     reach = float(np.abs(on_place[:, :2]).max())

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-UNDISTORT_STEPS = 20
-UNDISTORT_TOLERANCE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -51,26 +49,6 @@ class CameraModel:
         z = np.where(p[:, 2] > 0, p[:, 2], np.nan)
         normalised = self.distort(p[:, :2] / z[:, None])
         return normalised * (self.fx, self.fy) + (self.cx, self.cy)
-
-    def project_with_jacobians(self, points: ArrayLike) -> tuple[Array, Array, Array]:
-        """Pixels (n, 2), ∂pixel/∂point (n, 2, 3) and ∂pixel/∂parameter (n, 2, 9) for points (n, 3) in front."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        x, y = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
-        distorted = self._distorted(x, y)
-        pixels = distorted * (self.fx, self.fy) + (self.cx, self.cy)
-        return pixels, self._by_point(x, y, p[:, 2]), self._by_parameters(x, y, distorted)
-
-    def point_jacobian(self, points: ArrayLike) -> Array:
-        """∂pixel/∂point (n, 2, 3) for points (n, 3) in front."""
-        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        return self._by_point(p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], p[:, 2])
-
-    def _by_point(self, x: Array, y: Array, z: Array) -> Array:
-        made = np.empty((len(x), 2, 3))
-        focal = np.array([[self.fx], [self.fy]])
-        made[:, :, :2] = focal * self._distortion_jacobian(x, y) / z[:, None, None]
-        made[:, :, 2] = -(made[:, :, 0] * x[:, None] + made[:, :, 1] * y[:, None])
-        return made
 
     def parameter_jacobian(self, points: ArrayLike) -> Array:
         """∂pixel/∂parameter (n, 2, 9) for points (n, 3) in front."""
@@ -117,30 +95,12 @@ class CameraModel:
         target = (np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not any(self.dist):
             return target
-        k1, k2, p1, p2, k3 = self.dist
-        to_x, to_y = target.T
-        x, y, off, determinant = to_x, to_y, np.full(len(target), np.inf), np.ones(len(target))
-        # Written out, because every solve of a calibration comes through here many times.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for _ in range(UNDISTORT_STEPS):
-                xx, yy, xy = x * x, y * y, x * y
-                r2 = xx + yy
-                radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                off_x = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx) - to_x
-                off_y = y * radial + p1 * (r2 + 2 * yy) + 2 * p2 * xy - to_y
-                off = np.maximum(np.abs(off_x), np.abs(off_y))
-                if np.fmax.reduce(off, initial=0.0) < UNDISTORT_TOLERANCE:
-                    break
-                slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
-                by_x, by_y = (
-                    radial + xx * slope + 2 * p1 * y + 6 * p2 * x,
-                    radial + yy * slope + 6 * p1 * y + 2 * p2 * x,
-                )
-                both = xy * slope + 2 * (p1 * x + p2 * y)
-                determinant = by_x * by_y - both * both
-                x = x - (by_y * off_x - both * off_y) / determinant
-                y = y - (by_x * off_y - both * off_x) / determinant
-        found = np.column_stack([x, y])
+        # Here, because that module needs this one.
+        from cell.geometry.seen import undistort
+
+        found, off, determinant = np.empty((len(target), 2)), np.empty(len(target)), np.empty(len(target))
+        undistort(self.parameters, np.ascontiguousarray(target), found, off, determinant)
+        x, y = found.T
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
             fold = self._fold(float(np.fmax.reduce(r2, initial=0.0)))

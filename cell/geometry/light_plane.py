@@ -16,6 +16,8 @@ from cell.geometry.camera import Array, CameraModel
 
 # A ray that makes less than this angle (as its sine) with the plane meets it nowhere useful.
 VANISHING_SINE = 1e-6
+# By so much the length of a normal that was divided by its length may be off 1.
+ROUNDING = 1e-15
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,14 @@ class LightPlane:
 
     @classmethod
     def of(cls, normal: ArrayLike, distance: float) -> LightPlane:
-        """The plane normal·P = distance with a normal of any length but zero."""
+        """The plane normal·P = distance with a normal of any length but zero; one of length 1 is kept to the bit."""
         n = np.asarray(normal, dtype=np.float64)
         length = float(np.linalg.norm(n))
         if not length > 0:
             raise ValueError("the normal of a light plane must not be zero")
+        # What was made and stored is the same when it is read: divided again, its last bits would move.
+        if abs(length - 1.0) < ROUNDING:
+            length = 1.0
         x, y, z = (float(v) for v in n / length)
         return cls((x, y, z), float(distance) / length)
 

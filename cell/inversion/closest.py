@@ -13,6 +13,7 @@ from cell.compiled import compiled
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Point = tuple[float, float, float]
 
 CELL = 0.0005
 """Edge of a cell, m, unless that makes more than `MOST_CELLS`."""
@@ -62,63 +63,89 @@ class Walk:
 @compiled
 def closest(
     points: Array,
+    within: float,
     low: Array,
     cell: float,
     owner: NDArray[np.int32],
     corners: Array,
+    normals: Array,
     corner_of: NDArray[np.int64],
     start: NDArray[np.int32],
     fan: NDArray[np.int32],
-) -> tuple[Array, Indices]:
-    """For each point (n, 3) the closest point of the mesh (corners (m, 3, 3)), and the triangle on which it lies."""
-    feet = np.empty_like(points)
-    hit = np.empty(len(points), dtype=np.intp)
-    foot, weights = np.empty(3), np.empty(3)
+) -> tuple[Indices, Indices, Array, Array, Array, NDArray[np.bool_]]:
+    """Of the points (n, 3) those within `within` m of the mesh (corners (m, 3, 3), unit normals (m, 3)).
+
+    Their indices, the triangles on which their closest points lie, those points and the normals there, how far the
+    points are along the normal, and whether the shortest way runs along it.
+    """
+    many = len(points)
+    chosen, hit = np.empty(many, dtype=np.intp), np.empty(many, dtype=np.intp)
+    feet, ups = np.empty((many, 3)), np.empty((many, 3))
+    heights, upright = np.empty(many), np.empty(many, dtype=np.bool_)
     at = np.empty(3, dtype=np.intp)
-    better, better_weights = np.empty(3), np.empty(3)
-    for n in range(len(points)):
+    count = 0
+    for n in range(many):
+        p = points[n, 0], points[n, 1], points[n, 2]
         for i in range(3):
             at[i] = min(max(int((points[n, i] - low[i]) / cell), 0), owner.shape[i] - 1)
         best = int(owner[at[0], at[1], at[2]])
-        distance = to_triangle(points[n], corners, best, foot, weights)
+        distance, foot, weights = to_triangle(
+            p,
+            (corners[best, 0, 0], corners[best, 0, 1], corners[best, 0, 2]),
+            (corners[best, 1, 0], corners[best, 1, 1], corners[best, 1, 2]),
+            (corners[best, 2, 0], corners[best, 2, 1], corners[best, 2, 2]),
+        )
         for _ in range(100):
             if min(weights[0], weights[1], weights[2]) > 0.0:
                 break
-            pivot = corner_of[best, np.argmax(weights)]
+            largest = 0 if weights[0] >= weights[1] else 1
+            largest = largest if weights[largest] >= weights[2] else 2
+            pivot = corner_of[best, largest]
             left = best
             for place in range(start[pivot], start[pivot + 1]):
-                triangle = int(fan[place])
-                if triangle == left:
+                t = int(fan[place])
+                if t == left:
                     continue
-                other = to_triangle(points[n], corners, triangle, better, better_weights)
+                other, better, better_weights = to_triangle(
+                    p,
+                    (corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]),
+                    (corners[t, 1, 0], corners[t, 1, 1], corners[t, 1, 2]),
+                    (corners[t, 2, 0], corners[t, 2, 1], corners[t, 2, 2]),
+                )
                 if other < distance:
-                    distance, best = other, triangle
-                    # One by one: for slices numba compiles the text of an error, which takes 3 s.
-                    for i in range(3):
-                        foot[i], weights[i] = better[i], better_weights[i]
+                    distance, best, foot, weights = other, t, better, better_weights
             if best == left:
                 break
-        hit[n] = best
-        for i in range(3):
-            feet[n, i] = foot[i]
-    return feet, hit
+        if not distance <= within * within:
+            continue
+        x, y, z = p[0] - foot[0], p[1] - foot[1], p[2] - foot[2]
+        nx, ny, nz = normals[best, 0], normals[best, 1], normals[best, 2]
+        height = x * nx + y * ny + z * nz
+        aside = np.sqrt((x - height * nx) ** 2 + (y - height * ny) ** 2 + (z - height * nz) ** 2)
+        chosen[count], hit[count], heights[count] = n, best, height
+        upright[count] = aside <= 2e-5 + 0.3 * abs(height)
+        feet[count, 0], feet[count, 1], feet[count, 2] = foot
+        ups[count, 0], ups[count, 1], ups[count, 2] = nx, ny, nz
+        count += 1
+    return chosen[:count], hit[:count], feet[:count], ups[:count], heights[:count], upright[:count]
 
 
 @compiled
-def to_triangle(p: Array, corners: Array, t: int, foot: Array, weights: Array) -> float:
-    """Squared distance (m²) of `p` from triangle `t`; fills `foot` (3,) and its barycentric `weights` (3,).
+def to_triangle(p: Point, a: Point, b: Point, c: Point) -> tuple[float, Point, Point]:
+    """Squared distance (m²) of `p` from the triangle a, b, c, the closest point and its barycentric weights.
 
-    The regions are Ericson's, Real-Time Collision Detection 5.1.5.
+    The regions are Ericson's, Real-Time Collision Detection 5.1.5. Tuples: references to arrays are counted at each
+    call, which takes longer than the rest.
     """
     d1 = d2 = d3 = d4 = d5 = d6 = 0.0
     for i in range(3):
-        ab, ac = corners[t, 1, i] - corners[t, 0, i], corners[t, 2, i] - corners[t, 0, i]
-        d1 += ab * (p[i] - corners[t, 0, i])
-        d2 += ac * (p[i] - corners[t, 0, i])
-        d3 += ab * (p[i] - corners[t, 1, i])
-        d4 += ac * (p[i] - corners[t, 1, i])
-        d5 += ab * (p[i] - corners[t, 2, i])
-        d6 += ac * (p[i] - corners[t, 2, i])
+        ab, ac = b[i] - a[i], c[i] - a[i]
+        d1 += ab * (p[i] - a[i])
+        d2 += ac * (p[i] - a[i])
+        d3 += ab * (p[i] - b[i])
+        d4 += ac * (p[i] - b[i])
+        d5 += ab * (p[i] - c[i])
+        d6 += ac * (p[i] - c[i])
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     u = v = w = 0.0
     if d1 <= 0.0 and d2 <= 0.0:
@@ -139,9 +166,8 @@ def to_triangle(p: Array, corners: Array, t: int, foot: Array, weights: Array) -
     else:
         v, w = vb / (va + vb + vc), vc / (va + vb + vc)
         u = 1.0 - v - w
-    weights[0], weights[1], weights[2] = u, v, w
-    squared = 0.0
-    for i in range(3):
-        foot[i] = u * corners[t, 0, i] + v * corners[t, 1, i] + w * corners[t, 2, i]
-        squared += (p[i] - foot[i]) ** 2
-    return squared
+    x = u * a[0] + v * b[0] + w * c[0]
+    y = u * a[1] + v * b[1] + w * c[1]
+    z = u * a[2] + v * b[2] + w * c[2]
+    squared = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
+    return squared, (x, y, z), (u, v, w)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from cell.geometry.poses import cross
 from cell.inversion.closest import Array
 from cell.inversion.nominal import NominalSurface
 from cell.reconstruction.cloud import Cloud
@@ -66,7 +67,7 @@ def correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: fl
     index = index[keep]
     normals = feet.normals[keep] @ pose.rotation.T
     arms = scan.points[index] - pose.translation
-    jacobian = -np.concatenate([normals, np.cross(arms, normals)], axis=1)
+    jacobian = -np.concatenate([normals, cross(arms, normals)], axis=1)
     return Rows(index, feet.heights[keep], normals, arms, jacobian)
 
 

@@ -6,7 +6,8 @@ foot lies on the rim say nothing about the surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -17,12 +18,14 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from cell.inversion.closest import Array, Grid, Indices, Walk, closest
-from cell.surface_file import read_mesh
 from drivers.errors import ConfigError
 
 SPACING = 0.0004
 """Distance of the samples, m; a larger triangle carries several."""
 MOST_SAMPLES = 400_000
+WHOLE = (".stl", ".ply")
+"""Files that refer to no others."""
+UNREADABLE = "nominal surface {} cannot be read as a mesh; give an STL or PLY"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +81,7 @@ class NominalSurface:
 
         The last few are kept: one job after another is placed on the same surface, and preparing it takes a while.
         """
-        try:
-            content = sha256(path.read_bytes()).digest()
-        except OSError:
-            content = b""
-        return _prepared(path, content, unit, rim)
+        return _prepared(path, _MeshFile.of(path), unit, rim)
 
     @property
     def extent(self) -> tuple[Array, Array]:
@@ -93,14 +92,18 @@ class NominalSurface:
         """Indices of the points (n, 3), surface frame, that lie within `within` m of the surface, and their feet."""
         p = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         grid, walk = self.grid, self._walk
-        feet, hit = closest(p, grid.low, grid.cell, grid.owner, self._corners, walk.corner_of, walk.start, walk.fan)
-        way = p - feet
-        chosen = np.flatnonzero(np.einsum("ni,ni->n", way, way) <= within * within)
-        feet, hit, way = feet[chosen], hit[chosen], way[chosen]
-        normals = self.normals[hit]
-        heights = np.einsum("ni,ni->n", way, normals)
-        aside = np.linalg.norm(way - heights[:, None] * normals, axis=1)
-        inner = aside <= 2e-5 + 0.3 * np.abs(heights)
+        chosen, hit, feet, normals, heights, inner = closest(
+            p,
+            float(within),
+            grid.low,
+            grid.cell,
+            grid.owner,
+            self._corners,
+            self.normals,
+            walk.corner_of,
+            walk.start,
+            walk.fan,
+        )
         if self._border is not None:
             doubtful = np.flatnonzero(self._maybe_rim[hit])
             inner[doubtful] &= self._border.query(feet[doubtful], distance_upper_bound=self._rim)[0] > self._rim
@@ -136,11 +139,72 @@ class NominalSurface:
         return np.asarray(self.areas[self.sample_triangles] / counts[self.sample_triangles])
 
 
+@dataclass(frozen=True)
+class _MeshFile:
+    """A mesh file by its content: a copy of it is the same. `place` is where others lie that it may refer to."""
+
+    path: Path = field(compare=False)
+    suffix: str
+    place: Path | None
+    content: bytes
+
+    @classmethod
+    def of(cls, path: Path) -> _MeshFile:
+        """The file as it is now; `ConfigError` when it cannot be read."""
+        suffix = path.suffix.lower()
+        try:
+            content = sha256(path.read_bytes()).digest()
+        except OSError as error:
+            raise ConfigError(UNREADABLE.format(path)) from error
+        return cls(path, suffix, None if suffix in WHOLE else path.parent, content)
+
+
 @lru_cache(maxsize=4)
-def _prepared(path: Path, content: bytes, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
-    """The surface in a file of this content."""
-    vertices, faces = read_mesh(path, unit)
-    return NominalSurface(vertices, faces, rim, path)
+def _prepared(path: Path, file: _MeshFile, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
+    """The surface in a file, of which there may be copies."""
+    found = copy(_built(file, unit, rim))
+    found.source = path
+    return found
+
+
+@lru_cache(maxsize=4)
+def _built(file: _MeshFile, unit: Literal["m", "mm"], rim: float) -> NominalSurface:
+    return NominalSurface(*_read(file, unit), rim, file.path)
+
+
+def read_mesh(path: Path, unit: str) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (n, 3) in m and triangles (m, 3) of a mesh file in `unit`, "m" or "mm".
+
+    Raises `ConfigError` when it is no mesh, or none of a size that a part can be placed onto. The last few are kept, as
+    a job's mesh is looked at before it is used: none of the arrays may be written to.
+    """
+    return _read(_MeshFile.of(path), unit)
+
+
+@lru_cache(maxsize=4)
+def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
+    import trimesh
+
+    path = file.path
+    try:
+        mesh = trimesh.load_mesh(path, process=True)
+        vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+    except Exception as error:  # every reader of trimesh raises its own
+        raise ConfigError(UNREADABLE.format(path)) from error
+    if vertices.ndim != 2 or not len(faces) or not np.isfinite(vertices).all():
+        raise ConfigError(
+            f"nominal surface {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY "
+            "of the surface"
+        )
+    vertices *= 1.0 if unit == "m" else 1e-3
+    extent = float(np.ptp(vertices, axis=0).max())
+    if not 0.001 < extent < 5.0:
+        raise ConfigError(
+            f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
+            "check surface.mesh_unit in the job"
+        )
+    vertices.flags.writeable = faces.flags.writeable = False
+    return vertices, faces
 
 
 def _samples(corners: Array, areas: Array) -> tuple[Array, Indices]:

@@ -67,19 +67,26 @@ def _scores(
     """Sum of 1 − (distance/REACH)² over the points that lie within REACH, for each (turn, shift, shift)."""
     scores = np.zeros((len(turns), len(steps), len(steps)))
     a, b, c = distance.shape
+    turned = np.empty((len(points), 3))
+    shifted = np.empty((2, 3))
     for k in range(len(turns)):
+        # In cells: each shift then moves the turned points along the turned axes.
+        r = turns[k]
+        for i in range(3):
+            for n in range(len(points)):
+                along = r[i, 0] * points[n, 0] + r[i, 1] * points[n, 1] + r[i, 2] * points[n, 2]
+                turned[n, i] = (along + offset[i]) / cell
+            for side in range(2):
+                along = r[i, 0] * sides[side, 0] + r[i, 1] * sides[side, 1] + r[i, 2] * sides[side, 2]
+                shifted[side, i] = along / cell
         for i in range(len(steps)):
             for j in range(len(steps)):
-                s0 = steps[i] * sides[0, 0] + steps[j] * sides[1, 0]
-                s1 = steps[i] * sides[0, 1] + steps[j] * sides[1, 1]
-                s2 = steps[i] * sides[0, 2] + steps[j] * sides[1, 2]
+                s0 = steps[i] * shifted[0, 0] + steps[j] * shifted[1, 0]
+                s1 = steps[i] * shifted[0, 1] + steps[j] * shifted[1, 1]
+                s2 = steps[i] * shifted[0, 2] + steps[j] * shifted[1, 2]
                 total = 0.0
                 for n in range(len(points)):
-                    p0, p1, p2 = points[n, 0] - s0, points[n, 1] - s1, points[n, 2] - s2
-                    r = turns[k]
-                    x = (r[0, 0] * p0 + r[0, 1] * p1 + r[0, 2] * p2 + offset[0]) / cell
-                    y = (r[1, 0] * p0 + r[1, 1] * p1 + r[1, 2] * p2 + offset[1]) / cell
-                    z = (r[2, 0] * p0 + r[2, 1] * p1 + r[2, 2] * p2 + offset[2]) / cell
+                    x, y, z = turned[n, 0] - s0, turned[n, 1] - s1, turned[n, 2] - s2
                     if x >= 0 and y >= 0 and z >= 0 and x < a and y < b and z < c:
                         d = distance[int(x), int(y), int(z)]
                         if d < REACH:

@@ -20,6 +20,8 @@ LEAST_SQUARE_MM, MOST_SQUARES = 1.2, 60
 """Edge of the map's squares: a line of the sweep or more falls into each; and how many make its longer side at most."""
 LEAST_MAP_MM = 25.0
 NO_DATA, BESIDE = "0.8", "0.45"
+GREY: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 255, "interpolation_stage": "data"}
+"""A picture's colours, given to what is shown of it and not to all of its pixels before."""
 MARGIN = 0.35
 """Room around the board in the photograph, in its own size."""
 REASON_COLUMNS, REASON_LINES = 54, 9
@@ -59,7 +61,7 @@ class StripePanel:
 
 def draw_board(axes: Axes, board: BoardPanel) -> None:
     """The photograph, cut to the board's surroundings, with every point found drawn over it."""
-    axes.imshow(board.image, cmap="gray", vmin=0, vmax=255)
+    axes.imshow(board.image, **GREY)
     axes.set_xlabel("column in px")
     axes.set_ylabel("row in px")
     if board.view is None:
@@ -144,7 +146,7 @@ def seam_words(seam: Mapping[str, Any]) -> str:
 
 def draw_stripe(axes: Axes, stripe: StripePanel) -> None:
     """A frame of the sweep with its stripe."""
-    axes.imshow(stripe.image, cmap="gray", vmin=0, vmax=255)
+    axes.imshow(stripe.image, **GREY)
     axes.set_xlabel("column in px")
     axes.set_ylabel("row in px")
     if stripe.stripe is None:

@@ -118,14 +118,23 @@ class Swath:
         return from_matrix(self.flanges[len(self.flanges) // 2])
 
 
+_REHEARSED: set[tuple[int, int]] = set()
+"""Heights and widths of pictures that were rehearsed."""
+
+
 def rehearse(geometry: ScanGeometry) -> None:
     """Take two drawn profiles and let them go: what is loaded or compiled on first use is so before anything moves.
 
-    Done under way it takes longer than the gaps that frames and the arm's states may have.
+    Done under way it takes longer than the gaps that frames and the arm's states may have. Once for pictures of a size:
+    a process that has read some has everything loaded.
     """
+    size = geometry.camera.height, geometry.camera.width
+    if size in _REHEARSED:
+        return
     builder = ProfileBuilder(geometry, 2)
-    for picture in drawn(geometry.camera.height, geometry.camera.width):
+    for picture in drawn(*size):
         builder.see(StripeStream().extract(picture))
+    _REHEARSED.add(size)
 
 
 @dataclass(eq=False)

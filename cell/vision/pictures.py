@@ -110,16 +110,31 @@ def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:
             Reason.WRONG_SIZE, f"the picture is {width}×{height} px, expected {size[0]}×{size[1]} like the others"
         )
     # A thin laser line must not make a black picture pass, hence a high percentile and not the maximum.
-    bright = float(np.percentile(image, 95))
+    counts = counts_of(image)
+    bright = percentile(counts, 95)
     if bright < BLACK_DN:
         raise PictureRefused(
             Reason.BLACK, f"the picture is black: 95 % of it below {bright:.0f} of 255; open the shutter or add light"
         )
-    blinded = float(np.mean(image >= 254))
+    blinded = float(counts[254:].sum()) / image.size
     if blinded > SATURATED_SHARE:
         raise PictureRefused(
             Reason.SATURATED, f"the picture is saturated: {blinded:.0%} of it is white; shorten the exposure"
         )
+
+
+def counts_of(image: Image) -> NDArray[np.int64]:
+    """How many pixels of an image (h, w) have each of the 256 grey values."""
+    made = cv2.calcHist([np.ascontiguousarray(image)], [0], None, [256], [0, 256])
+    return np.rint(made).astype(np.int64).ravel()
+
+
+def percentile(counts: NDArray[np.int64], share: float) -> float:
+    """The grey value below which `share` percent of so many pixels lie, as `np.percentile` has it, without sorting."""
+    reached = np.cumsum(counts)
+    at = (int(reached[-1]) - 1) * share / 100
+    low, high = np.searchsorted(reached, (np.floor(at), np.ceil(at)), side="right").tolist()
+    return float(low + (high - low) * (at - np.floor(at)))
 
 
 def _is_cut(data: bytes) -> bool:

@@ -77,6 +77,8 @@ class PartContact:
         box = [[sx * surface.half_x, sy * surface.half_y, surface.top] for sx in (-1, 1) for sy in (-1, 1)]
         corners = _moved(np.array(box) + np.array([*surface.centre, 0.0]), world_from_surface)
         self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
+        self._held_box = self._box(held=True)
+        self._empty_box = self._box(held=False)
 
     @property
     def held(self) -> bool:
@@ -111,6 +113,7 @@ class PartContact:
         if np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3]) <= GRIP_REACH:
             self._flange_from_part = found
             self._world_from_part = None
+            self._held_box = self._box(held=True)
 
     def _rest(self, world_from_part: Pose) -> Pose:
         """The part after it fell straight down (or sprang back up) to its first contact, its orientation kept."""
@@ -124,11 +127,22 @@ class PartContact:
                 break
         return rest
 
+    def _box(self, held: bool) -> tuple[list[float], list[float]]:
+        """Lowest and highest corner of what may touch the ground, in the flange: fingertips, and the part when held."""
+        part = [_moved(self._underside, self._flange_from_part)] if held else []
+        points = np.concatenate([self._fingertips, *part])
+        return points.min(axis=0).tolist(), points.max(axis=0).tolist()
+
     def _below(self, points: Vector) -> tuple[Vector, Vector]:
         """Depth (n,), m, of world `points` (n, 3) below the ground along z_S, and the ground's normals (n, 3) in S."""
+        depth, normals, _ = self._under(points)
+        return depth, normals
+
+    def _under(self, points: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        """As `_below`, and where (n,) the ground is the table."""
         local, on_table = _moved(points, self._surface_from_world), self._on_table(points)
         height, normals = self._surface.sample(local[:, 0], local[:, 1])
-        return np.where(on_table, height, -self._table_height) - local[:, 2], normals
+        return np.where(on_table, height, -self._table_height) - local[:, 2], normals, on_table
 
     def _on_table(self, points: Vector) -> NDArray[np.bool_]:
         made: NDArray[np.bool_] = (
@@ -136,20 +150,27 @@ class PartContact:
         )
         return made
 
+    def clear(self, points: Vector, radius: Vector) -> bool:
+        """Whether world `points` (n, 3) with a `radius` (n,), m, are all above whatever the ground has."""
+        return bool((points[:, 2] - radius).min() > self._highest)
+
     def below(self, points: Vector) -> tuple[Vector, NDArray[np.bool_]]:
         """How deep (n,), m, world `points` (n, 3) are below the ground, and where that is the table."""
-        depth, _ = self._below(points)
-        return depth, self._on_table(points)
+        depth, _, on_table = self._under(points)
+        return depth, on_table
 
     def wrench(self, world_from_flange: Pose) -> Vector:
         """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
-        points = _moved(self._fingertips, world_from_flange)
+        wrench = np.zeros(6)
         with self._lock:
+            low, high = self._held_box if self._world_from_part is None else self._empty_box
+            *along, height = world_from_flange[2].tolist()
+            # No corner of the box around the points is as low as that: most of the time the arm is far from everything.
+            if height + sum(min(k * a, k * b) for k, a, b in zip(along, low, high, strict=True)) > self._highest:
+                return wrench
+            points = _moved(self._fingertips, world_from_flange)
             if self._world_from_part is None:
                 points = np.concatenate([points, _moved(self._underside, self._pose(world_from_flange))])
-        wrench = np.zeros(6)
-        if points[:, 2].min() > self._highest:
-            return wrench
         depth, normals = self._below(points)
         if depth.max() <= 0.0:
             return wrench

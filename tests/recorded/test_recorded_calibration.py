@@ -98,7 +98,7 @@ def test_the_report_is_plain_json(line_laser):
 
 
 def test_without_poses_the_camera_and_the_light_plane_are_had(tmp_path):
-    for path in recording("robot_line_laser").glob("*.png"):
+    for path in sorted(recording("robot_line_laser").glob("*.png"))[:5]:
         shutil.copy(path, tmp_path)
     found = calibrate_folder(tmp_path, CHESS)
     assert found["intrinsics"]["rms_px"] < 0.36

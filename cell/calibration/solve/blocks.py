@@ -14,9 +14,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.camera import Array, CameraModel
-from cell.geometry.circles import seen_centres_with_jacobians
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import cross, from_parts, perturbed
+from cell.geometry.seen import dots_terms
 
 CAMERA, PLANE, RAIL = slice(0, 9), slice(9, 12), slice(12, 15)
 HAND, BOARD = slice(15, 21), slice(21, 27)
@@ -100,43 +100,21 @@ def tangents(normal: Array) -> tuple[Array, Array]:
 def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array]:
     """Measured minus predicted pixels (n, 2), and the derivative of the prediction (n, 2, COLUMNS)."""
     hand, board = state.flange_from_camera, state.base_from_board
-    turned = view.points @ board.rotation.T
-    in_base = turned + board.translation
-    from_flange = in_base - flange.translation
-    in_flange = from_flange @ flange.rotation
-    from_camera = in_flange - hand.translation
-    seen = from_camera @ hand.rotation - rail * state.rail_direction
-    to_camera = (flange.rotation @ hand.rotation).T
-    normal = board.rotation[:, 2]
-    middle, by_centre, by_normal = seen_centres_with_jacobians(seen, to_camera @ normal, view.dot_radius)
-    pixels, by_middle, by_camera = state.camera.project_with_jacobians(middle)
-    by_point = by_middle @ by_centre
-    jacobian = np.zeros((len(seen), 2, COLUMNS))
-    jacobian[:, :, CAMERA] = by_camera
-    by_base = _times(by_point, to_camera)
-    jacobian[:, :, RAIL] = -rail * by_point
-    by_flange_axes = _times(by_point, hand.rotation.T)
-    jacobian[:, :, 15:18] = -by_flange_axes
-    jacobian[:, :, 18:21] = cross(by_flange_axes, from_camera[:, None, :])
-    jacobian[:, :, 21:24] = by_base
-    jacobian[:, :, 24:27] = cross(turned[:, None, :], by_base)
-    jacobian[:, :, 27:30] = -by_base
-    jacobian[:, :, 30:33] = cross(by_base, from_flange[:, None, :])
-    jacobian[:, :, 33] = -by_point @ state.rail_direction
-    if view.dot_radius > 0:
-        # An ellipse's centre moves with the circle's tilt too. It is little, but a turn of the camera and a shift of
-        # its principal point are told apart by as little.
-        tilted = _times(by_middle @ by_normal, to_camera)
-        about_normal = _times(tilted, pin.skew(normal))
-        jacobian[:, :, 18:21] += _times(about_normal, flange.rotation)
-        jacobian[:, :, 24:27] -= about_normal
-        jacobian[:, :, 30:33] += about_normal
+    pixels, jacobian = np.empty(view.pixels.shape), np.empty((len(view.points), 2, COLUMNS))
+    dots_terms(
+        state.camera.parameters,
+        board.rotation,
+        flange.rotation,
+        hand.rotation,
+        np.array([board.translation, flange.translation, hand.translation]),
+        float(rail),
+        np.ascontiguousarray(state.rail_direction, dtype=np.float64),
+        np.ascontiguousarray(view.points),
+        float(view.dot_radius),
+        pixels,
+        jacobian,
+    )
     return view.pixels - pixels, jacobian
-
-
-def _times(rows: Array, matrix: Array) -> Array:
-    """Rows (n, 2, 3) times one matrix (3, 3), in one product instead of n."""
-    return np.asarray((rows.reshape(-1, 3) @ matrix).reshape(rows.shape), dtype=np.float64)
 
 
 def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:

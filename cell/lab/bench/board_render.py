@@ -19,6 +19,8 @@ from cell.vision.board.spec import MARKED, BoardSpec
 
 KIND = {"marked_dots": 0, "asymmetric_dots": 1, "dots": 2, "chessboard": 3, "charuco": 4, "aprilgrid": 5}
 SUB = 8
+Scalars = tuple[float, ...]
+Whole = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,11 @@ def paint(image: NDArray[np.float32], lens: Lens, placed: Placed) -> None:
         return
     spec = placed.spec
     inverse = np.linalg.inv(np.column_stack([placed.pose[:3, 0], placed.pose[:3, 1], placed.pose[:3, 3]]))
-    shape = np.array([KIND[spec.kind], spec.cols, spec.rows], dtype=np.int64)
-    size = np.array([spec.pitch, placed.radius, spec.marker, x0, x1, y0, y1, placed.white, placed.black])
-    _paint(image, *_rays(lens), inverse, np.array([*low, *high]), shape, size, _markers(spec))
+    # Tuples: references to arrays are counted at each call, which took most of the time.
+    shape = (KIND[spec.kind], spec.cols, spec.rows)
+    size = tuple(map(float, (spec.pitch, placed.radius, spec.marker, x0, x1, y0, y1, placed.white, placed.black)))
+    turn = tuple(inverse.ravel().tolist())
+    _paint(image, *_rays(lens), turn, tuple(map(int, (*low, *high))), shape, size, _markers(spec))
 
 
 @lru_cache(maxsize=8)
@@ -140,9 +144,7 @@ def _tags(
 
 
 @compiled
-def _shade(
-    x: float, y: float, shape: NDArray[np.int64], size: Array, markers: NDArray[np.uint8]
-) -> float:  # pragma: no cover
+def _shade(x: float, y: float, shape: Whole, size: Scalars, markers: NDArray[np.uint8]) -> float:  # pragma: no cover
     """Albedo at a place of the board; −1 beside the sheet."""
     pitch, radius, marker, white, black = size[0], size[1], size[2], size[7], size[8]
     if x < size[3] or x > size[4] or y < size[5] or y > size[6]:
@@ -190,51 +192,64 @@ def _shade(
 
 
 @compiled
+def _seen(
+    x: float, y: float, inverse: Scalars, shape: Whole, size: Scalars, markers: NDArray[np.uint8]
+) -> float:  # pragma: no cover
+    """Albedo that a ray through the ideal coordinates x, y meets; −1 beside the sheet."""
+    w = inverse[6] * x + inverse[7] * y + inverse[8]
+    if w <= 0:
+        return -1.0
+    bx = (inverse[0] * x + inverse[1] * y + inverse[2]) / w
+    by = (inverse[3] * x + inverse[4] * y + inverse[5]) / w
+    return float(_shade(bx, by, shape, size, markers))
+
+
+@compiled
 def _paint(
     image: NDArray[np.float32],
     ray_x: Array,
     ray_y: Array,
-    inverse: Array,
-    window: NDArray[np.int64],
-    shape: NDArray[np.int64],
-    size: Array,
+    inverse: Scalars,
+    window: Whole,
+    shape: Whole,
+    size: Scalars,
     markers: NDArray[np.uint8],
 ) -> None:  # pragma: no cover
     height, width = image.shape
+    first, count = window[0], window[2] - window[0]
+    # What is seen at the middles of the pixels, of their sides and at their corners: in rows half a pixel apart.
+    above, amid, below = np.empty(2 * count + 1), np.empty(2 * count + 1), np.empty(2 * count + 1)
+    slopes = np.empty((count, 4))
     for v in range(window[1], window[3]):
         up, down = max(v - 1, 0), min(v + 1, height - 1)
-        for u in range(window[0], window[2]):
+        above, below = below, above
+        for n in range(count):
+            u = first + n
             left, right = max(u - 1, 0), min(u + 1, width - 1)
-            xu = (ray_x[v, right] - ray_x[v, left]) / (right - left)
-            yu = (ray_y[v, right] - ray_y[v, left]) / (right - left)
-            xv = (ray_x[down, u] - ray_x[up, u]) / (down - up)
-            yv = (ray_y[down, u] - ray_y[up, u]) / (down - up)
-            first, mixed = 0.0, False
-            for k in range(9):
-                a, b = 0.5 * (k % 3 - 1), 0.5 * (k // 3 - 1)
-                x, y = ray_x[v, u] + a * xu + b * xv, ray_y[v, u] + a * yu + b * yv
-                w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-                value = -1.0
-                if w > 0:
-                    bx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
-                    by = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
-                    value = _shade(bx, by, shape, size, markers)
-                if k == 0:
-                    first = value
-                elif value != first:
-                    mixed = True
-                    break
+            slopes[n, 0] = xu = (ray_x[v, right] - ray_x[v, left]) / (right - left)
+            slopes[n, 1] = yu = (ray_y[v, right] - ray_y[v, left]) / (right - left)
+            slopes[n, 2] = xv = (ray_x[down, u] - ray_x[up, u]) / (down - up)
+            slopes[n, 3] = yv = (ray_y[down, u] - ray_y[up, u]) / (down - up)
+            for k in range(0 if n == 0 else 1, 3):
+                a = 0.5 * (k - 1)
+                x, y = ray_x[v, u] + a * xu, ray_y[v, u] + a * yu
+                amid[2 * n + k] = _seen(x, y, inverse, shape, size, markers)
+                below[2 * n + k] = _seen(x + 0.5 * xv, y + 0.5 * yv, inverse, shape, size, markers)
+                if v == window[1]:
+                    above[2 * n + k] = _seen(x - 0.5 * xv, y - 0.5 * yv, inverse, shape, size, markers)
+        for n in range(count):
+            u, value, mixed = first + n, amid[2 * n + 1], False
+            for k in range(2 * n, 2 * n + 3):
+                mixed = mixed or above[k] != value or amid[k] != value or below[k] != value
             if not mixed:
-                if first >= 0:
-                    image[v, u] = first
+                if value >= 0:
+                    image[v, u] = value
                 continue
+            xu, yu, xv, yv = slopes[n]
             total = 0.0
-            for n in range(SUB * SUB):
-                a, b = (n % SUB + 0.5) / SUB - 0.5, (n // SUB + 0.5) / SUB - 0.5
+            for k in range(SUB * SUB):
+                a, b = (k % SUB + 0.5) / SUB - 0.5, (k // SUB + 0.5) / SUB - 0.5
                 x, y = ray_x[v, u] + a * xu + b * xv, ray_y[v, u] + a * yu + b * yv
-                w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-                bx = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
-                by = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
-                value = _shade(bx, by, shape, size, markers)
+                value = _seen(x, y, inverse, shape, size, markers)
                 total += image[v, u] if value < 0 else value
             image[v, u] = total / (SUB * SUB)

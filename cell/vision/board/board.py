@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.geometry.camera import Array, CameraModel
-from cell.geometry.circles import lens_shift, seen_centres
-from cell.geometry.poses import cross, difference, from_parts, perturbed, transform
+from cell.geometry.poses import difference, from_parts, perturbed, transform
+from cell.geometry.seen import pose_equations, seen_points
 from cell.vision.board.charuco import find_charuco
 from cell.vision.board.chess import find_chessboard
 from cell.vision.board.dot_board import find_dots
@@ -115,12 +115,10 @@ def board_pose(view: BoardView, camera: CameraModel) -> BoardPose:
 
 def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_radius: float) -> Array:
     """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
-    centres = transform(camera_from_board, points)
-    if dot_radius <= 0:
-        return camera.project(centres)
-    normal = camera_from_board.rotation[:, 2]
-    pixels = camera.project(seen_centres(centres, normal, dot_radius))
-    return np.asarray(pixels + lens_shift(camera, centres, normal, dot_radius), dtype=np.float64)
+    pixels = np.empty((len(points), 2))
+    rotation, translation = camera_from_board.rotation, camera_from_board.translation
+    seen_points(camera.parameters, rotation, translation, np.ascontiguousarray(points), float(dot_radius), pixels)
+    return pixels
 
 
 def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
@@ -188,24 +186,24 @@ def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
 
 def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _Fit:
     """Levenberg's method on the pose, the points weighted by `weights` (n,) over their variances."""
-    points = view.object_points
-    factor = np.sqrt(weights) / view.sigma
+    points, pixels = np.ascontiguousarray(view.object_points), np.empty(view.pixels.shape)
+    lens, radius, factor = camera.parameters, float(view.dot_radius), np.sqrt(weights) / view.sigma
 
     def residual_of(candidate: pin.SE3) -> tuple[Array, float]:
-        residual = view.pixels - predict(camera, candidate, points, view.dot_radius)
-        total = float(np.sum((factor[:, None] * residual) ** 2))
+        seen_points(lens, candidate.rotation, candidate.translation, points, radius, pixels)
+        residual = view.pixels - pixels
+        white = (factor[:, None] * residual).ravel()
+        total = float(white @ white)
         return residual, total if np.isfinite(total) else np.inf
 
     damping = 1e-6
     residual, squares = residual_of(pose)
-    normal = np.eye(6)
+    normal, right = np.eye(6), np.zeros(6)
     for _ in range(STEPS):
-        arm = points @ pose.rotation.T
-        by_point = factor[:, None, None] * camera.point_jacobian(arm + pose.translation)
-        jacobian = np.concatenate([by_point, cross(arm[:, None, :], by_point)], axis=2).reshape(-1, 6)
-        normal = jacobian.T @ jacobian
-        right = jacobian.T @ (factor[:, None] * residual).ravel()
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+        pose_equations(lens, pose.rotation, pose.translation, points, factor, residual, normal, right)
+        damped = normal.copy()
+        damped.flat[::7] *= 1 + damping
+        step = np.linalg.solve(damped, right)
         candidate = perturbed(pose, step)
         new_residual, new_squares = residual_of(candidate)
         if new_squares <= squares:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cell.geometry.camera import Array
 from cell.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
 from cell.vision.board.corner_fit import fit_corners
-from cell.vision.board.ends import check_hidden_sides
+from cell.vision.board.ends import check_hidden_sides, smoothed
 from cell.vision.board.plane_map import PlaneMap
 from cell.vision.board.spec import BoardSpec
 from cell.vision.board.view import BoardView
@@ -176,5 +176,5 @@ def _view(image: Image, spec: BoardSpec, plane: PlaneMap, legacy: bool) -> Board
             Reason.NO_BOARD, f"{good.sum()} corners of {spec.name} could be measured; show more of it, in focus"
         )
     ids = np.flatnonzero(good)
-    check_hidden_sides(image, spec, plane, ids, 1.3)
+    check_hidden_sides(smoothed(image), spec, plane, ids, 1.3)
     return BoardView(spec, (image.shape[1], image.shape[0]), ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX))

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 
 from cell.geometry.camera import Array
-from cell.vision.board.dots import find_blobs, measure_dots
+from cell.vision.board.dots import find_blobs, measure_dots, tell_dots
 from cell.vision.board.ends import check_dot_ends
 from cell.vision.board.identify import LEAST_SHARE, identify
 from cell.vision.board.lattice import Blobs, Places, dot_lattices
 from cell.vision.board.plane_map import PlaneMap
 from cell.vision.board.spec import BoardSpec
 from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason, only_one
+from cell.vision.pictures import Image, PictureRefused, Reason, counts_of, only_one, percentile
 
 LEAST_SIGMA_PX = 0.004
 LEAST_DOTS = 12
@@ -29,7 +29,8 @@ WINDOWS = (0.06, 0.12, 0.03, 0.25)
 def find_dots(image: Image, spec: BoardSpec) -> BoardView:
     """The dots of `spec` in an 8-bit image (h, w). Raises PictureRefused with the most telling of its reasons."""
     refusals: list[PictureRefused] = []
-    contrast = float(np.percentile(image[::4, ::4], 97) - np.percentile(image[::4, ::4], 3))
+    few = counts_of(image[::4, ::4])
+    contrast = percentile(few, 97) - percentile(few, 3)
     # Enlarging helps small pictures of small dots, and only those.
     for scale in (1, 2) if image.size <= SMALL_PX else (1,):
         picture = (
@@ -59,7 +60,7 @@ def _attempt(
                 grown, places = _extended(image, blobs.take(index), places, spec.name)
             else:
                 grown = blobs.take(index)
-            dots, sigma, scores = measure_dots(image, grown, rounds=2)
+            dots, sigma, scores = tell_dots(image, grown)
             board_places, assumed = identify(
                 spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
             )
@@ -91,7 +92,7 @@ def _extended(image: Image, dots: Blobs, places: Places, name: str) -> tuple[Blo
         middles, steps = plane.pixels(flat), plane.steps(flat)
         radius = _relative_radius(dots, plane.steps(places.astype(np.float64)))
         guess = Blobs(middles, radius * steps)
-        measured, sigma, _ = measure_dots(image, guess, rounds=3)
+        measured, sigma = measure_dots(image, guess, rounds=3)
         ratio = measured.areas / guess.areas
         away = np.linalg.norm(measured.centres - middles, axis=1)
         good = np.isfinite(sigma) & (ratio > 0.75) & (ratio < 1.33) & (away < 0.15 * np.linalg.norm(steps, axis=(1, 2)))
@@ -130,7 +131,7 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
     number = {tuple(p): k for k, p in enumerate(spec.lattice())}
     for place, centre in zip(places, dots.centres, strict=True):
         start[number[tuple(place)]] = centre
-    measured, sigma, _ = measure_dots(image, Blobs(start[ids], shapes[ids]))
+    measured, sigma = measure_dots(image, Blobs(start[ids], shapes[ids]))
     ratio = measured.areas / Blobs(start[ids], shapes[ids]).areas
     away = np.linalg.norm(measured.centres - predicted[ids], axis=1)
     pitch = np.sqrt(np.abs(np.linalg.det(jacobian[ids])))

@@ -22,6 +22,10 @@ REACH = (0.15, 1.75)
 LEAST_AREA_PX = 9.0
 ROUNDS = 4
 UNIT = np.column_stack([f(np.arange(RAYS) * 2 * np.pi / RAYS) for f in (np.cos, np.sin)])
+# Pairs that have to be put in order so that the fourth of seven values is the middle one (Devillard 1998).
+ORDER_OF_SEVEN = (
+    (0, 5), (0, 3), (1, 6), (2, 4), (0, 1), (3, 5), (2, 6), (2, 3), (3, 6), (4, 5), (1, 4), (1, 3), (3, 4),
+)  # fmt: skip
 # Share of the step from dot to board by which light that falls off evenly may depart from a plane.
 MOST_UNEVEN = 0.06
 MOST_SLOPE = 0.3
@@ -91,12 +95,23 @@ def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
     return Blobs((middle + origin)[good], shapes)
 
 
-def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array, Array]:
-    """Dots re-measured from their edges, one standard deviation (n,) of each centre in px, and ring scores (n, 2).
+def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array]:
+    """Dots re-measured from their edges, and one standard deviation (n,) of each centre in px.
 
     A dot whose edge is not found all around gets the deviation NaN. `rounds` of refinement: two to tell dots apart,
     more to measure them.
     """
+    return _measured(image, start, rounds)[:2]
+
+
+def tell_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
+    """Dots measured well enough to tell them apart, the deviations of their centres, and ring scores (n, 2)."""
+    dots, sigma, profiles = _measured(image, start, 2)
+    return dots, sigma, _ring_scores(profiles, np.linspace(*REACH, SAMPLES))
+
+
+def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Array]:
+    """As `measure_dots`, with the grey values (n, rays, samples) of the last round."""
     picture = image.astype(np.float32)
     centres, shapes = start.centres.copy(), start.shapes.copy()
     rho = np.linspace(*REACH, SAMPLES)
@@ -121,15 +136,20 @@ def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blob
     # A dot that wandered off its blob measures something else.
     wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
     sigma[wandered > 0.7] = np.nan
-    return Blobs(centres, shapes), sigma, _ring_scores(profiles, rho)
+    return Blobs(centres, shapes), sigma, profiles
 
 
 def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, rho: Array) -> Array:
     """Grey values (n, rays, samples) along rays in the dots' normalised coordinates."""
-    directions = np.einsum("nij,kj->nki", shapes, UNIT)
-    places = centres[:, None, None, :] + directions[:, :, None, :] * rho[None, None, :, None]
-    flat = places.reshape(len(centres) * RAYS, len(rho), 2).astype(np.float32)
-    sampled = cv2.remap(picture, flat[:, :, 0], flat[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    directions = np.einsum("nij,kj->ink", shapes, UNIT)
+    # The columns and rows of all places by themselves: neither has to be picked out of pairs again.
+    x, y = (
+        (centres[:, axis, None, None] + directions[axis, :, :, None] * rho)
+        .astype(np.float32)
+        .reshape(len(centres) * RAYS, len(rho))
+        for axis in (0, 1)
+    )
+    sampled = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return sampled.reshape(len(centres), RAYS, len(rho)).astype(np.float64)
 
 
@@ -139,7 +159,7 @@ def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
     outside = (rho > 1.2) & (rho < 1.6)
     bright = profiles[:, :, outside].mean(axis=2)
     # Neighbouring rays see the same board; a laser line or a neighbour dot does not move their median.
-    ring = np.median(np.stack([np.roll(bright, k, axis=1) for k in range(-3, 4)]), axis=0)
+    ring = _median_of_seven([np.roll(bright, k, axis=1) for k in range(-3, 4)])
     dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
     slope, even = _light(profiles[:, :, inside].mean(axis=2), rho[inside].mean(), ring, rho[outside].mean())
     dark, bright = dark * (1 + slope), np.where(even, ring.mean(axis=1, keepdims=True) * (1 + slope), ring)
@@ -156,6 +176,14 @@ def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
         edge = rho[first] + (level - low) / (high - low) * (rho[1] - rho[0])
     good = crossing.any(axis=2) & (crossing.sum(axis=2) <= 2) & (step > 0.4 * np.median(step, axis=1)[:, None])
     return np.where(good, edge, 1.0), good & (step > 4.0)
+
+
+def _median_of_seven(values: list[Array]) -> Array:
+    """The middle of seven arrays, element by element: by comparisons of whole arrays, as nothing has to be sorted."""
+    v = list(values)
+    for a, b in ORDER_OF_SEVEN:
+        v[a], v[b] = np.minimum(v[a], v[b]), np.maximum(v[a], v[b])
+    return v[3]
 
 
 def _light(dot: Array, within: float, ring: Array, beyond: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -182,10 +210,11 @@ def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Arr
     weight = good.astype(np.float64)
     coefficients = np.zeros((len(edge), design.shape[1]))
     scatter, residual, z = np.ones(len(edge)), edge, edge
+    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), -1)
     for _ in range(4):
-        normal = np.einsum("nk,ki,kj->nij", weight, design, design) + 1e-9 * np.eye(design.shape[1])
-        right = np.einsum("nk,ki,nk->ni", weight, design, edge)
-        coefficients = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        normal = (weight @ products).reshape(len(edge), *2 * design.shape[1:]) + 1e-9 * np.eye(design.shape[1])
+        right = (weight * edge) @ design
+        coefficients = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
         residual = edge - coefficients @ design.T
         scatter = 1.4826 * np.median(np.where(good, np.abs(residual), np.inf), axis=1)
         scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), LEAST_SCATTER, None)
@@ -207,12 +236,9 @@ def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Arr
 def _widest_gaps(used: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Longest run of unused rays (n,) around the circle, for rays (n, rays)."""
     twice = np.concatenate([used, used], axis=1)
-    run = np.zeros(len(used), dtype=np.intp)
-    longest = np.zeros(len(used), dtype=np.intp)
-    for column in twice.T:
-        run = np.where(column, 0, run + 1)
-        longest = np.maximum(longest, run)
-    return longest
+    columns = np.arange(twice.shape[1])
+    last = np.maximum.accumulate(np.where(twice, columns, -1), axis=1)
+    return np.asarray((columns - last).max(axis=1))
 
 
 def _ring_scores(profiles: Array, rho: Array) -> Array:

@@ -33,28 +33,23 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
 
     A marked board's order comes from its rings: for it, only what contradicts is refused.
     """
-    smooth = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
+    smooth = smoothed(image)
     lattice = spec.lattice()
     marked = spec.kind == "marked_dots"
     around = 1.65 * radius * np.column_stack([f(np.arange(8) * np.pi / 4) for f in (np.cos, np.sin)])
-    level = grey(smooth, plane.pixels(lattice[found]))
+    own = lattice[found]
+    level = grey(smooth, plane.pixels(own))
     for name, beyond in _sides(spec):
         ends = further = seen = 0
-        for place in beyond:
-            near = lattice[found][np.argsort(np.abs(lattice[found] - place).sum(axis=1))[:1]].astype(np.float64)
-            if np.abs(near[0] - place).max() > 2:
-                continue
-            outward = (place - near[0]) / np.linalg.norm(place - near[0])
-            # The near side of the dot that would follow is seen even where the picture or a narrow sheet ends.
-            spots = np.vstack([near, 0.5 * (near + place), place, place - 0.75 * radius * outward])
-            dark, between, middle, near_side = grey(smooth, plane.pixels(spots))
-            rim = grey(smooth, plane.pixels(place + around))
+        spots, outward = _spots(own, beyond, around, radius)
+        there = grey(smooth, plane.pixels(spots.reshape(-1, 2))).reshape(spots.shape[:2])
+        for (dark, between, middle, near_side), rim, out in zip(there[:, :4], there[:, 4:], outward, strict=True):
             step = between - dark
             if not step > max(4.0, 0.12 * typical(between - level)):
                 continue
             seen += 1
             darker = rim - middle > 0.4 * step
-            beside = np.argsort(np.abs(around @ outward))[:2]
+            beside = np.argsort(np.abs(around @ out))[:2]
             if darker.all():
                 further += 1
             elif not darker[beside].any() and np.isfinite(rim[beside]).all():
@@ -74,7 +69,25 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
                 f"the end of the board beyond the {name} of {spec.name} is not seen; show the whole board",
             )
     if marked:
-        check_hidden_sides(image, spec, plane, found, 0.5)
+        check_hidden_sides(smooth, spec, plane, found, 0.5)
+
+
+def _spots(own: NDArray[np.intp], beyond: Array, around: Array, radius: float) -> tuple[Array, Array]:
+    """Where one looks for the end of a side: spots (n, 12, 2) for n of the places `beyond`, and the ways out (n, 2).
+
+    They are the nearest of the board's `own` dots, half way to the place, the place, its near side, and what lies
+    `around` it. Places far from every dot are left out.
+    """
+    spots, outward = [], []
+    for place in beyond:
+        near = own[np.argsort(np.abs(own - place).sum(axis=1))[0]].astype(np.float64)
+        if np.abs(near - place).max() > 2:
+            continue
+        out = (place - near) / np.linalg.norm(place - near)
+        # The near side of the dot that would follow is seen even where the picture or a narrow sheet ends.
+        spots.append(np.vstack([near, 0.5 * (near + place), place, place - 0.75 * radius * out, place + around]))
+        outward.append(out)
+    return np.reshape(spots, (-1, 4 + len(around), 2)), np.reshape(outward, (-1, 2))
 
 
 def typical(values: Array) -> float:
@@ -83,12 +96,17 @@ def typical(values: Array) -> float:
     return float(np.median(numbers)) if len(numbers) else 0.0
 
 
-def check_hidden_sides(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], beyond: float) -> None:
+def smoothed(image: Image) -> Image:
+    """The picture (h, w) with its noise averaged over three pixels."""
+    return np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
+
+
+def check_hidden_sides(smooth: Image, spec: BoardSpec, plane: PlaneMap, found: NDArray[np.intp], beyond: float) -> None:
     """Refuse a smaller board: a whole side without a point, though the bright sheet is seen before it.
 
-    `beyond` is where, in pitches beyond the last points found, only the sheet's margin can be bright all along.
+    `smooth` is the picture without its noise (`smoothed`); `beyond` is where, in pitches beyond the last points found,
+    only the sheet's margin can be bright all along.
     """
-    smooth = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8)
     cols, rows = spec.grid
     own = spec.lattice()[found]
     # Both colours are met around any point: of a ChArUco board between corner and marker.
@@ -168,6 +186,8 @@ def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
 
 def grey(image: Image, pixels: Array) -> Array:
     """Grey values (n,) at pixels (n, 2), NaN outside of the picture."""
+    if not len(pixels):
+        return np.zeros(0)
     height, width = image.shape
     at = pixels.astype(np.float32).reshape(-1, 1, 2)
     values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

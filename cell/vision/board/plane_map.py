@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -34,12 +35,16 @@ class PlaneMap:
         kept = places[keep].astype(np.float64)
         return cls(plain.homography, kept, pixels[keep] - plain.pixels(kept))
 
+    @cached_property
+    def _near(self) -> scipy.spatial.cKDTree:
+        return scipy.spatial.cKDTree(self.places)
+
     def pixels(self, places: Array | NDArray[np.intp]) -> Array:
         """Pixels (m, 2) of lattice places (m, 2)."""
         mapped = np.column_stack([places, np.ones(len(places))]) @ self.homography.T
         pixels = mapped[:, :2] / mapped[:, 2:]
         if len(self.places) >= NEAREST:
-            distance, who = scipy.spatial.cKDTree(self.places).query(places, k=NEAREST)
+            distance, who = self._near.query(places, k=NEAREST)
             weight = 1.0 / (np.asarray(distance) + 0.1)
             weight /= weight.sum(axis=1, keepdims=True)
             pixels = pixels + np.einsum("mk,mkd->md", weight, self.residuals[np.asarray(who)])

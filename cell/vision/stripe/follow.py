@@ -93,9 +93,7 @@ def candidates(
         if 6 * scale > n:
             continue
         response = respond(part, scale, along)
-        clear = response / _noise(response)
-        better = clear > best
-        best[better], answer[better], of[better] = clear[better], response[better], k
+        _take_better(response, np.float32(_noise(response)), k, best, answer, of)
     edge = 2
     peak = np.zeros(part.shape, np.bool_)
     peak[:, edge:-edge] = (best[:, edge:-edge] >= best[:, edge - 1 : -edge - 1]) & (
@@ -108,6 +106,19 @@ def candidates(
         rows, place.astype(np.float64), answer[line, place].astype(np.float64), score[line, place].astype(np.float64),
         np.asarray(scales)[of[line, place]],
     )  # fmt: skip
+
+
+@compiled
+def _take_better(
+    response: NDArray[np.float32], noise: np.float32, k: int, best: NDArray[np.float32],
+    answer: NDArray[np.float32], of: NDArray[np.uint8],
+) -> None:  # fmt: skip  # pragma: no cover
+    """Where `response` over `noise` is above `best` (m, n): takes it, and notes the answer and the scale's number."""
+    for row in range(response.shape[0]):
+        for column in range(response.shape[1]):
+            clear = response[row, column] / noise
+            if clear > best[row, column]:
+                best[row, column], answer[row, column], of[row, column] = clear, response[row, column], k
 
 
 def _noise(response: NDArray[np.float32]) -> float:

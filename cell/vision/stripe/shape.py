@@ -7,11 +7,13 @@ fitted by a penalised cubic spline. It is kept where it foretells held-out lines
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+
+from cell.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -73,28 +75,53 @@ def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> 
     inside = np.abs(x) < count * spacing
     x, value, weight = x[inside], value[inside], weight[inside]
     base = np.exp(-0.5 * (x / width) ** 2)
-    design: Any = scipy.interpolate.BSpline.design_matrix(x, knots, 3)
-    normal: Any = design.T @ design.multiply(weight[:, None]).tocsr()
-    right = np.asarray(design.T @ (weight * (value - base)))
     # Splines that lie farther than 3 apart do not overlap: the matrix is a band.
-    size = normal.shape[0]
-    band = np.zeros((4, size))
-    for k in range(4):
-        band[3 - k, k:] = normal.diagonal(k)
+    size = 2 * count + 3
+    band, right = np.zeros((4, size)), np.zeros(size)
+    _gather(x / spacing + count, value - base, weight, band, right)
     # Of a stripe that is narrow in a wide reach most splines have no sample.
     typical = float(np.median(band[3][band[3] > 0])) if np.any(band[3] > 0) else 0.0
     if typical == 0:
         return gaussian(width, reach)
-    rough = np.diff(np.eye(size), 3, axis=0)
-    penalty = typical * (SMOOTHING * rough.T @ rough + RIDGE * np.eye(size))
-    for k in range(4):
-        band[3 - k, k:] += np.diagonal(penalty, k)
+    band += typical * (SMOOTHING * _roughness(size))
+    band[3] += typical * RIDGE
     coefficients = scipy.linalg.solveh_banded(band, right)
     spline = scipy.interpolate.BSpline(knots, coefficients, 3)
     step = spacing / FINE
     grid: Array = np.arange(-count * FINE, count * FINE + 1) * np.float64(step)
     table = spline(grid) + np.exp(-0.5 * (grid / width) ** 2)
     return _settled(grid, np.asarray(table, dtype=np.float64), step, width)
+
+
+@lru_cache(maxsize=64)
+def _roughness(size: int) -> Array:
+    """The sum of the squared third differences of `size` coefficients as the upper band (4, size) of a matrix."""
+    rough = np.diff(np.eye(size), 3, axis=0)
+    whole, band = rough.T @ rough, np.zeros((4, size))
+    for k in range(4):
+        band[3 - k, k:] = np.diagonal(whole, k)
+    return band
+
+
+@compiled
+def _gather(place: Array, value: Array, weight: Array, band: Array, right: Array) -> None:  # pragma: no cover
+    """Adds the samples' normal equations for cubic splines on whole numbers: upper `band` (4, size), `right` (size,).
+
+    `place` (m,) counts from the low end of what is looked at, where the last piece of the first spline begins.
+    """
+    basis = np.empty(4)
+    for n in range(len(place)):
+        first = min(max(int(place[n]), 0), len(right) - 4)
+        t = place[n] - first
+        basis[0] = (1 - t) ** 3 / 6
+        basis[1] = (3 * t**3 - 6 * t**2 + 4) / 6
+        basis[2] = (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6
+        basis[3] = t**3 / 6
+        for i in range(4):
+            weighted = weight[n] * basis[i]
+            right[first + i] += weighted * value[n]
+            for j in range(i, 4):
+                band[3 - (j - i), first + j] += weighted * basis[j]
 
 
 def _settled(grid: Array, table: Array, step: float, width: float) -> Shape:
