@@ -383,11 +383,8 @@ class Cell:
 
         `job` names the part that may be in the claw, so that it does not touch anything on the way.
         """
-        from cell import ahead
-
         stops = self.stops
         load_job(job)
-        ahead.begin()
         return self.begin("calibration", lambda run: sessions.calibrate(self._here, run, job), observer, stops).result()
 
     def verify(self, observer: Observer | None = None, job: str | Path = "pot") -> Verification:

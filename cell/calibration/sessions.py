@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from cell import ahead
 from cell.calibration.archive import Observations
 from cell.calibration.collect.boards import collect_scan, collect_target
 from cell.calibration.collect.edge import with_edge
@@ -80,6 +81,7 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
 
     `job` names the part that may be in the claw.
     """
+    ahead.begin()
     part_of, _ = load_job(job)
     config, devices = cell.config, cell.devices
 
