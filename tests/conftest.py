@@ -1,6 +1,6 @@
 """What several test files need and what takes long to make, once for all of them; and which files run beside which.
 
-Three workers share the two cores: tests over the wires mostly wait. Files of a group run on one worker, one after the
+Four workers share the two cores: tests over the wires mostly wait. Files of a group run on one worker, one after the
 other, because they share what is made once for a worker, or because devices over wires would disturb each other's time.
 """
 
@@ -24,17 +24,13 @@ GROUPS = (
         "wire/test_whole_job.py",
         "browser/test_screen.py",
     ),
-    # One device at a time; last those whose times are compared most closely: at first others still compile.
+    # One device at a time; they mostly wait.
     (
         "wire/test_rail_driver.py",
         "wire/test_vehicle_driver.py",
         "wire/test_camera_driver.py",
         "wire/test_gige_camera.py",
         "wire/test_aravis_fake_camera.py",
-        "wire/test_sim_arm.py",
-        "wire/test_sim_arm_ports.py",
-        "wire/test_arm_others.py",
-        "wire/test_factory_kinematics.py",
         "wire/test_other_module.py",
         "wire/test_other_vehicle.py",
         "wire/test_other_drives.py",
@@ -46,8 +42,15 @@ GROUPS = (
         "wire/test_modbus_rail.py",
         "wire/test_relay_boards.py",
         "wire/test_robotiq_claw.py",
-        "wire/test_last_words.py",
         "wire/test_contracts_over_wires.py",
+    ),
+    # The arm; last those whose times are compared most closely: at first others still compile.
+    (
+        "wire/test_sim_arm.py",
+        "wire/test_sim_arm_ports.py",
+        "wire/test_arm_others.py",
+        "wire/test_factory_kinematics.py",
+        "wire/test_last_words.py",
         "wire/test_safe_stop_over_wires.py",
         "wire/test_arm_endings.py",
         "wire/test_arm_driver.py",
@@ -79,7 +82,7 @@ GROUPS = (
 """Groups of files in the order in which they begin, the wires first. Other files over the wires end the first one,
 those of `SCREENS` the second; any other is a group of its own, after them."""
 
-VIRTUAL_JOB = 2
+VIRTUAL_JOB = 3
 """The group whose files share `placed_pot`."""
 
 HERE = Path(__file__).parent

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from cell.steps.photograph import BoardFix
 from cell.steps.way import TURN_DRIFT, Way, distance
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import RefusedError
+from drivers.interfaces import VehicleState
 from sim_backends.world.nominal import inverse
 
 CONFIG = load_config(None)
@@ -101,6 +103,45 @@ def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(se
     site.run()
     assert moved(stood, site.truth()) < 0.002
     assert site.cell.world.collisions.found == ()
+
+
+class LateVehicle:
+    """The simulated vehicle behind a bus that once, at the end of its way unseen, hands on nothing new for a while."""
+
+    def __init__(self, cell: VirtualCell, begins: float, lasts: float) -> None:
+        self._vehicle, self._clock = cell.vehicle, cell.clock
+        self._begins, self._until, self._lasts = begins, math.inf, lasts
+        self._old: VehicleState | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._vehicle, name)
+
+    def state(self, max_age: float = 0.2) -> VehicleState:
+        if self._old is None and self._vehicle.state().x >= self._begins:
+            self._old, self._until = self._vehicle.state(), self._clock.now() + self._lasts
+        if self._old is not None and self._clock.now() < self._until:
+            return self._old
+        state: VehicleState = self._vehicle.state()
+        return state
+
+
+def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board() -> None:
+    site = Site()
+    way = moved(Planar.of(JOB.approach.start.se3()), Planar.of(JOB.approach.staging.se3()))
+    site.vehicle = LateVehicle(site.cell, way - 0.05, 0.6)
+    site.whereabouts = Whereabouts(site.vehicle)
+    site.whereabouts.say_at_start()
+    seen = site.photograph
+
+    def narrow() -> BoardFix:
+        if site.truth().x > JOB.approach.staging.translation[0] + 0.04 and not site.notes:
+            raise RefusedError("the board is cut off by the picture's edge")
+        return seen()
+
+    site.photograph = narrow  # type: ignore[method-assign]
+    arrival = site.run()
+    assert max(abs(arrival.error_along), abs(arrival.error_across)) < JOB.approach.tolerance
+    assert ["brought there" in note for note in site.notes] == [True]
 
 
 def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:

@@ -27,6 +27,9 @@ from statemachine.runner import StepContext
 MAX_TRIES = 5
 SETTLE_S = 0.3
 """The suspension's, after the vehicle has come to rest."""
+PASSED = 0.02
+"""So far, m, from where it was sent a vehicle that does not see the board is brought there first: readings that came
+late let it drive on, which the later ones tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,7 @@ def drive_to_target(
     close to the station, and when the tolerance is not met after five tries.
     """
     way = Way(job, vehicle_from_base, whereabouts, carried)
+    sent: Planar | None = None
 
     def place_from_vehicle(fix: BoardFix) -> Planar:
         return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
@@ -100,7 +104,15 @@ def drive_to_target(
     def look_again() -> BoardFix:
         way_so_far = whereabouts.way
         try:
-            return look()
+            try:
+                return look()
+            except RefusedError:
+                if sent is None or abs((sent.inverse() * whereabouts.pose()).x) < PASSED:
+                    raise
+                note("the board is not seen, and the vehicle stands elsewhere than it was sent: it is brought there")
+                go(sent)
+                clock.sleep(SETTLE_S)
+                return look()
         except RefusedError as unseen:
             raise RefusedError(
                 f"after {way_so_far:.2f} m on odometry the board is not seen from where it should be: {unseen}. Look "
@@ -109,6 +121,8 @@ def drive_to_target(
             ).showing(*unseen.numbers, seen=unseen.seen) from unseen
 
     def go(goal: Planar) -> None:
+        nonlocal sent
+        sent = goal
         hold()
         way.require_line(goal)
         drive_line(vehicle, whereabouts, goal, approach.speed, clock, check)
