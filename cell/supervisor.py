@@ -24,6 +24,7 @@ from cell.calibration.verify.verdict import Verification
 from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
 from cell.devices.injection import Injector
+from cell.devices.jogging import begin_program
 from cell.devices.mix import Sim
 from cell.devices.simulated import Simulation, is_whole
 from cell.devices.stopping import stop_cell
@@ -426,6 +427,7 @@ class Cell:
                 self.devices.rail.home().wait(60.0)
             if device != "rail":
                 self.devices.vehicle.recover()
+                begin_program(self.devices.arm)
                 self.mover(None, hands.safe_point).to_joints(HOME)
 
         self.perform("homing", work, stops=stops)

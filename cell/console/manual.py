@@ -19,7 +19,7 @@ import numpy as np
 from cell.config import RailConfig
 from cell.console.holding import Press
 from cell.devices.gate import Gated
-from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, moved
+from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
 from cell.job import Job
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, InterlockError, LimitError
@@ -196,6 +196,8 @@ class Manual:
         bare = device.bare if isinstance(device, Gated) else device
         if not isinstance(bare, Attended):
             raise InterlockError(press.device, "nothing beside this program would stop it; move it by steps")
+        if press.device == "arm":
+            begin_program(device)
         with bare.attended() as beat:
             press.beat = beat
             motion = self._begin(press, device)

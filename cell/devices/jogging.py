@@ -20,6 +20,7 @@ from cell.steps.camera_poses import look_pose
 from cell.units import parse_quantity
 from cell.vision import parse_board
 from drivers.errors import ConfigError, LimitError
+from drivers.interfaces import Arm
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
@@ -116,9 +117,19 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
     return {**said, "rail": f"{1e3 * here.position:.3f} mm → {1e3 * rail.state().position:.3f} mm"}
 
 
+def begin_program(arm: Arm) -> None:
+    """Begin the arm's control program anew where a stop, a silent computer or somebody at the pendant has ended it.
+
+    Raises `DeviceFault` where that takes a person's word, as after a protective stop.
+    """
+    if not arm.state().controlled:
+        arm.recover()
+
+
 def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
     if "vehicle" in cell.devices:
         cell.devices.vehicle.recover()
+    begin_program(cell.devices.arm)
     mover = cell.mover(None)
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1

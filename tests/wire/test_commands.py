@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import socket
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cell import Cell
 from cell.config import default_toml, load_config
 from cell.devices.assembly import connect
+from cell.devices.jogging import jog, needed_for, parse_jog
 from cell.run.lock import CellLock
 from drivers.errors import InterlockError, NotConnectedError
 from tests.packages import RAIL, install, with_acme_rail
@@ -161,6 +165,21 @@ def test_jogs_move_and_are_refused_outside_the_limits(endpoints: dict[str, Any],
     code, _, error = typed("jog", "rail", "-20mm")
     assert code == 1
     assert "0 mm" in error or "0 to 100" in error
+
+
+def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoints: dict[str, Any]) -> None:
+    wish = parse_jog("arm", ["j1", "+2deg"])
+    with Cell.open("cell.toml", only=needed_for(wish)) as opened:
+        arm, joints = opened.devices.arm, opened.devices.arm.state().joints
+        with socket.create_connection((opened.config.arm.place, 29999), timeout=5.0) as dashboard:
+            dashboard.makefile("r").readline()
+            dashboard.sendall(b"stop\n")
+            until = time.monotonic() + 5.0
+            while arm.state().controlled and time.monotonic() < until:
+                opened.devices.clock.sleep(0.05)
+        assert not arm.state().controlled
+        jog(opened, wish)
+        assert np.degrees(arm.state().joints - joints)[0] == pytest.approx(2.0, abs=0.01)
 
 
 def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoints: dict[str, Any]) -> None:
