@@ -18,7 +18,7 @@ from tests.wire.cells import Supervised
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Devices keep deadlines on the wall, which four workers on two cores cannot always: a failure is looked at again
+    """Devices keep deadlines on the wall, which three workers on two cores cannot always: a failure is looked at again
     a little later, and listed. What is wrong fails each time."""
     for item in items:
         if item.get_closest_marker("wire") is not None and item.get_closest_marker("flaky") is None:

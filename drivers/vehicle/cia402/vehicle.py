@@ -218,10 +218,15 @@ class CanopenVehicle:
         with self._master.command:
             if self._master.stops:
                 raise Aborted(f"{self.name}: a stop is under way")
-            if self._braked or not self._master.enabled:
-                reason = "the brake is locked" if self._braked else "operation is not enabled"
-                raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
-            self._master.set_velocity(speed, yaw_rate)
+            lost, braked = self._master.lost is not None, self._braked
+            if self._master.enabled and not braked and not lost:
+                self._master.set_velocity(speed, yaw_rate)
+                return
+        if lost:
+            # Since the check above: it is the fault and no mistake of whoever drives.
+            self._check(driving=True)
+        reason = "the brake is locked" if braked else "operation is not enabled"
+        raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
 
     def stop(self) -> None:
         """Halt at once and wait until both drives report standstill; `DeadlineError` after 4 s.
