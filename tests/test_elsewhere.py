@@ -30,9 +30,10 @@ def board(sigma: float, off: float = 0.0) -> Prior:
     return Prior(perturbed(TRUE, np.array([off, 0.0, 0.0, 0.0, 0.0, 0.0])), spread)
 
 
-def test_a_pattern_that_the_board_does_not_place_is_refused_with_its_pitch() -> None:
+@pytest.mark.parametrize("off", [0.003, 0.0], ids=["nearer to the other", "nearer to this one"])
+def test_a_pattern_that_the_board_does_not_place_is_refused_with_its_pitch(off: float) -> None:
     with pytest.raises(RefusedError, match=r"looks the same elsewhere: shifted by \(-?5\.0, ") as refused:
-        invert_pose(scanned(waves, 1), nominal(waves), board(0.002, off=0.003), JOB)
+        invert_pose(scanned(waves, 1), nominal(waves), board(0.002, off=off), JOB)
     assert "surface.prior_sigma" in str(refused.value)
     assert refused.value.numbers[0].least == 5.0
 

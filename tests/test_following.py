@@ -120,7 +120,7 @@ def test_of_a_moment_that_nobody_told_of_there_is_no_picture(pair: tuple[World, 
 def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World, World, Following]) -> None:
     """The arm turned by 0.3 rad between two readings that are 0.2 s apart, and stood before and after."""
     real, _, told = pair
-    t = told._tracks["arm"].until
+    t = max(0.0, told._tracks["arm"].until)
     told.tell("vehicle", [[t + at, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0] for at in (0.1, 3.0)])
     for at, turned in ((0.5, 0.0), (0.7, 0.0), (0.9, 0.3), (1.1, 0.3)):
         told.tell("arm", [[t + at, *(real.arm.drive.q + turned), 0.0, 0.0]])

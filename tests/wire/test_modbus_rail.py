@@ -253,6 +253,10 @@ def test_an_obstacle_is_an_alarm_with_its_number() -> None:
     with pytest.raises(InterlockError):
         rail.move_to(0.01)
     assert [reading.ok for reading in rail.examine(0.0)] == [False]
+    # Cleared at the drive, which says that it is homed as before: it may have slipped.
+    drive.model.clear_stall()
+    assert drive.peer.drive._homed
+    assert not rail.state().homed
     rail.close()
     drive.peer.stop()
 
