@@ -6,6 +6,7 @@ there is nothing to compile, and no second process.
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -27,14 +28,23 @@ LINES = 40
 GIVING_WAY = 19
 """How nice the second process is: nothing that moves waits for it."""
 
+log = logging.getLogger(__name__)
+
+
+_second: list[subprocess.Popen[bytes]] = []
+"""The second process, if one was begun. Kept: with its pipe it would end."""
+
 
 def begin() -> None:
     """Compile in a second process what is not kept on disk yet. It ends with this one, if not before."""
-    if is_kept(closest):
+    if _second or is_kept(closest):
         return
     mine, nowhere = [sys.executable, "-m", "cell.ahead"], subprocess.DEVNULL
     # Nothing is written to the pipe; it closes when this process ends, in whatever way.
-    subprocess.Popen(mine, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere)
+    try:
+        _second.append(subprocess.Popen(mine, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere))
+    except OSError as error:
+        log.warning("nothing is compiled ahead: %s; the first job waits for it longer", error)
 
 
 def compile_all() -> None:
