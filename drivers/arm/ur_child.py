@@ -117,8 +117,9 @@ class Child:
                 elif request.name == "safe_off":
                     self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
                 elif request.name == "attend":
+                    # The time first: with the silence alone the watch would look at one that is long past.
+                    self._attended_until = time.monotonic() + request.arguments[0]
                     self._silence = request.arguments[0]
-                    self._attended_until = time.monotonic() + self._silence if self._silence > 0 else math.inf
                 else:
                     self._control.submit(request)
         self.shut_down(closing)
@@ -172,9 +173,11 @@ class Child:
         while True:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
-            if time.monotonic() > self._attended_until:
+            # Read once: the owner may say that nothing is attended any more meanwhile.
+            silence = self._silence
+            if silence > 0 and time.monotonic() > self._attended_until:
                 # Again and again: an owner that hung may begin a motion afterwards.
-                self._attended_until = time.monotonic() + self._silence
+                self._attended_until = time.monotonic() + silence
                 self._control.submit(Request(UNANSWERED, "stop"))
             if not self._packets.connected:
                 self._lose("the arm closed the connection")
