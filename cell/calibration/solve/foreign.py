@@ -56,7 +56,8 @@ def foreign_view(found: Intrinsics, views: Sequence[BoardView]) -> tuple[int, fl
 def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
     """Views from each of which on all may want another camera than those before, by the test alone; else empty.
 
-    Where any half of the views wants one, board or lens are not what the model has, and nothing was changed in between.
+    Where any half of the views wants one, or single views still do beside those of their own part, board or lens are
+    not what the model has, and nothing was changed in between.
     """
     count = len(views)
     if count < 2 * LEAST_PART:
@@ -67,7 +68,8 @@ def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
     split, rest = wants[: len(splits)], wants[len(splits) :]
     if split.max() < max(FOREIGN, AT_ONCE * rest.max()):
         return []
-    return [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
+    at = [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
+    return [k for k in at if ALONE * max(own_cameras(found, part).max() for part in (views[:k], views[k:])) < split.max()]
 
 
 def own_cameras(
