@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -280,3 +281,39 @@ def test_a_camera_that_the_arm_contradicts_is_stated_with_what_parts_them():
     assert abs(doubted.camera.fx - MATRIX[0, 0]) < 2.5 * doubted.sigma[0] < 25.0
     hand = choice.best.adjusted.state.flange_from_camera.translation - FLANGE_FROM_CAMERA.translation
     assert np.all(np.abs(FLANGE_FROM_CAMERA.rotation.T @ hand) < Z * choice.best.sigma[HAND][:3])
+
+
+@pytest.mark.parametrize("seed", [6, 8, 11])
+def test_few_views_of_a_bent_board_state_how_little_they_tell(seed):
+    """A bend of 0.2 mm that four views cannot tell moved the focal length by three times what was stated."""
+    found, _ = choose_lens([f.view for f in scene(seed=seed, count=4, bend=2e-4, laser=False)])
+    assert abs(found.camera.fx - MATRIX[0, 0]) < 2 * found.sigma[0] < 0.1 * MATRIX[0, 0]
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_views_from_one_side_are_no_change_of_zoom(seed):
+    """The first three look square on at a bent board and take the bend for another focal length, 821 ± 21 px."""
+    rng = np.random.default_rng(seed)
+    frames = scene(seed=seed, count=9, laser=False)
+    real = frames[0].view.object_points - frames[0].view.object_points.mean(axis=0)
+    real[:, 2] += 5e-4 * (real[:, 0] / np.abs(real[:, 0]).max()) ** 2
+    for frame, tilt in zip(frames, np.radians([1, 1, 2, 25, 25, 25, 25, 25, 25]), strict=True):
+        way = rng.uniform(0, 2 * np.pi)
+        at = np.array([*rng.uniform(-0.03, 0.03, 2), 0.4 + rng.uniform(-0.03, 0.03)])
+        pixels = cv2.projectPoints(real, tilt * np.array([np.cos(way), np.sin(way), 0.0]), at, MATRIX, LENS)[0]
+        pixels = pixels.reshape(-1, 2)
+        frame.view = replace(frame.view, pixels=pixels + rng.normal(0, 0.05, pixels.shape))
+    found, _ = camera_of(frames)
+    assert abs(found.camera.fx - MATRIX[0, 0]) < Z * found.sigma[0] < 0.1 * MATRIX[0, 0]
+
+
+def test_a_picture_whose_pose_cannot_be_told_does_not_take_the_camera_of_the_others():
+    frames = scene(seed=1, count=7, laser=False)
+    view = frames[3].view
+    far = np.array([1.2, 0.0, 0.0]), np.array([0.0, 0.0, 9.0])
+    points = view.object_points - view.object_points.mean(axis=0)
+    frames[3].view = replace(view, pixels=cv2.projectPoints(points, *far, MATRIX, LENS)[0].reshape(-1, 2))
+    found, _ = camera_of(frames)
+    assert [f.name for f in frames if f.reason is not None] == [frames[3].name]
+    assert "two poses" in frames[3].text
+    assert abs(found.camera.fx - MATRIX[0, 0]) < Z * found.sigma[0]

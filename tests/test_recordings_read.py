@@ -314,6 +314,100 @@ def words_beside_named_numbers(folder: Path) -> None:
     (folder / "data.json").write_text(json.dumps(entries[::-1]))
 
 
+def as_a_pendant_shows_them(folder: Path) -> None:
+    lines = [
+        "{{X {:.6f}, Y {:.6f}, Z {:.6f}, A {:.8f}, B {:.8f}, C {:.8f}}}".format(*(1e3 * p[:3, 3]), *angles(p, "ZYX"))
+        for p in POSES
+    ]
+    (folder / "points.txt").write_text("\n".join(lines))
+
+
+def named_over_two_lines(folder: Path) -> None:
+    text = "X = {:.6f} mm, Y = {:.6f} mm, Z = {:.6f} mm,\nW = {:.8f} deg, P = {:.8f} deg, R = {:.8f} deg\n"
+    one_file_each(folder, lambda p: text.format(*(1e3 * p[:3, 3]), *angles(p, "xyz")))
+
+
+def targets_of_a_program(folder: Path) -> None:
+    lines = [
+        f"CONST robtarget p{k}:=[[{row(1e3 * p[:3, 3], ',')}],[{row(quaternion(p, 'wxyz'), ',')}],[0,0,0,0]];"
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "module.txt").write_text("\n".join(lines))
+
+
+def message(pose: np.ndarray) -> str:
+    place = "".join(f"    {n}: {v:.9f}\n" for n, v in zip("xyz", pose[:3, 3], strict=True))
+    turn = "".join(f"    {n}: {v:.9f}\n" for n, v in zip("xyzw", quaternion(pose), strict=True))
+    return f'header:\n  seq: 1\n  frame_id: "base"\npose:\n  position:\n{place}  orientation:\n{turn}'
+
+
+def messages_in_a_text(folder: Path) -> None:
+    (folder / "echo.txt").write_text("---\n".join(map(message, POSES)))
+
+
+def documents_of_yaml(folder: Path) -> None:
+    parts = [f"image: frame{k + 3:02d}.png\n{message(p)}" for k, p in enumerate(POSES)]
+    (folder / "poses.yaml").write_text("---\n" + "---\n".join(parts))
+
+
+def attributes_of_xml(folder: Path) -> None:
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    parts = [" ".join(f'{n}="{v:.9f}"' for n, v in zip(names, [*p[:3, 3], *quaternion(p)], strict=True)) for p in POSES]
+    text = "".join(f'<pose image="frame{k + 3:02d}.png" {part}/>' for k, part in enumerate(parts))
+    (folder / "poses.xml").write_text(f"<poses>{text}</poses>")
+
+
+def utf_16_without_a_mark(folder: Path) -> None:
+    lines = [f"frame{k + 3:02d}.png,{row([*p[:3, 3], *quaternion(p)], ',')}" for k, p in enumerate(POSES)]
+    (folder / "poses.csv").write_bytes("\r\n".join(["name,x,y,z,qx,qy,qz,qw", *lines]).encode("utf-16-le"))
+
+
+JOINTS = np.random.default_rng(0).normal(0, 1.5, (len(POSES), 6))
+
+
+def joints_before_poses_without_names(folder: Path) -> None:
+    lines = [
+        row([1.7e9 + k, *JOINTS[k], *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()])
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "record.csv").write_text("\n".join(lines))
+
+
+def as_the_arms_client_records_them(folder: Path) -> None:
+    names = [*(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(6))]
+    lines = [
+        row([100.0 + k, *JOINTS[k], *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()])
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "robot_data.csv").write_text("\n".join([" ".join(["timestamp", *names]), *lines]))
+
+
+def named_with_the_tool_before(folder: Path) -> None:
+    lines = [
+        f"frame{k + 3:02d}.png,{row([*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec(), *JOINTS[k]], ',')}"
+        for k, p in enumerate(POSES)
+    ]
+    names = "image,tcp_x,tcp_y,tcp_z,tcp_rx,tcp_ry,tcp_rz,q1,q2,q3,q4,q5,q6"
+    (folder / "poses.csv").write_text("\n".join([names, *lines]))
+
+
+def numbered_rows_in_any_order(folder: Path) -> None:
+    lines = [f"{k + 3} {row([*(1e3 * p[:3, 3]), *angles(p, 'xyz')])}" for k, p in enumerate(POSES)]
+    (folder / "poses.txt").write_text("\n".join([*lines[3:], *lines[:3]]))
+
+
+def links_of_which_one_is_the_flange(folder: Path) -> None:
+    still = POSES[0]
+    frames = [
+        {
+            "image": f"frame{k + 3:02d}.png",
+            "tf": {f"link{j}": (p if j == 6 else still).tolist() for j in range(1, 7)},
+        }
+        for k, p in enumerate(POSES)
+    ]
+    (folder / "poses.json").write_text(json.dumps(frames))
+
+
 SPELLINGS = {
     halves_in_one_file: ("rotation-9+xyz", "m", "order"),
     halves_in_two_files: ("rotation-9+xyz", "mm", "order"),
@@ -341,6 +435,18 @@ SPELLINGS = {
     position_rotation_and_picture_below_each_other: ("xyz+quaternion-xyzw", "m", "name"),
     titles_above_rotation_and_position: ("rotvec-rad+xyz", "m", "name"),
     as_ros_echoes_a_transform: ("xyz+quaternion-xyzw", "m", "order"),
+    as_a_pendant_shows_them: ("xyz+abc-deg", "mm", "order"),
+    named_over_two_lines: ("xyz+rpy-deg", "mm", "name"),
+    targets_of_a_program: ("xyz+quaternion-wxyz", "mm", "order"),
+    messages_in_a_text: ("xyz+quaternion-xyzw", "m", "order"),
+    documents_of_yaml: ("xyz+quaternion-xyzw", "m", "name"),
+    attributes_of_xml: ("xyz+quaternion-xyzw", "m", "name"),
+    utf_16_without_a_mark: ("xyz+quaternion-xyzw", "m", "name"),
+    joints_before_poses_without_names: ("xyz+rotvec-rad", "m", "order"),
+    as_the_arms_client_records_them: ("xyz+rotvec-rad", "m", "order"),
+    named_with_the_tool_before: ("xyz+rotvec-rad", "m", "name"),
+    numbered_rows_in_any_order: ("xyz+rpy-deg", "mm", "name"),
+    links_of_which_one_is_the_flange: ("matrix-4x4", "m", "name"),
 }
 
 
@@ -423,6 +529,12 @@ def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
     frames, understood, _ = understand(recording, seen)
     assert "25.0" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
+
+
+def test_positions_in_inches_are_named(recording, seen):
+    one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], p[:3, 3] / 0.0254], p[3:]]).ravel()))
+    _, understood, _ = understand(recording, seen)
+    assert "are the positions in inches?" in understood.refused
 
 
 def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):

@@ -33,6 +33,8 @@ SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
 # … and where that other size leaves no more than this share of the scatter.
 SCALE_BETTER, SCALE_CLEARLY = 0.7, 0.35
 
+# Units in which no arm is asked to tell its poses, but some do, in m, and how near the size must be.
+OTHER_UNITS, OTHER_SHARE = {"inches": 0.0254, "feet": 0.3048, "tenths of a mm": 1e-4, "µm": 1e-6}, 0.03
 
 # Poses that were written with few digits, or in two files, are the same to this.
 SAME_RAD, SAME_M = 1e-3, 2e-4
@@ -193,6 +195,10 @@ def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:
         f"its poses say ({1e3 * fit.shift_scaled:.1f} mm of scatter instead of {1e3 * fit.shift:.1f} mm): is the "
         f"board's pitch {1e3 * pitch / fit.scale:.2f} mm and not {1e3 * pitch:.2f} mm?"
     )
+    size = fit.scale * UNITS[fit.unit]
+    other = next((name for name, unit in OTHER_UNITS.items() if abs(size / unit - 1) < OTHER_SHARE), None)
+    if other is not None:
+        text = f"{text} Or are the positions in {other}? Write them in mm"
     return text, off > SCALE_REFUSED and fit.shift_scaled < SCALE_CLEARLY * fit.shift
 
 

@@ -9,12 +9,14 @@ import ast
 import json
 import re
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cell.calibration.recorded.halves import Half, half_of
+from cell.calibration.recorded.keyed import read_keyed
 from cell.calibration.recorded.listing import PICTURES
 from cell.calibration.recorded.records import COUNTS, Content, Record, file_like, named_numbers
 from cell.calibration.recorded.tables import read_table
@@ -22,6 +24,8 @@ from cell.calibration.recorded.xml_files import read_xml
 from cell.calibration.recorded.yaml_subset import read_yaml
 from cell.geometry.camera import Array
 
+# A robtarget of an ABB arm: position and quaternion.
+TARGET = re.compile(r"robtarget\s+\w+\s*:=\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]")
 # A pose that a program of a UR arm moves to: position and rotation vector.
 MOVE = re.compile(r"\bmove[a-z]+\s*\(\s*p\s*\[([^\]]*)\]")
 
@@ -43,7 +47,7 @@ def read_content(path: Path) -> Content:
     data = _structured(path, text)
     if data is not None:
         _walk(path, data, [], None, content)
-    elif not _program(path, text, content):
+    elif not (_program(path, text, content) or read_keyed(path, text, content) or _printed(path, text, content)):
         read_table(path, text, content)
     return content
 
@@ -52,6 +56,8 @@ def _decoded(data: bytes) -> str:
     for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
         if data.startswith(mark):
             return data.decode(encoding, errors="replace")
+    if len(data) > 3 and (data[0] == 0) != (data[1] == 0):
+        return data[: len(data) // 2 * 2].decode("utf-16-be" if data[0] == 0 else "utf-16-le", errors="replace")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError:
@@ -81,11 +87,25 @@ def _structured(path: Path, text: str) -> Any:
 
 def _program(path: Path, text: str, content: Content) -> bool:
     """Add the poses that an arm's own program moves to, one after the other; False for a text that is none."""
+    for found in TARGET.findall(text):
+        with suppress(ValueError):
+            place, turn = ([float(value) for value in part.split(",")] for part in found)
+            if (len(place), len(turn)) == (3, 4):
+                content.records.append(Record(path, "row", f"[{len(content.records)}]", np.array([*place, *turn])))
     for found in MOVE.findall(text):
         with suppress(ValueError):
             numbers = np.array([float(value) for value in found.split(",")])
             if len(numbers) == 6:
                 content.records.append(Record(path, "row", f"[{len(content.records)}]", numbers, "rotation"))
+    return bool(content.records)
+
+
+def _printed(path: Path, text: str, content: Content) -> bool:
+    """Add the poses of a text that is YAML under another name, as rostopic prints messages; False where it is none."""
+    if not re.match(r"(?:---\s+)?\w+:\s", text.lstrip()):
+        return False
+    with suppress(ValueError):
+        _walk(path, read_yaml(text), [], None, content)
     return bool(content.records)
 
 
@@ -102,7 +122,8 @@ def _walk(path: Path, data: Any, place: list[str], label: str | None, content: C
             return
         found, named = _by_names(data)
         if found is not None:
-            content.records.append(Record(path, _pattern(place), label or _number_in(place), found, named))
+            label = label or _number_in(place)
+            content.records.append(Record(path, _pattern(place), label, found, named, exact=_names(place)))
             return
         for key, value in data.items():
             _walk(path, value, [*place, str(key)], label, content)
@@ -121,7 +142,8 @@ def _take(path: Path, array: Array, place: list[str], label: str | None, content
     """Add the pose, the poses or the halves of poses that an array holds."""
     pose = _one(array)
     if pose is not None:
-        content.records.append(_record(path, _pattern(place), label or _number_in(place), pose))
+        record = _record(path, _pattern(place), label or _number_in(place), pose)
+        content.records.append(replace(record, exact=_names(place)))
     elif array.ndim >= 2 and _one(array[0]) is not None:
         for k, part in enumerate(array):
             one = _one(part)
@@ -203,6 +225,10 @@ def _part(low: dict[str, Any], keys: tuple[str, ...]) -> tuple[Array, str] | Non
 
 def _pattern(place: list[str]) -> str:
     return "/".join(re.sub(r"\d+", "N", p) for p in place)
+
+
+def _names(place: list[str]) -> str:
+    return "/".join(re.sub(r"\[\d+\]", "[N]", p) for p in place)
 
 
 def _number_in(place: list[str]) -> str | None:

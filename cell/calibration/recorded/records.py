@@ -24,6 +24,7 @@ TURNS = (
     (("rx", "ry", "rz"), "rotation"),
     (("roll", "pitch", "yaw"), "rotation"),
     (("a", "b", "c"), "rotation"),
+    (("w", "p", "r"), "rotation"),
 )
 
 
@@ -40,6 +41,8 @@ class Record:
     numbers: Array
     named: str = ""
     time: float | None = None
+    exact: str = ""
+    """Its place with the numbers in the names that `field` leaves out, where that is another."""
 
 
 @dataclass
@@ -60,12 +63,16 @@ def named_numbers(names: list[str], values: list[Any]) -> tuple[Array | None, st
             continue
         for turn, kind in TURNS:
             where = [clean.index(t) if t in clean else -1 for t in turn]
+            if min(where) < 0:
+                where = [clean.index(prefix + t) if prefix + t in clean else -1 for t in turn]
             if min(where) >= 0 and not (turn[0] == "x" and prefix == ""):
                 return np.array([values[k] for k in (*place, *where)], dtype=np.float64), kind
     numbered = [re.sub(r"[^a-z0-9]", "", n.lower()) for n in names]
-    six = [numbered.index(f"pose{k}") if f"pose{k}" in numbered else -1 for k in range(1, 7)]
-    if min(six) >= 0 and "pose7" not in numbered:
-        return np.array([values[k] for k in six], dtype=np.float64), ""
+    for name in ("pose", "actualtcppose"):
+        for first in (0, 1):
+            six = [numbered.index(n) if (n := f"{name}{k}") in numbered else -1 for k in range(first, first + 6)]
+            if min(six) >= 0 and f"{name}{first + 6}" not in numbered:
+                return np.array([values[k] for k in six], dtype=np.float64), ""
     return None, ""
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.conventions import Reading
+from cell.calibration.recorded.conventions import Reading, readings_of
 from cell.calibration.recorded.halves import join_halves
 from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
@@ -94,12 +94,46 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             groups.setdefault((source_name, place, len(record.numbers)), []).append(record)
     found = [
         Series(f"{source}:{place}" if place not in ("", "row", "matrix") else source, records)
-        for (source, place, _), records in groups.items()
+        for (source, place), records in _apart(groups)
     ]
     links = [link for content in contents.values() for link in content.links]
     few = [s for s in found if len(s.records) < LEAST]
     unread += [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in few]
     return [s for s in found if len(s.records) >= LEAST], links, unread
+
+
+def _apart(groups: dict[tuple[str, str, int], list[Record]]) -> list[tuple[tuple[str, str], list[Record]]]:
+    """Groups of records by their source and place, those that hold several kinds of poses taken apart.
+
+    Of one picture there may be link1 to link8, and only one is the flange. Twelve numbers that are no matrix are two
+    times six: joint angles and a pose, in either order.
+    """
+    found: list[tuple[tuple[str, str], list[Record]]] = []
+    for (source, place, count), records in groups.items():
+        kinds: dict[str, list[Record]] = {}
+        if len({(r.path, r.label) for r in records}) < len(records):
+            for record in records:
+                kinds.setdefault(record.exact, []).append(record)
+        if len(kinds) > 1:
+            found += [((source, kind), some) for kind, some in kinds.items()]
+        elif count == 12 and not any(_reads(record) for record in records):
+            for half, name in ((slice(0, 6), "numbers1-6"), (slice(6, 12), "numbers7-12")):
+                six = [replace(record, numbers=record.numbers[half]) for record in records]
+                found.append(((source, f"{place}/{name}" if place not in ("", "row", "matrix") else name), six))
+        else:
+            found.append(((source, place), records))
+    return found
+
+
+def _reads(record: Record) -> bool:
+    """True where some reading makes a pose of a record, or it has values that are not finite, which tell nothing."""
+    for reading in readings_of(len(record.numbers), record.named, None):
+        try:
+            reading.pose(record.numbers)
+        except ValueError:
+            continue
+        return True
+    return not bool(np.isfinite(record.numbers).all())
 
 
 def match_series(

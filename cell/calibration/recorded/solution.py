@@ -28,11 +28,11 @@ from cell.calibration.solve.plane_checks import (
     planes_of_cameras,
     planes_without_one,
 )
-from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels
+from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels, zhang
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
 from cell.vision.board.view import BoardView
-from cell.vision.pictures import Reason
+from cell.vision.pictures import PictureRefused, Reason
 from drivers.errors import RefusedError
 
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
@@ -43,6 +43,11 @@ CHANGED_SIGMAS, CHANGED_SHARE = 4.0, 0.02
 """Two parts of the pictures are of two cameras where their focal lengths differ by more than both.
 
 A bent board and views from one side move that of few pictures by up to a hundredth.
+"""
+FITS_BETTER = 1.06
+"""… and where one camera for both leaves so many times the squares of two; with a zoom of 2 % it leaves 1.1 times.
+
+A few views from one side take noise or a bend for another focal length and hardly fit better with it.
 """
 LIKELY_LASER = 0.5
 """Share of the pictures that shows a stripe where there was a laser."""
@@ -63,11 +68,17 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
         views = _views(kept)
         stops = by_stop(kept)
         apart = _views([merged(s) for s in stops])
-        if given is None:
-            chosen, plain = (_of_all(c, views) for c in choose_lens(apart))
-            _refuse_change(chosen, apart, [s[0].name for s in stops])
-        else:
-            chosen, plain = (given_camera(given, views),) * 2
+        try:
+            if given is None:
+                chosen, plain = (_of_all(c, views) for c in choose_lens(apart))
+                _refuse_change(chosen, apart, [s[0].name for s in stops])
+            else:
+                chosen, plain = (given_camera(given, views),) * 2
+        except PictureRefused:
+            # One picture whose pose nobody can tell must not take the camera of the others.
+            if not _refuse_without_pose(kept, zhang(apart, lens=False)[0] if given is None else given):
+                raise
+            continue
         worst = int(np.argmax(chosen.view_rms))
         typical = float(np.median(chosen.view_rms))
         if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
@@ -100,18 +111,39 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
             return chosen, plain
 
 
+def _refuse_without_pose(frames: Sequence[RecordedFrame], camera: CameraModel) -> bool:
+    """Refuse frames in which the board's pose cannot be told, by about such a camera; True where there are some."""
+    found = False
+    for frame in frames:
+        assert frame.view is not None
+        try:
+            board_pose(frame.view, camera)
+        except PictureRefused as refused:
+            frame.refuse(refused.reason, str(refused))
+            found = True
+    return found
+
+
 def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:
     """CameraChanged where the pictures from one on are of another camera than those before, by the cameras of both."""
     roomy = replace(found, model=replace(found.model, k1=True, k2=True, one_focal=False))
     for at in parted_at(roomy, views):
         before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
         focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
+        apart = _squares(views[:at], before.camera) + _squares(views[at:], after.camera)
+        if _squares(views, found.camera) < FITS_BETTER * apart:
+            continue
         if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
             raise CameraChanged(
                 f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from "
                 f"{names[at]} on {focal[1]:.0f} ± {sigma[1]:.0f} px: zoom, focus or camera were changed in between; "
                 "give both parts by themselves, each in a folder of its own"
             )
+
+
+def _squares(views: Sequence[BoardView], camera: CameraModel) -> float:
+    """Sum of the squares in px² by which the views' points miss their places in a camera."""
+    return sum(len(v.ids) * board_pose(v, camera).rms_px ** 2 for v in views)
 
 
 def _of_all(found: Intrinsics, views: Sequence[BoardView]) -> Intrinsics:

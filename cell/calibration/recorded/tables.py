@@ -40,6 +40,7 @@ def read_table(path: Path, text: str, content: Content) -> None:
     if header is None and _one_pose(path, rows, numbers, content):
         return
     told = _labels(header, rows)
+    numbered = _numbered(numbers)
     for k, (row, found) in enumerate(zip(rows, numbers, strict=True)):
         words = [c for c in row if c and _number(c) is None]
         label = next((w for w in words if Path(w).suffix.lower() in PICTURES), told[k])
@@ -48,6 +49,8 @@ def read_table(path: Path, text: str, content: Content) -> None:
             content.links.append({n: c for n, c in zip(names, row, strict=True) if file_like(c)})
         if not found:
             continue
+        if numbered and label.startswith("["):
+            label, found = f"{found[0]:.0f}", found[1:]
         record = _row(path, header, row, found, label)
         if record is None:
             raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; a pose has 6, 7, 12 or 16")
@@ -123,6 +126,16 @@ def _labels(header: list[str] | None, rows: list[list[str]]) -> list[str]:
         columns = [k for k in columns if all(row[k] and _number(row[k]) is None for row in rows)]
         return [row[columns[0]] if columns else f"[{k}]" for k, row in enumerate(rows)]
     return [next((c for c in row if c and _number(c) is None), f"[{k}]") for k, row in enumerate(rows)]
+
+
+def _numbered(numbers: list[list[float]]) -> bool:
+    """True for rows of seven of which the first is a number of its own in each, and no quaternion is behind it."""
+    first = [row[0] for row in numbers if row]
+    return (
+        all(len(row) == 7 and row[0] == row[0] // 1 and abs(sum(v * v for v in row[3:]) - 1) > 0.02 for row in numbers)
+        and len(set(first)) == len(first) > 2
+        and max(map(abs, first)) < LEAST_TIME
+    )
 
 
 def _row(path: Path, header: list[str] | None, row: list[str], found: list[float], label: str) -> Record | None:

@@ -27,7 +27,8 @@ def _value(element: ElementTree.Element) -> Any:
         parts.setdefault(key, []).append(_scalar(value))
     for child in element:
         parts.setdefault(child.tag, []).append(_value(child))
-    if parts and len(element):
+    # An attribute beside a text says what the text is (type_id); beside none it is what the element holds.
+    if parts and (len(element) or not (element.text or "").strip()):
         return {key: values[0] if len(values) == 1 else values for key, values in parts.items()}
     return _scalar(element.text or "")
 

@@ -13,10 +13,13 @@ PAIR = re.compile(r"""^("[^"]*"|'[^']*'|[^\s\[\]{},"'][^:]*?)\s*:(?:\s+(.*))?$""
 
 
 def read_yaml(text: str) -> Any:
-    """The maps, lists, numbers and words of a text. Raises ValueError."""
-    lines = _lines(text)
-    if not lines:
-        return None
+    """The maps, lists, numbers and words of a text; a list of those of its documents. Raises ValueError."""
+    documents = [lines for part in re.split(r"(?m)^---.*$", text) if (lines := _lines(part))]
+    found = [_document(lines) for lines in documents]
+    return found if len(found) > 1 else found[0] if found else None
+
+
+def _document(lines: list[Line]) -> Any:
     value, rest = _block(lines, 0)
     if rest < len(lines):
         raise ValueError(f"{lines[rest][1][:40]!r} does not belong to what is before it")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.calibration.solve.adjustment import Adjustment
 from cell.calibration.solve.blocks import CAMERA, FLANGE, State
@@ -16,6 +17,9 @@ from cell.geometry.camera import Array
 SHAPES = 3
 SIGNIFICANT, CERTAIN = 4.0, 2.0
 """Deviations, by leaving views out, from which a bend is believed."""
+USUAL = 1.5e-3
+"""Share of its diagonal by which a board may be bent without a doubt: `camera_checks` has the same."""
+LEAST_RISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +43,7 @@ class Bend:
 def bend_of(adjustment: Adjustment, state: State) -> Bend:
     """The bend that the dots speak of, at the solution of an adjustment to pictures alone, lens and poses free."""
     whole, middle, half = _whole(adjustment)
-    lens = np.flatnonzero(adjustment.free[CAMERA])
-    lens_rows, lens_right = adjustment.lens_prior(state)
-    size = len(lens) + SHAPES
-    prior, pull = np.zeros((size, size)), np.zeros(size)
-    prior[: len(lens), : len(lens)] = (lens_rows.T @ lens_rows)[np.ix_(lens, lens)]
-    pull[: len(lens)] = (lens_rows.T @ lens_right)[lens]
-    parts, wide = [], []
-    for k, view in enumerate(adjustment.views):
-        for _, rows, residual, _ in adjustment.rows_of(k, state):
-            height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
-            shapes = np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
-            wanted = np.column_stack([rows[:, lens], height[:, None] * shapes, residual])
-            pose = np.linalg.qr(rows[:, FLANGE])[0]
-            wanted -= pose @ (pose.T @ wanted)
-            parts.append((wanted[:, :-1].T @ wanted[:, :-1], wanted[:, :-1].T @ wanted[:, -1]))
-            wide.append(wanted)
-    information = prior + np.sum([h for h, _ in parts], axis=0)
-    gradient = pull + np.sum([g for _, g in parts], axis=0)
+    lens, information, gradient, parts, wide = _normal(adjustment, state)
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
 
     def solved(h: Array, g: Array) -> Array:
@@ -84,6 +71,62 @@ def bend_of(adjustment: Adjustment, state: State) -> Bend:
     size_m = float(heights[high] - heights[low])
     certain = float(gain.sum() / max(np.sqrt(count) * gain.std(ddof=1), 1e-9))
     return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera)
+
+
+def untold_by_bend(adjustment: Adjustment, state: State) -> Array:
+    """What a bend that is not believed may have moved the camera's parameters, (4, 9): rows whose squares add up.
+
+    At the solution of an adjustment to pictures alone. A board is bent by about as much as boards usually are, and the
+    views tell more of it or less: views from one side tell nothing, and take it for another focal length. The first
+    row is what the likeliest bend would move, the others what is left of the usual one.
+    """
+    whole, middle, half = _whole(adjustment)
+    lens, information, gradient, *_ = _normal(adjustment, state)
+    size = len(lens)
+    # Of two columns of points none stands out: a board of so few has no such bend.
+    rise = np.ptp(surface_shapes((whole - middle) / half), axis=0)
+    usual = np.divide(USUAL * 2 * half, rise, out=np.zeros(SHAPES), where=rise > LEAST_RISE)
+    # In deviations of the usual bend, and in parameters of one size.
+    scale = np.r_[1 / np.sqrt(np.maximum(np.diag(information)[:size], 1e-30)), usual]
+    unit = information * scale[:, None] * scale + np.diag(np.r_[np.zeros(size), np.ones(SHAPES)])
+    inverse = np.linalg.pinv(unit)
+    found = inverse @ (scale * gradient)
+    flat = np.linalg.pinv(unit[:size, :size])
+    moved = np.zeros((1 + SHAPES, 9))
+    moved[0, lens] = found[:size] - flat @ (scale * gradient)[:size]
+    root = np.linalg.cholesky(inverse[size:, size:] + 1e-12 * np.eye(SHAPES))
+    moved[1:, lens] = (flat @ unit[:size, size:] @ root).T
+    moved[:, lens] *= scale[:size]
+    return moved
+
+
+def _normal(
+    adjustment: Adjustment, state: State
+) -> tuple[NDArray[np.intp], Array, Array, list[tuple[Array, Array]], list[Array]]:
+    """The free terms of the lens, normal equations of these and the three shapes, those of each view, and its rows.
+
+    Poses are eliminated.
+    """
+    _, middle, half = _whole(adjustment)
+    lens = np.flatnonzero(adjustment.free[CAMERA])
+    lens_rows, lens_right = adjustment.lens_prior(state)
+    size = len(lens) + SHAPES
+    prior, pull = np.zeros((size, size)), np.zeros(size)
+    prior[: len(lens), : len(lens)] = (lens_rows.T @ lens_rows)[np.ix_(lens, lens)]
+    pull[: len(lens)] = (lens_rows.T @ lens_right)[lens]
+    parts, wide = [], []
+    for k, view in enumerate(adjustment.views):
+        for _, rows, residual, _ in adjustment.rows_of(k, state):
+            height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
+            shapes = np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
+            wanted = np.column_stack([rows[:, lens], height[:, None] * shapes, residual])
+            pose = np.linalg.qr(rows[:, FLANGE])[0]
+            wanted -= pose @ (pose.T @ wanted)
+            parts.append((wanted[:, :-1].T @ wanted[:, :-1], wanted[:, :-1].T @ wanted[:, -1]))
+            wide.append(wanted)
+    information = prior + np.sum([h for h, _ in parts], axis=0)
+    gradient = pull + np.sum([g for _, g in parts], axis=0)
+    return lens, information, gradient, parts, wide
 
 
 def moved_by_bend(adjustment: Adjustment, state: State) -> Array:

@@ -69,7 +69,9 @@ def parted_at(found: Intrinsics, views: Sequence[BoardView]) -> list[int]:
     if split.max() < max(FOREIGN, AT_ONCE * rest.max()):
         return []
     at = [LEAST_PART + int(k) for k in np.flatnonzero(split > ABOUT * split.max())]
-    return [k for k in at if ALONE * max(own_cameras(found, part).max() for part in (views[:k], views[k:])) < split.max()]
+    return [
+        k for k in at if ALONE * max(own_cameras(found, part).max() for part in (views[:k], views[k:])) < split.max()
+    ]
 
 
 def own_cameras(

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from cell.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
 from cell.calibration.solve.blocks import CAMERA, SHARED, State, ViewData
-from cell.calibration.solve.board_shape import Bend, bend_of
+from cell.calibration.solve.board_shape import Bend, bend_of, untold_by_bend
 from cell.calibration.solve.left_out import LeftOut, leave_out
 from cell.calibration.solve.starts import zhang
 from cell.geometry.camera import Array, CameraModel
@@ -78,9 +78,9 @@ class Intrinsics:
 
     `sigma` (9,) is the larger of what the residuals say and of the scatter between calibrations that lack one view.
     `formal` (9,) the former alone. `tried` has the RMS of left-out views of each lens model that was tried.
-    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations. `pull` (n,) is how
-    far each view moves focal lengths and principal point, over what the residuals allow (Cook's distance); empty with
-    too few views.
+    `bend` is how far the board seems to be bent; what it would move the camera is in the deviations, and where it is
+    not believed, what a usual bend would that the views do not exclude. `pull` (n,) is how far each view moves focal
+    lengths and principal point, over what the residuals allow (Cook's distance); empty with too few views.
     """
 
     camera: CameraModel
@@ -108,6 +108,8 @@ class _Fit:
     covariance: Array
     left: LeftOut | None
     bend: Bend | None
+    untold: Array = field(default_factory=lambda: np.zeros((0, 9)))
+    """What a bend that is not believed may have moved the camera (n, 9)."""
 
     @property
     def held_out(self) -> float:
@@ -196,7 +198,10 @@ def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
     result = adjustment.solve(at, ROUNDS)
     left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
     bend = bend_of(adjustment, result.state) if left is not None else None
-    return _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
+    found = _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
+    if bend is not None and bend.believed:
+        return found
+    return replace(found, untold=untold_by_bend(adjustment, result.state))
 
 
 def _intrinsics(
@@ -213,6 +218,7 @@ def _intrinsics(
     for moved in (
         None if fit.bend is None or not fit.bend.believed else fit.bend.camera,
         None if other is None else other.parameters - fit.camera.parameters,
+        *fit.untold,
     ):
         if moved is not None:
             covariance = covariance + np.outer(moved, moved)
