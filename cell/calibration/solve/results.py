@@ -102,7 +102,7 @@ class ScanCalibration:
             reference,
             bow.sigma * joint.adjusted.inflation,
             bow.gain[:KEPT],
-            (bow.words,) if bow.sigma else (),
+            (*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
