@@ -67,6 +67,7 @@ GROUPS = (
         "test_touch.py",
         "test_confirmed_turn.py",
         "test_quiet.py",
+        "test_unmoved.py",
         "test_timing.py",
         "test_fixed_vehicle.py",
         "test_record.py",
@@ -77,7 +78,7 @@ GROUPS = (
     ("test_board_campaign.py",),
     ("test_calibration_archive.py",),
     ("test_interlocks.py",),
-    ("test_calibration.py",),
+    ("test_calibration.py", "test_board_size.py"),
 )
 """Groups of files in the order in which they begin, the wires first. Other files over the wires end the first one,
 those of `SCREENS` the second; any other is a group of its own, after them."""

@@ -100,6 +100,8 @@ def board_size(board: str, pitch: float, problem: Adjustment, found: Adjusted) -
     left = information + float(right @ follow)
     if not left > 1e-9 * information:
         return BoardSize(board, pitch, 0.0, np.inf, np.zeros(SHARED))
+    # The stripe is weighed in m, by depths that are held still: a smaller board would fit it better by up to so much.
+    pull = normal.groups["stripe"].squares / left
+    scatter = float(np.linalg.norm([found.inflation / np.sqrt(left), ARM_SHARE, pull]))
     share = slope / left
-    scatter = float(np.hypot(found.inflation / np.sqrt(left), ARM_SHARE))
     return BoardSize(board, pitch, share, scatter, share * follow[:SHARED])
