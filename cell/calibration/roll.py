@@ -72,5 +72,5 @@ def roll_of(moved: Array, by_roll: Array) -> Roll:
     (high, low), (high_gain, low_gain) = ([float(np.median(v[end])) for end in ends] for v in (moved, by_roll))
     gain = low_gain - high_gain
     scatter = [1.4826 * float(np.median(np.abs(moved[end] - np.median(moved[end])))) for end in ends]
-    noise = CORRELATED * 1.25 * float(np.hypot(*scatter)) / np.sqrt(third)
+    noise = CORRELATED * 1.25 * float(np.linalg.norm(scatter)) / np.sqrt(third)
     return Roll((low - high) / gain, noise / abs(gain))
