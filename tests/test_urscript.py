@@ -42,10 +42,10 @@ class Controller:
 
     def said(self) -> list[str]:
         """What the program has written for the log."""
-        return [words for kind, words in self.program.announcements if kind == "text"]
+        return [one.words for one in self.program.announcements if one.kind == "text"]
 
     def failed(self) -> list[str]:
-        return [words for kind, words in self.program.announcements if kind == "failed"]
+        return [one.words for one in self.program.announcements if one.kind == "failed"]
 
 
 @pytest.fixture
@@ -195,23 +195,35 @@ end
 
 
 @pytest.mark.parametrize(
-    ("line", "reason"),
+    ("line", "reason", "told"),
     [
-        ("x = ", "'\\n'"),
-        ("launch()", "'launch'"),
-        ("if True", "needed"),
-        ("@", "'@"),
+        ("x = ", "'end'", (3, 1, "syntax_error_on_line:3:end:")),
+        ("launch()", "'launch'", (2, 3, "compile_error_name_not_found:launch:")),
+        ("if True", "needed", (2, 10, "syntax_error_on_line:2:  if True:")),
+        ("@", "'@", (2, 3, "syntax_error_on_line:2:  @:")),
     ],
 )
-def test_a_text_that_does_not_compile_changes_nothing_and_its_line_is_named(
-    controller: Controller, line: str, reason: str
+def test_a_text_that_does_not_compile_changes_nothing_and_clients_hear_what_a_controller_says(
+    controller: Controller, line: str, reason: str, told: tuple[int, int, str]
 ) -> None:
+    """The words and places are those that controllers and URSim were recorded with."""
     controller.program.load(program("while True:", "  sync()", "end"))
     controller.cycles(2)
     controller.program.load(program(line))
     assert controller.program.runtime_state is RuntimeState.PLAYING
-    assert "line 2" in controller.failed()[0] or "line 3" in controller.failed()[0]
-    assert reason.strip("'") in controller.failed()[0] or reason == "'\\n'"
+    (failed,) = [one for one in controller.program.announcements if one.kind == "failed"]
+    assert (failed.line, failed.column, failed.words) == told
+    assert f"line {failed.line}" in controller.program.message and reason in controller.program.message
+
+
+def test_a_run_time_error_names_the_statement_that_brought_it_about(controller: Controller) -> None:
+    lines = ("def half(x):", "  y = 1", "  return y / x", "end", "a = 2", "if a == 3:", "  a = 4", "elif half(0) > 1:")
+    controller.run(program(*lines, "  a = 5", "end"))
+    (failed,) = [one for one in controller.program.announcements if one.kind == "failed"]
+    assert (failed.line, failed.column) == (4, 5) and "division by zero" in failed.words
+    controller.run(program("a = 1", "", "movej(p[10, 0, 0, 0, 0, 0])"))
+    failed = [one for one in controller.program.announcements if one.kind == "failed"][-1]
+    assert (failed.line, failed.column) == (4, 3) and "no solution" in failed.words
 
 
 @pytest.mark.parametrize(
@@ -224,6 +236,7 @@ def test_a_text_that_does_not_compile_changes_nothing_and_its_line_is_named(
         ("get_inverse_kin(p[9, 0, 0, 0, 0, 0])", "no solution"),
         ("write_output_integer_register(48, 1)", "register 48 does not exist"),
         ("movej([0, 0, 0, 0, 0])", "six"),
+        ("movej([-123, 0, 0, 0, 0, 0])", "joint 0 to -123 rad"),
     ],
 )
 def test_a_run_time_error_ends_the_program_and_says_why(controller: Controller, line: str, reason: str) -> None:

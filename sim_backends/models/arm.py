@@ -295,11 +295,14 @@ class ArmModel:
             self._stopped_at = self.time
             self.suspend()
 
-    def unlock(self) -> bool:
-        """Release a protective stop; False while it is younger than `unlock_delay`."""
+    def unlock(self, at_once: bool = False) -> bool:
+        """Release a protective stop; False while it is younger than `unlock_delay`, unless `at_once`.
+
+        The dashboard makes its clients wait; the primary port does not.
+        """
         with self._lock:
             if self.safety is Safety.PROTECTIVE_STOP:
-                if self.time - self._stopped_at < self.params.unlock_delay:
+                if not at_once and self.time - self._stopped_at < self.params.unlock_delay:
                     return False
                 self.safety = Safety.NORMAL
                 self.fault_text = ""

@@ -46,6 +46,10 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
 
     def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
         goal = joints(q)
+        limit = e.context.model.params.joint_limit
+        farthest = int(np.abs(goal).argmax())
+        if abs(goal[farthest]) > limit:
+            raise ProgramError(f"movej: joint {farthest} to {goal[farthest]:.6g} rad, its limit is {limit:.6g} rad")
         length = float(np.abs(goal - e.context.model.drive.q).max())
         yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
 
