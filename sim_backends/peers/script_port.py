@@ -26,10 +26,8 @@ _RUNNING, _OFF = 253, 239
 _TEXT, _POPUP, _VERSION, _SAFETY, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 5, 6, 7, 10
 _WARNING, _VIOLATION = 2, 3
 """Report levels: a protective stop, and an error that ends what its sender wanted."""
-_UNNUMBERED = 0
-"""Error code of the protective stops, whose numbers at the maker's are not known; the text says the reason."""
-_READ_ONLY = 210
-"""Error code of a script that came while the arm was not in remote control."""
+_STOPPED, _READ_ONLY = 209, 210
+"""Error codes: a protective stop was triggered; a script came while the arm was not in remote control."""
 
 
 def version_message(version: tuple[int, int, int, int]) -> bytes:
@@ -50,7 +48,7 @@ def message(kind: str, words: str, time: float, line: int = 0, column: int = 0) 
     if kind == "failed":
         return _message(_EXCEPTION, struct.pack(">ii", line, column) + text, time)
     if kind in ("read-only", "warning"):
-        code, level = (_READ_ONLY, _VIOLATION) if kind == "read-only" else (_UNNUMBERED, _WARNING)
+        code, level = (_READ_ONLY, _VIOLATION) if kind == "read-only" else (_STOPPED, _WARNING)
         return _message(_ERROR, struct.pack(">iiiII", code, 0, level, 0, 0) + text, time)
     title = f"PROGRAM_XXX_{kind.upper()}".encode()
     return _message(_KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text, time)

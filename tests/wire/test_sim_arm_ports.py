@@ -232,7 +232,7 @@ def test_a_protective_stop_is_told_with_a_state_that_shows_it_and_this_port_unlo
             stamp = struct.unpack_from(">Q", package, 5)[0]
             if stopped:
                 warning = next(package for package in heard if package[4] == 20)
-                assert warning[14] == 6 and struct.unpack_from(">i", warning, 23)[0] == 2, "a warning, no violation"
+                assert warning[14] == 6 and struct.unpack_from(">iii", warning, 15) == (209, 0, 2), "C209A0, a warning"
                 assert b"Protective stop" in warning
                 at = stamp
         assert stamp - at < 250_000, "the dashboard of this arm would make us wait 300 ms"

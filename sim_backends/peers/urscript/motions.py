@@ -1,6 +1,7 @@
 """URScript's commands that move the arm: moves, streams, stops and compliance. Source: the maker's script manual.
 
-Blend radii are not modelled: the arm stops at every way point. A circle is two straight lines, by its via point.
+A move that is asked to be faster than the joints can takes longer. Blend radii are not modelled: the arm stops at
+every way point. A circle is two straight lines, by its via point.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     def movel(pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
         goal, here = tool(pose), e.context.model.drive.base_from_tcp()
         length = math.dist(goal[:3, 3], here[:3, 3])
-        yield from e.move(LinearMove(goal, *_timed(length, t, v, a)))
+        yield from e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
 
     def movep(pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
         yield from movel(pose, a, v)
