@@ -18,6 +18,7 @@ from cell.devices.simulated import Simulation
 from cell.devices.stopping import require_healthy, require_no_emergency_stop
 from cell.devices.truth_link import ask_truth
 from cell.job import Job
+from cell.run.pace import Pace
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
 from cell.steps.moves import Mover
@@ -41,6 +42,11 @@ class Opened:
         """What is known of where the vehicle stands."""
         return Whereabouts(self.devices.vehicle)
 
+    @cached_property
+    def pace(self) -> Pace:
+        """How fast work moves arm and vehicle, of what is planned."""
+        return Pace()
+
     @property
     def runs_folder(self) -> Path:
         """Where run folders go."""
@@ -53,7 +59,7 @@ class Opened:
 
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm; with a job, its part is in the claw. `hold` is called before each free motion."""
-        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks)
+        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks, self.pace)
 
     @property
     def world(self) -> dict[str, Any]:

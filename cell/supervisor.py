@@ -161,6 +161,20 @@ class Cell:
         return self._here.whereabouts
 
     @property
+    def pace(self) -> float:
+        """The share of their planned speed at which arm and vehicle move in a run, 0.25 to 1 (see `Pace`).
+
+        Set from any thread, it holds from the next motion on, in this run and all later ones. `ConfigError` for
+        anything else.
+        """
+        return self._here.pace.share
+
+    @pace.setter
+    def pace(self, share: float) -> None:
+        self._here.pace.share = share
+        log.info("arm and vehicle move at %.0f %% of their planned speed from the next motion on", 100 * share)
+
+    @property
     def runs_folder(self) -> Path:
         """Where run folders go."""
         return self._here.runs_folder

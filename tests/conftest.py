@@ -61,6 +61,7 @@ GROUPS = (
         "test_virtual_door.py",
         "test_report.py",
         "test_report_page.py",
+        "test_figures.py",
         "test_end_screen.py",
         "test_direct_devices.py",
         "test_described_jobs.py",

@@ -120,6 +120,32 @@ def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
         slip.require()
 
 
+def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
+    virtual, before, since = cell
+    camera, seen = virtual.scan_camera.model, []
+
+    def lose(after: Callable[[int], bool]) -> Witness:
+        def keep(what: str, frame: Frame) -> None:
+            if what == "witness-edge":
+                seen.append(frame)
+                if after(len(seen)):
+                    camera.fault("camera.frame_loss", 1)
+
+        seen.clear()
+        return require_edge(CONFIG, virtual.devices, keep, before, replace(before, edge=None))
+
+    lose(lambda k: False)
+    undisturbed = len(seen)
+    # The line leaves the plate at the middle of each pass.
+    slip = since(lose(lambda k: k in (undisturbed // 4, undisturbed // 4 + 1)))
+    assert len(seen) > 1.3 * undisturbed, "once more"
+    assert abs(slip.lag) < 3e-3 and abs(slip.along) < 2.5e-5
+    with pytest.raises(
+        RefusedError, match=r"pictures were lost each of the 3 times.*open by \d\.\d+ mm.*then try again"
+    ):
+        lose(lambda k: k % 4 == 0)
+
+
 def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused() -> None:
     axes = np.eye(3)[[1, 2, 0]]
     small, some, far = (Slip(size, 0.0, 0.0) for size in (0.9 * NOTED_M, 1.5 * NOTED_M, 1.1 * LARGEST_M))

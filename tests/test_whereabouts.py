@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_matrix
 from cell.job import Job, load_job
-from cell.steps.approach import Planar, RelativeOdometry, turn_to, wrap
+from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to, wrap
 from cell.steps.drive_to_target import Arrival, drive_to_target
 from cell.steps.photograph import BoardFix
 from cell.steps.way import TURN_DRIFT, Way, distance
@@ -106,9 +107,13 @@ def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(se
 
 
 class LateVehicle:
-    """The simulated vehicle behind a bus that once, at the end of its way unseen, hands on nothing new for a while."""
+    """The simulated vehicle behind a bus that once, at the end of its way unseen, hands on nothing new for a while.
 
-    def __init__(self, cell: VirtualCell, begins: float, lasts: float) -> None:
+    With `looks_new` what it hands on is old, but seems to be of now, as from an adapter that holds it back.
+    """
+
+    def __init__(self, cell: VirtualCell, begins: float, lasts: float, looks_new: bool) -> None:
+        self._looks_new = looks_new
         self._vehicle, self._clock = cell.vehicle, cell.clock
         self._begins, self._until, self._lasts = begins, math.inf, lasts
         self._old: VehicleState | None = None
@@ -120,7 +125,7 @@ class LateVehicle:
         if self._old is None and self._vehicle.state().x >= self._begins:
             self._old, self._until = self._vehicle.state(), self._clock.now() + self._lasts
         if self._old is not None and self._clock.now() < self._until:
-            return self._old
+            return replace(self._old, stamp=self._clock.now()) if self._looks_new else self._old
         state: VehicleState = self._vehicle.state()
         return state
 
@@ -128,7 +133,7 @@ class LateVehicle:
 def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board() -> None:
     site = Site()
     way = moved(Planar.of(JOB.approach.start.se3()), Planar.of(JOB.approach.staging.se3()))
-    site.vehicle = LateVehicle(site.cell, way - 0.05, 0.6)
+    site.vehicle = LateVehicle(site.cell, way - 0.05, 0.6, looks_new=True)
     site.whereabouts = Whereabouts(site.vehicle)
     site.whereabouts.say_at_start()
     seen = site.photograph
@@ -142,6 +147,27 @@ def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_t
     arrival = site.run()
     assert max(abs(arrival.error_along), abs(arrival.error_across)) < JOB.approach.tolerance
     assert ["brought there" in note for note in site.notes] == [True]
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_a_vehicle_stands_where_it_may_have_arrived_until_newer_feedback_tells(seed: int) -> None:
+    site = Site(seed)
+    vehicle = LateVehicle(site.cell, 0.45, 0.6, looks_new=False)
+    site.vehicle.enable()
+    begun, furthest = site.truth(), 0.0
+
+    def look() -> None:
+        nonlocal furthest
+        furthest = max(furthest, moved(begun, site.truth()))
+
+    drive_line(vehicle, RelativeOdometry(vehicle), Planar(0.5, 0.0, 0.0), 0.4, site.cell.clock, look)
+    assert furthest < 0.52, "0.4 m/s for 0.6 s would be 0.24 m"
+    assert moved(begun, site.truth()) == pytest.approx(0.5, abs=0.02), "news come, and it goes the rest"
+    vehicle = LateVehicle(site.cell, -1.0, 0.6, looks_new=False)
+    odometry = RelativeOdometry(vehicle)
+    heading = site.truth().yaw
+    turn_to(vehicle, odometry, 0.1, site.cell.clock, look)
+    assert wrap(site.truth().yaw - heading) == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:

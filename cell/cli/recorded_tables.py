@@ -26,7 +26,7 @@ def print_recorded(result: Mapping[str, Any]) -> None:
     if camera is not None:
         for name in ("fx", "fy", "cx", "cy"):
             values.add_row(f"camera {name}", f"{camera[name]:.3f} ± {camera['sigma_px'][name]:.3f}", "px")
-        for name in ("k1", "k2", "p1", "p2"):
+        for name in ("k1", "k2", "p1", "p2", "k3"):
             values.add_row(f"camera {name}", f"{camera[name]:.5f}", "")
         values.add_row("RMS of the board's points", f"{camera['rms_px']:.4f}", "px")
     if hand is not None:

@@ -51,6 +51,9 @@ def run(
     sim: SimOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
+    pace: Annotated[
+        float, typer.Option("--pace", help="Arm and vehicle at this share of their planned speed, 0.25 to 1.")
+    ] = 1.0,
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
@@ -58,11 +61,14 @@ def run(
 
     The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
     """
+    from cell.run.pace import require_share
     from cell.supervisor import Cell
 
     def perform(cell: Cell, display: Observer) -> RunOutcome:
+        cell.pace = pace
         return cell.run(job, display, at_start=at_start, until=until)
 
+    require_share(pace)
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
     _perform(opened, perform, json, noise)
 

@@ -80,6 +80,7 @@ class Desk:
             "manual": self._manual,
             "jog_step": self._jog_step,
             "speed": self._speed,
+            "pace": self._pace,
         }
 
     # --- clients ---
@@ -268,6 +269,10 @@ class Desk:
             raise ConfigError(f"speed {fraction!r}: allowed are {LEAST_SPEED:g} to 1")
         self.manual.speed = float(fraction)
         return f"held buttons move at {100 * fraction:.0f} %"
+
+    def _pace(self, client: str, words: Words) -> str:
+        self.cell.pace = words.get("share", 0.0)
+        return f"arm and vehicle move at {100 * self.cell.pace:.0f} % of their planned speed, from the next motion on"
 
     def _diag(self) -> Answer:
         if self.cell.current is not None:

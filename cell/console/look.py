@@ -103,7 +103,7 @@ class Look:
             "last": desk.told(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
-            "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed,
+            "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
             "dry_run": desk.rehearsals.present, "behind": 0,
         }  # fmt: skip
 

@@ -58,6 +58,10 @@ class Trajectory:
         """Joint angles (6,) at a time in s, linear between samples, held beyond the ends."""
         return np.array([np.interp(time, self.times, column) for column in self.joints.T])
 
+    def at_pace(self, share: float) -> Trajectory:
+        """The same way at this share, up to 1, of its speed."""
+        return Trajectory(self.times / share, self.joints)
+
     def speeds(self) -> NDArray[np.float64]:
         """(n - 1, 6) mean joint speeds between samples, rad/s."""
         return np.asarray(np.diff(self.joints, axis=0) / np.diff(self.times)[:, None])

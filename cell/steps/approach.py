@@ -26,6 +26,7 @@ TURN_GAIN = 1.5  # 1/s
 MAX_HEADING = math.radians(25)
 MAX_TURN_RATE = math.radians(25)
 ARRIVED = 0.0005  # m
+FRESH_S = 0.1  # s on the wall; feedback up to this old says whether the vehicle is there, it comes every 0.02 s
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,25 @@ class RelativeOdometry:
         return self._start_from_odometry * _reading(self._vehicle.state())
 
 
+class _SinceNews:
+    """How far a vehicle has gone, by its commands, since the feedback that odometry tells of."""
+
+    def __init__(self, vehicle: Vehicle, clock: Clock) -> None:
+        self._vehicle, self._clock = vehicle, clock
+        self._stamp, self._looked, self._gone = -math.inf, 0.0, Planar(0.0, 0.0, 0.0)
+
+    def look(self, speed: float, yaw_rate: float) -> tuple[Planar, bool]:
+        """The way gone since then, of it at `speed` and `yaw_rate` since the last look, and whether the news are so
+        fresh that they say whether it is there."""
+        now, stamp = self._clock.now(), self._vehicle.state().stamp
+        if stamp != self._stamp:
+            self._stamp, self._gone = stamp, Planar(0.0, 0.0, 0.0)
+        else:
+            self._gone *= Planar(speed * (now - self._looked), 0.0, yaw_rate * (now - self._looked))
+        self._looked = now
+        return self._gone, now - stamp <= FRESH_S * max(1.0, self._clock.rate)
+
+
 def _reading(state: VehicleState) -> Planar:
     return Planar(state.x, state.y, state.yaw)
 
@@ -103,16 +123,24 @@ def _reading(state: VehicleState) -> Planar:
 def drive_line(
     vehicle: Vehicle, odometry: Located, goal: Planar, speed: float, clock: Clock, check: Callable[[], None]
 ) -> None:
-    """Drive along the goal's line and stop at the goal, on odometry. `check` raises when the run is to end."""
+    """Drive along the goal's line and stop at the goal, on odometry. `check` raises when the run is to end.
+
+    Feedback that comes late finds the vehicle further on: it slows down for that, and stands where it may have arrived
+    until newer feedback tells.
+    """
     distance = abs((goal.inverse() * odometry.pose()).x)
     deadline = clock.now() + 10.0 + 3.0 * (distance / speed + speed / DECELERATION + 0.1 / CREEP)
-    direction = 0.0
+    since_news = _SinceNews(vehicle, clock)
+    direction = v = w = 0.0
     while True:
         check()
-        v, w = line_command(odometry.pose(), goal, speed)
+        gone, fresh = since_news.look(v, w)
+        v, w = line_command(odometry.pose() * gone, goal, speed)
         if v == 0.0 or direction * v < 0:  # there, or just past it
-            break
-        direction = v
+            if fresh:
+                break
+            v = w = 0.0
+        direction = v or direction
         if clock.now() > deadline:
             vehicle.stop()
             raise _blocked(f"did not arrive at x = {goal.x:.3f} m in time")
@@ -135,12 +163,20 @@ def _blocked(what: str) -> DeviceFault:
 def turn_to(vehicle: Vehicle, odometry: Located, yaw: float, clock: Clock, check: Callable[[], None]) -> None:
     """Turn on the spot to `yaw` in the place frame, on odometry, to 0.1°."""
     deadline = clock.now() + 20.0
-    while abs(error := wrap(yaw - odometry.pose().yaw)) > math.radians(0.1):
+    since_news, rate = _SinceNews(vehicle, clock), 0.0
+    while True:
         check()
+        gone, fresh = since_news.look(0.0, rate)
+        error = wrap(yaw - odometry.pose().yaw - gone.yaw)
+        there = abs(error) <= math.radians(0.1)
+        if there and fresh:
+            break
         if clock.now() > deadline:
             vehicle.stop()
             raise _blocked(f"did not turn by {math.degrees(error):.2f} deg in time")
-        rate = math.copysign(max(math.radians(0.6), min(MAX_TURN_RATE, TURN_GAIN * abs(error))), error)
+        rate = (
+            0.0 if there else math.copysign(max(math.radians(0.6), min(MAX_TURN_RATE, TURN_GAIN * abs(error))), error)
+        )
         vehicle.drive(0.0, rate)
         clock.sleep(CONTROL_PERIOD_S)
     vehicle.stop()

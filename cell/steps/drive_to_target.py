@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from cell.job import Job
 from cell.motion.bodies import Body
+from cell.run.pace import Pace
 from cell.steps.approach import Planar, drive_line, turn_to
 from cell.steps.camera_poses import look_pose
 from cell.steps.moves import HOME
@@ -78,6 +79,7 @@ def drive_to_target(
     note: Callable[[str], None],
     hold: Callable[[], None] = lambda: None,
     carried: Sequence[Body] = (),
+    pace: Pace | None = None,
 ) -> Arrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
@@ -85,7 +87,8 @@ def drive_to_target(
     staging pose, and only when `whereabouts` knows where it stands. `photograph` gives the board in the base; `check`
     raises when the run is to end; `note` takes what is worth keeping; `hold` is called before
     each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and part as they stand, in the
-    arm base, which are kept off the station as the vehicle itself is.
+    arm base, which are kept off the station as the vehicle itself is. `pace` says how fast each way is driven, of the
+    job's `approach.speed`.
     Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
     close to the station, and when the tolerance is not met after five tries.
     """
@@ -125,7 +128,8 @@ def drive_to_target(
         sent = goal
         hold()
         way.require_line(goal)
-        drive_line(vehicle, whereabouts, goal, approach.speed, clock, check)
+        speed = approach.speed * (1.0 if pace is None else pace.share)
+        drive_line(vehicle, whereabouts, goal, speed, clock, check)
 
     approach = job.approach
     staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
@@ -245,6 +249,7 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
         lambda text: context.note(text=text),
         context.safe_point,
         here.mover.solids(),
+        here.mover.pace,
     )
 
 

@@ -28,6 +28,7 @@ from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from cell.obstacles import station_obstacles, vehicle_obstacles
+from cell.run.pace import Pace
 from cell.steps.camera_poses import centre_of
 from cell.vision import BoardSpec, parse_board
 from drivers.clock import Clock
@@ -49,7 +50,8 @@ class Mover:
     """Moves one arm among the bodies that are known so far. Used by one thread at a time.
 
     `hold` is called before each free motion, at a moment when nothing moves: a paused run waits in it. `interlocks` are
-    told of the part and of the station, so that moves that nobody planned are checked against them as well.
+    told of the part and of the station, so that moves that nobody planned are checked against them as well. `pace` says
+    how fast, of what is planned.
     """
 
     def __init__(
@@ -60,8 +62,10 @@ class Mover:
         job: Job | None,
         hold: Callable[[], None] = lambda: None,
         interlocks: Interlocks | None = None,
+        pace: Pace | None = None,
     ) -> None:
         self.hold = hold
+        self.pace = pace or Pace()
         self._arm = arm
         self._clock = clock
         self._settle_time = config.arm.settle_time
@@ -133,7 +137,7 @@ class Mover:
     def plan_to(self, base_from_flange: pin.SE3, what: str) -> Trajectory:
         """A free motion to a flange pose; raises `Unreachable` or `CollisionError` before anything moves."""
         start = self.joints
-        return self._planner.free(start, self._planner.reach(base_from_flange, start, what))
+        return self._planner.free(start, self._planner.reach(base_from_flange, start, what)).at_pace(self.pace.share)
 
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose and settle."""
@@ -144,14 +148,15 @@ class Mover:
         """Move freely to joint angles and settle."""
         self.hold()
         start = self.joints
-        self.follow(self._planner.free(start, joints, self._leaving(start)))
+        self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
 
     def line(
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None
     ) -> bool:
         """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
         limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
-        return self.follow(self._planner.line(self.joints, base_from_flange, limits, allowed), force_limit)
+        line = self._planner.line(self.joints, base_from_flange, limits, allowed)
+        return self.follow(line.at_pace(self.pace.share), force_limit)
 
     def plan_line(
         self, base_from_start: pin.SE3, base_from_end: pin.SE3, speed: float

@@ -19,6 +19,7 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     # Who does not hold the cell can do one thing alone.
     assert screen.page.locator("#start").is_disabled()
     assert screen.page.locator("#manual").is_disabled()
+    assert screen.page.locator("#pace").is_disabled()
     assert screen.page.locator("#stop").is_enabled()
     assert "not an emergency stop" in screen.page.inner_text("#stop")
     screen.hold()
@@ -31,6 +32,11 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     screen.shows("run-title", "paus")
     screen.page.click("#go-on")
     watcher.until(lambda state: state["run"]["state"] == "running")
+    screen.page.fill("#pace", "50")
+    watcher.until(lambda state: state["pace"] == 0.5)
+    screen.shows("pace-said", "50 %")
+    screen.page.fill("#pace", "100")
+    watcher.until(lambda state: state["pace"] == 1.0)
     screen.page.click("#stop")
     ended = watcher.until(idle)
     screen.shows("stop-said", "was carried out")
@@ -67,3 +73,29 @@ def test_a_page_that_hangs_while_a_button_is_held_stops_the_arm(screen: Screen, 
     assert joint(watcher.state) == pytest.approx(stood, abs=1e-4)
     screen.page.mouse.up()
     leave(screen, watcher)
+
+
+def test_a_point_has_the_colour_of_its_deviation_and_another_one_on_another_scale(screen: Screen) -> None:
+    colours = screen.page.evaluate(
+        """async () => {
+            const { Cloud } = await import(new URL('cloud.js', document.querySelector('script[type=module]').src));
+            const cloud = new Cloud(() => {});
+            cloud.add(new Float32Array([-0.2, 0, 0.2, 0.1, 0.9, NaN].flatMap((off) => [0, 0, 0, off])));
+            const of = (k) => Array.from(cloud.color.array.slice(3 * k, 3 * k + 3));
+            const seen = () => Array.from({ length: cloud.count }, (_, k) => of(k));
+            const fine = seen();
+            cloud.scale(0.4);
+            return [fine, seen()];
+        }"""
+    )
+    fine, wide = colours
+    blue, middle, red = fine[0], fine[1], fine[2]
+    assert blue[2] > 0.7 > 0.2 > blue[0]
+    assert red[0] > 0.7 > 0.2 > red[2]
+    assert max(middle) - min(middle) < 0.1
+    assert fine[4] == red, "what is beyond the scale has the colour of its end"
+    # Half of the way to the end: between the colours beside it.
+    assert wide[0] == pytest.approx([0.35, 0.7, 0.95]) and wide[2] == pytest.approx([0.98, 0.65, 0.3])
+    assert wide[1] == middle and wide[5] == fine[5], "zero and unknown are the same on every scale"
+    assert fine[5] not in (blue, middle, red)
+    assert fine[3] == wide[2]

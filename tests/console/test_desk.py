@@ -69,6 +69,8 @@ def test_one_holds_the_others_see(desk: Desk) -> None:
         ({"do": "clear_stop", "by": " "}, ConfigError),
         ({"do": "speed", "fraction": 2}, ConfigError),
         ({"do": "speed", "fraction": float("nan")}, ConfigError),
+        ({"do": "pace", "share": 0.1}, ConfigError),
+        ({"do": "pace"}, ConfigError),
         ({"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.001}, InterlockError),
         ({"do": "dry_run", "seed": -1}, ConfigError),
     ],

@@ -27,6 +27,7 @@ WORST_FIT = 1.6
 """Residuals larger than this many times the calibration's own have another cause than a moved part."""
 DRAWS = 8_000
 LEAST_PROBABILITY = 0.1
+LENS = PARAMETERS[:9]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,16 +158,17 @@ def _figures(name: str, weighed: Evidence, state: State) -> list[Figure]:
 
 
 def _named(change: Array) -> dict[str, float]:
-    """The parameters that change, px or relative as they are, m as mm and rad as mrad."""
-    made = {}
-    for k, name in enumerate(PARAMETERS):
-        if change[k] == 0.0:
-            continue
-        plain = name[0] in "fck"
-        unit = "" if plain else "_per_mille" if name.startswith("rail") else "_mrad" if _angle(name) else "_mm"
-        made[name.replace(" ", "_") + (unit or "_px")] = round(float(change[k]) * (1.0 if plain else 1e3), 4)
-    return made
+    """The parameters that change with their units: the lens' in px or none, m as mm, rad as mrad."""
+    return {
+        name.replace(" ", "_") + _unit(name): round(float(change[k]) * (1.0 if name in LENS else 1e3), 4)
+        for k, name in enumerate(PARAMETERS)
+        if change[k] != 0.0
+    }
 
 
-def _angle(name: str) -> bool:
-    return "tilt" in name or name.split()[-1] in ("rx", "ry", "rz")
+def _unit(name: str) -> str:
+    if name in LENS:
+        return "_px" if name[0] in "fc" else ""
+    if name.startswith("rail"):
+        return "_per_mille"
+    return "_mrad" if "tilt" in name or name.split()[-1] in ("rx", "ry", "rz") else "_mm"

@@ -11,6 +11,8 @@ export class Sequence {
     this.ask = ask;
     byId('pause').onclick = () => ask('pause');
     byId('go-on').onclick = () => ask('go_on');
+    byId('pace').oninput = () => say(byId('pace-said'), `${byId('pace').value} %`);
+    byId('pace').onchange = () => ask('pace', { share: byId('pace').value / 100 });
     byId('abort').onclick = () => ask('abort', { reason: 'a person at the screen' });
     byId('start-form').onsubmit = (event) => {
       event.preventDefault();
@@ -42,7 +44,7 @@ export class Sequence {
     byId('until').replaceChildren(el('option', { value: '', textContent: 'the end' }), ...until);
   }
 
-  state({ run, last, dry_run: dry }, mine) {
+  state({ run, last, pace, dry_run: dry }, mine) {
     const paused = run !== null && ['pausing', 'paused'].includes(run.state);
     say(byId('run-title'), run ? `${words(run.kind)} ${run.job ?? ''}`.trim() + this.mood(run) : 'No run');
     say(byId('run-text'), run ? this.now(run) : this.ended(last));
@@ -56,6 +58,11 @@ export class Sequence {
     byId('pause').disabled = !mine || paused;
     byId('go-on').disabled = !mine || !paused;
     byId('abort').disabled = !mine;
+    byId('pace').disabled = !mine;
+    if (document.activeElement !== byId('pace')) {
+      byId('pace').value = Math.round(100 * pace);
+      say(byId('pace-said'), `${Math.round(100 * pace)} %`);
+    }
     byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine; });
     if (dry?.state === 'running') byId('dry-run').disabled = true;
     this.dry(dry ?? null);
