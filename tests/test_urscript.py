@@ -282,6 +282,51 @@ def test_a_line_that_is_asked_for_in_less_time_than_the_joints_need_takes_longer
     np.testing.assert_allclose(model.drive.base_from_tcp(), goal, atol=1e-6)
 
 
+@pytest.mark.parametrize("mode", [0, 1])
+def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Controller, mode: int) -> None:
+    """Three quarters of a circle of 50 mm round a centre below the tool, in a plane that leans."""
+    model = controller.model
+    start = model.drive.base_from_tcp()
+    across, down = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, -1.0])
+    centre = start[:3, 3] + 0.05 * down
+
+    def on_circle(angle: float) -> str:
+        x, y, z = centre + 0.05 * (math.sin(angle) * across - math.cos(angle) * down)
+        rotation = Rotation.from_matrix(start[:3, :3]).as_rotvec()
+        return f"p[{x}, {y}, {z}, {', '.join(map(str, rotation))}]"
+
+    quarter = 0.5 * math.pi
+    controller.program.load(program(f"movec({on_circle(quarter)}, {on_circle(3 * quarter)}, a=2, v=0.1, mode={mode})"))
+    angles, off = [], []
+    for cycle in range(4000):
+        if cycle == 1000:
+            controller.program.pause()
+        if cycle == 1500:
+            assert controller.program.play()
+        if controller.program.runtime_state is RuntimeState.STOPPED:
+            break
+        controller.cycles(1)
+        here = model.drive.base_from_tcp()[:3, 3] - centre
+        angles.append(math.atan2(across @ here, -down @ here) % (2 * math.pi))
+        off.append(max(abs(np.linalg.norm(here) - 0.05), abs(np.cross(across, down) @ here)))
+    assert controller.failed() == [] and model.fault_text == ""
+    assert max(off) < 1e-3 and max(off[:1000]) < 1e-6, "off the circle only where it was stopped"
+    assert angles[-1] == pytest.approx(3 * quarter, abs=1e-6)
+    assert np.diff(np.unwrap(angles)).min() > -1e-4, "never back to the via point"
+    turned = Rotation.from_matrix(start[:3, :3].T @ model.drive.base_from_tcp()[:3, :3]).magnitude()
+    assert turned == pytest.approx(quarter if mode else 0.0, abs=2e-2 if mode else 1e-6)
+
+
+def test_points_of_a_circle_on_a_line_stop_the_arm(controller: Controller) -> None:
+    line = (
+        "here = get_actual_tcp_pose()",
+        "movec(pose_add(here, p[0,0,-0.05,0,0,0]), pose_add(here, p[0,0,-0.1,0,0,0]))",
+    )
+    controller.program.load(program(*line))
+    controller.cycles(20)
+    assert "lie on a line" in controller.model.fault_text
+
+
 def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller) -> None:
     controller.program.load(program("speedj([0.2, 0, 0, 0, 0, 0], 2.0, 0.3)", "sleep(1)"))
     controller.cycles(150)

@@ -141,6 +141,7 @@ class LinearMove(Motion):
     """
 
     from_rest = True
+    shape = "straight line"
 
     def __init__(self, target: Matrix, speed: float, acceleration: float, slows: bool = False) -> None:
         self._target = target
@@ -175,13 +176,17 @@ class LinearMove(Motion):
         """The joint angles at `time` of the profile, `dt` from now."""
         distance, _ = self._profile.at(time)
         fraction = distance / self._profile.length if self._profile.length > 0 else 1.0
+        q = drive.kinematics.refine(self._pose(fraction).dot(self._tcp_from_flange), drive.q + dt * drive.qd)
+        if q is None:
+            raise MotionError(f"the {self.shape} leaves the reach of the arm or passes a singularity")
+        return q
+
+    def _pose(self, fraction: float) -> Matrix:
+        """Tool pose (4, 4) after this much of the way."""
         pose = np.eye(4)
         pose[:3, :3] = rotation_matrix(self._turn * fraction).dot(self._start[:3, :3])
         pose[:3, 3] = self._start[:3, 3] + self._way * fraction
-        q = drive.kinematics.refine(pose.dot(self._tcp_from_flange), drive.q + dt * drive.qd)
-        if q is None:
-            raise MotionError("the straight line leaves the reach of the arm or passes a singularity")
-        return q
+        return pose
 
 
 class Stop(Motion):

@@ -19,8 +19,11 @@ _STATE, _MESSAGE = 16, 20
 _LINEARISED = 2
 """The status of an arm that was calibrated in the factory."""
 _PROJECT, _BUILT = b"URControl", b"10-11-2023, 00:00:00"
-_MODELS = {"UR5e": 1, "UR10e": 2, "UR3e": 3, "UR16e": 4, "UR20": 7, "UR30": 8, "UR15": 9}
-"""The controller's numbers of the models."""
+_MODELS = {
+    **dict.fromkeys(("UR5", "UR5e", "UR7e"), 1), **dict.fromkeys(("UR10", "UR10e", "UR12e"), 2),
+    **dict.fromkeys(("UR3", "UR3e"), 3), "UR16e": 4, "UR20": 7, "UR30": 8,
+}  # fmt: skip
+"""The controller's numbers of the models; the newer names of a model have its number."""
 _RUNNING, _OFF = 253, 239
 """What joints and tool say of themselves."""
 _TEXT, _POPUP, _VERSION, _SAFETY, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 5, 6, 7, 10
@@ -130,7 +133,7 @@ def _configuration(model: ArmModel) -> bytes:
     motion = np.column_stack((params.speed_limits, np.full(6, 40.0))).ravel()
     a, d, alpha, theta = TABLES[params.model].T
     numbers = (*limits, *motion, 1.05, 1.4, 0.25, 1.2, 0.25, *a, *d, *alpha, *theta)
-    return _part(6, struct.pack(">53d4i", *numbers, 3, 0, _MODELS.get(params.model, 0), 1))
+    return _part(6, struct.pack(">53d4i", *numbers, 3, 0, _MODELS[params.model], 1))
 
 
 def _part(kind: int, content: bytes) -> bytes:
