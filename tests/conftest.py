@@ -34,6 +34,7 @@ GROUPS = (
         "wire/test_other_module.py",
         "wire/test_other_vehicle.py",
         "wire/test_other_drives.py",
+        "wire/test_other_master.py",
         "wire/test_canopen_contract.py",
         "test_canopen_vehicle.py",
         "wire/test_sim_rail.py",
