@@ -34,6 +34,7 @@ GROUPS = (
         "wire/test_other_module.py",
         "wire/test_other_vehicle.py",
         "wire/test_other_drives.py",
+        "wire/test_other_master.py",
         "wire/test_canopen_contract.py",
         "test_canopen_vehicle.py",
         "wire/test_sim_rail.py",
@@ -68,6 +69,7 @@ GROUPS = (
         "test_touch.py",
         "test_confirmed_turn.py",
         "test_quiet.py",
+        "test_unmoved.py",
         "test_timing.py",
         "test_fixed_vehicle.py",
         "test_record.py",
@@ -78,7 +80,7 @@ GROUPS = (
     ("test_board_campaign.py",),
     ("test_calibration_archive.py",),
     ("test_interlocks.py",),
-    ("test_calibration.py",),
+    ("test_calibration.py", "test_board_size.py"),
 )
 """Groups of files in the order in which they begin, the wires first. Other files over the wires end the first one,
 those of `SCREENS` the second; any other is a group of its own, after them."""

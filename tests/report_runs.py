@@ -18,11 +18,12 @@ from typing import Any
 from cell.config import CellConfig, load_config
 from cell.devices.direct import VirtualCell
 from cell.devices.truth_link import ask_truth
+from cell.geometry.poses import from_parts
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
 from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
-from cell.report.truth import Witness
+from cell.report.truth import Witness, pose_of
 from cell.run.folder import new_run
 from cell.run.frames import FrameStore
 from cell.run.job_run import classify
@@ -71,11 +72,22 @@ def work_of(
     return Workplace(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
 
 
+def at_station(cell: VirtualCell, record: JobRecord, further: float = 0.0) -> None:
+    """Put the vehicle where it stood at the end of `record`, and so many metres further."""
+    assert record.at_end is not None
+    stood, vehicle = pose_of(record.at_end, "world_from_vehicle"), cell.world.vehicle
+    way = stood.rotation[:, 0]
+    vehicle._x, vehicle._y = (float(v) for v in (stood.translation + further * way)[:2])
+    vehicle._yaw = math.atan2(way[1], way[0])
+
+
 def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root: Path) -> Ended:
     """A run on a cell just started that did the steps before `step` as in `record` and then this one, by itself."""
     assert record.calibration is not None
     folder = new_run(root)
     cell = VirtualCell(CONFIG, record.seed, record.level)
+    if step == "place":
+        at_station(cell, record)
     cell.devices.vehicle.brake()
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     with FrameStore(folder / "frames") as frames:
@@ -239,9 +251,11 @@ def too_strict(record: JobRecord, root: Path) -> Ended:
 
 
 def no_contact(record: JobRecord, root: Path) -> Ended:
-    """There is nothing under the part where the surface was: the vehicle stands elsewhere."""
+    """There is nothing under the part where the scan has the surface."""
     job, nominal = pot()
-    return tried(record, job, nominal, "place", root)
+    pose = record.results["invert_pose"]
+    higher = replace(pose, base_from_surface=pose.base_from_surface * from_parts((0.0, 0.0, 0.005)))
+    return tried(replace(record, results={**record.results, "invert_pose": higher}), job, nominal, "place", root)
 
 
 def faulted(record: JobRecord, root: Path) -> Ended:

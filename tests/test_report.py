@@ -37,7 +37,7 @@ REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
     (report_runs.few_points, "reconstruct", "points of the cloud", False, True),
     (report_runs.other_surface, "invert_pose", "points over the surface that fit it", False, False),
     (report_runs.too_strict, "invert_pose", "3σ in tolerances: translation along the z axis", False, False),
-    (report_runs.no_contact, "place", None, False, False),
+    (report_runs.no_contact, "place", None, True, False),
 ]
 
 

@@ -127,6 +127,29 @@ def test_a_joint_move_keeps_every_joint_within_its_speed_limit() -> None:
     assert fastest[0] == pytest.approx(math.radians(120), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "fastest"),
+    [
+        ("UR3e", (180, 180, 180, 360, 360, 360)),
+        ("UR5e", (180, 180, 180, 180, 180, 180)),
+        ("UR10e", (120, 120, 180, 180, 180, 180)),
+        ("UR30", (120, 120, 150, 210, 210, 210)),
+    ],
+)
+def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]) -> None:
+    for joint, limit in enumerate(fastest):
+        model = ArmModel(ArmParams.of(name), np.random.default_rng(3), WorldClock())
+        goal = model.drive.q.copy()
+        goal[joint] += 1.5
+        model.start(JointMove(goal, 100.0, 1000.0))
+        seen = 0.0
+        for step in range(1, 1000):
+            model.tick(0.002 * step)
+            seen = max(seen, abs(float(model.drive.qd[joint])))
+        assert math.degrees(seen) == pytest.approx(limit)
+        assert model.safety is Safety.NORMAL and model.idle
+
+
 def test_a_linear_move_keeps_to_the_line_at_its_speed() -> None:
     arm = make_arm()
     start = arm.reported_flange()

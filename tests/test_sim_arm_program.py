@@ -9,9 +9,10 @@ import pytest
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.rtde_registers import Registers
 from sim_backends.peers.script import ControlProgram, RuntimeState
-from sim_backends.peers.script_port import robot_mode, version_message
+from sim_backends.peers.script_port import robot_mode, robot_state, version_message
 
 TICK = 0.002
 GOAL = [1.0, -1.57, -1.57, -1.57, 1.57, 0.0]
@@ -203,6 +204,21 @@ def test_the_secondary_port_greets_with_packages_as_the_maker_describes_them(con
     assert struct.unpack_from(">IB", mode, 5) == (len(mode) - 5, 0)
     assert list(mode[18:25]) == [1, 1, 1, 0, 0, 1, 0], "powered, no stop, a program runs"
     assert mode[25] == 7
+
+
+def test_every_model_tells_its_number() -> None:
+    """UR7e and UR12e are told as what they were called before."""
+    told = {}
+    for name in TABLES:
+        state = robot_state(ArmModel(ArmParams.of(name), np.random.default_rng(1), WorldClock()), 1, [0.0, 0.0])
+        at = 5
+        while state[at + 4] != 6:
+            at += struct.unpack_from(">I", state, at)[0]
+        told[name] = struct.unpack_from(">i", state, at + 445 - 8)[0]
+    assert told == {
+        "UR3": 3, "UR3e": 3, "UR5": 1, "UR5e": 1, "UR7e": 1, "UR10": 2, "UR10e": 2, "UR12e": 2, "UR16e": 4, "UR20": 7,
+        "UR30": 8,
+    }  # fmt: skip
 
 
 def test_a_ur5e_stands_where_its_makers_table_says() -> None:

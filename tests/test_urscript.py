@@ -42,10 +42,10 @@ class Controller:
 
     def said(self) -> list[str]:
         """What the program has written for the log."""
-        return [words for kind, words in self.program.announcements if kind == "text"]
+        return [one.words for one in self.program.announcements if one.kind == "text"]
 
     def failed(self) -> list[str]:
-        return [words for kind, words in self.program.announcements if kind == "failed"]
+        return [one.words for one in self.program.announcements if one.kind == "failed"]
 
 
 @pytest.fixture
@@ -195,23 +195,35 @@ end
 
 
 @pytest.mark.parametrize(
-    ("line", "reason"),
+    ("line", "reason", "told"),
     [
-        ("x = ", "'\\n'"),
-        ("launch()", "'launch'"),
-        ("if True", "needed"),
-        ("@", "'@"),
+        ("x = ", "'end'", (3, 1, "syntax_error_on_line:3:end:")),
+        ("launch()", "'launch'", (2, 3, "compile_error_name_not_found:launch:")),
+        ("if True", "needed", (2, 10, "syntax_error_on_line:2:  if True:")),
+        ("@", "'@", (2, 3, "syntax_error_on_line:2:  @:")),
     ],
 )
-def test_a_text_that_does_not_compile_changes_nothing_and_its_line_is_named(
-    controller: Controller, line: str, reason: str
+def test_a_text_that_does_not_compile_changes_nothing_and_clients_hear_what_a_controller_says(
+    controller: Controller, line: str, reason: str, told: tuple[int, int, str]
 ) -> None:
+    """The words and places are those that controllers and URSim were recorded with."""
     controller.program.load(program("while True:", "  sync()", "end"))
     controller.cycles(2)
     controller.program.load(program(line))
     assert controller.program.runtime_state is RuntimeState.PLAYING
-    assert "line 2" in controller.failed()[0] or "line 3" in controller.failed()[0]
-    assert reason.strip("'") in controller.failed()[0] or reason == "'\\n'"
+    (failed,) = [one for one in controller.program.announcements if one.kind == "failed"]
+    assert (failed.line, failed.column, failed.words) == told
+    assert f"line {failed.line}" in controller.program.message and reason in controller.program.message
+
+
+def test_a_run_time_error_names_the_statement_that_brought_it_about(controller: Controller) -> None:
+    lines = ("def half(x):", "  y = 1", "  return y / x", "end", "a = 2", "if a == 3:", "  a = 4", "elif half(0) > 1:")
+    controller.run(program(*lines, "  a = 5", "end"))
+    (failed,) = [one for one in controller.program.announcements if one.kind == "failed"]
+    assert (failed.line, failed.column) == (4, 5) and "division by zero" in failed.words
+    controller.run(program("a = 1", "", "movej(p[10, 0, 0, 0, 0, 0])"))
+    failed = [one for one in controller.program.announcements if one.kind == "failed"][-1]
+    assert (failed.line, failed.column) == (4, 3) and "no solution" in failed.words
 
 
 @pytest.mark.parametrize(
@@ -224,6 +236,7 @@ def test_a_text_that_does_not_compile_changes_nothing_and_its_line_is_named(
         ("get_inverse_kin(p[9, 0, 0, 0, 0, 0])", "no solution"),
         ("write_output_integer_register(48, 1)", "register 48 does not exist"),
         ("movej([0, 0, 0, 0, 0])", "six"),
+        ("movej([-123, 0, 0, 0, 0, 0])", "joint 0 to -123 rad"),
     ],
 )
 def test_a_run_time_error_ends_the_program_and_says_why(controller: Controller, line: str, reason: str) -> None:
@@ -250,6 +263,68 @@ def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None
     controller.run(program("movel(pose_add(get_actual_tcp_pose(), p[0, 0, -0.05, 0, 0, 0]), v=0.1)"))
     way = controller.model.drive.base_from_tcp()[:3, 3] - before[:3, 3]
     np.testing.assert_allclose(way, [0, 0, -0.05], atol=1e-6)
+
+
+def test_a_line_that_is_asked_for_in_less_time_than_the_joints_need_takes_longer(controller: Controller) -> None:
+    model = controller.model
+    limits = np.array(model.params.speed_limits)
+    goal = model.drive.base_from_tcp()
+    goal[:3, 3] += (0.0, 0.2, -0.2)
+    controller.program.load(program("movel(pose_add(get_actual_tcp_pose(), p[0, 0.2, -0.2, 0, 0, 0]), t=0.05)"))
+    fastest, cycles = np.zeros(6), 0
+    while controller.program.runtime_state is not RuntimeState.STOPPED:
+        controller.cycles(1)
+        cycles += 1
+        fastest = np.maximum(fastest, np.abs(model.drive.qd) / limits)
+    assert model.fault_text == "" and controller.failed() == []
+    assert 0.95 < fastest.max() <= 1.0, "as fast as the joints can"
+    assert 30 < cycles < 500
+    np.testing.assert_allclose(model.drive.base_from_tcp(), goal, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [0, 1])
+def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Controller, mode: int) -> None:
+    """Three quarters of a circle of 50 mm round a centre below the tool, in a plane that leans."""
+    model = controller.model
+    start = model.drive.base_from_tcp()
+    across, down = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, -1.0])
+    centre = start[:3, 3] + 0.05 * down
+
+    def on_circle(angle: float) -> str:
+        x, y, z = centre + 0.05 * (math.sin(angle) * across - math.cos(angle) * down)
+        rotation = Rotation.from_matrix(start[:3, :3]).as_rotvec()
+        return f"p[{x}, {y}, {z}, {', '.join(map(str, rotation))}]"
+
+    quarter = 0.5 * math.pi
+    controller.program.load(program(f"movec({on_circle(quarter)}, {on_circle(3 * quarter)}, a=2, v=0.1, mode={mode})"))
+    angles, off = [], []
+    for cycle in range(4000):
+        if cycle == 1000:
+            controller.program.pause()
+        if cycle == 1500:
+            assert controller.program.play()
+        if controller.program.runtime_state is RuntimeState.STOPPED:
+            break
+        controller.cycles(1)
+        here = model.drive.base_from_tcp()[:3, 3] - centre
+        angles.append(math.atan2(across @ here, -down @ here) % (2 * math.pi))
+        off.append(max(abs(np.linalg.norm(here) - 0.05), abs(np.cross(across, down) @ here)))
+    assert controller.failed() == [] and model.fault_text == ""
+    assert max(off) < 1e-3 and max(off[:1000]) < 1e-6, "off the circle only where it was stopped"
+    assert angles[-1] == pytest.approx(3 * quarter, abs=1e-6)
+    assert np.diff(np.unwrap(angles)).min() > -1e-4, "never back to the via point"
+    turned = Rotation.from_matrix(start[:3, :3].T @ model.drive.base_from_tcp()[:3, :3]).magnitude()
+    assert turned == pytest.approx(quarter if mode else 0.0, abs=2e-2 if mode else 1e-6)
+
+
+def test_points_of_a_circle_on_a_line_stop_the_arm(controller: Controller) -> None:
+    line = (
+        "here = get_actual_tcp_pose()",
+        "movec(pose_add(here, p[0,0,-0.05,0,0,0]), pose_add(here, p[0,0,-0.1,0,0,0]))",
+    )
+    controller.program.load(program(*line))
+    controller.cycles(20)
+    assert "lie on a line" in controller.model.fault_text
 
 
 def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller) -> None:

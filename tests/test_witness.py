@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cell.calibration.roll import rolled
 from cell.calibration.witness import LARGEST_RAD, Pointing, Witness, pointing, turned
 from cell.geometry.camera import CameraModel
 from cell.geometry.light_plane import LightPlane, triangulate
@@ -30,14 +31,28 @@ def pointed(angle: float) -> LaserOptics:
     return replace(LASER, normal=normal, distance=float(np.dot(normal, LASER.origin)))
 
 
-def seen(angle: float, seed: int, shift: float = 0.0, rows: int = 480, off: float = 0.0) -> Witness:
+def rolled_laser(angle: float) -> LaserOptics:
+    """The simulator's laser turned by `angle` about the middle of its beam."""
+    normal, stripe = np.array(LASER.normal), np.array([0.0, 1.0, 0.0])
+    nx, ny, nz = (float(v) for v in np.cos(angle) * normal + np.sin(angle) * stripe)
+    return replace(LASER, normal=(nx, ny, nz), distance=float(np.dot((nx, ny, nz), LASER.origin)))
+
+
+def seen(
+    angle: float,
+    seed: int,
+    shift: float = 0.0,
+    rows: int = 480,
+    off: float = 0.0,
+    laser: LaserOptics | None = None,
+) -> Witness:
     """The line on a plate 85 mm away and `off` m more, tilted by 3°, with noise, the whole picture `shift` px aside."""
     plate = np.eye(4)
     plate[:3, 3] = -0.0107, 0.0, 0.085 + off
     tilt = np.deg2rad(3.0)
     plate[:3, 0] = np.cos(tilt), 0.0, np.sin(tilt)
     plate[:3, 2] = -np.sin(tilt), 0.0, np.cos(tilt)
-    found = crossings(OPTICS, pointed(angle), PlaneInstance(plate, (0.02, 0.012)))
+    found = crossings(OPTICS, laser or pointed(angle), PlaneInstance(plate, (0.02, 0.012)))
     columns = np.full(480, np.nan)
     columns[found.rows] = found.columns + shift + SIGMA * np.random.default_rng(seed).standard_normal(len(found.rows))
     columns[rows:] = np.nan
@@ -116,3 +131,33 @@ def test_it_is_kept_with_the_calibration() -> None:
     assert np.array_equal(again.columns, witness.columns, equal_nan=True)
     assert Witness.read(None) is None
     assert "mrad" in Pointing(0.4e-3, 0.02e-3).words
+
+
+@pytest.mark.parametrize("angle", [0.3e-3, -0.5e-3])
+def test_a_laser_that_rolled_about_its_beam_tilts_nothing_any_more(angle: float) -> None:
+    """As the paper draws the sheet, a scan would tilt by more than three times the roll."""
+    laser = rolled_laser(angle)
+    found = pointing(seen(0.0, 1), seen(0.0, 2, laser=laser), CAMERA, PLANE, EXIT)
+    assert abs(found.roll) == pytest.approx(abs(angle), abs=0.08e-3)
+    assert found.roll_sigma >= abs(found.roll) and "about its beam" in found.notes[-1]
+    assert abs(found.turn) < 0.025e-3
+    wall = np.eye(4)
+    wall[2, 3] = 0.130
+    there = crossings(OPTICS, laser, PlaneInstance(wall, (0.2, 0.2)))
+    pixels = np.column_stack([there.columns, there.rows])
+    before, _ = triangulate(CAMERA, PLANE, pixels)
+    after, _ = triangulate(CAMERA, rolled(turned(PLANE, EXIT, found.turn), EXIT, found.roll), pixels)
+    tilts = [abs(np.polyfit(points[:, 1], points[:, 2], 1)[0]) for points in (before, after)]
+    assert tilts[0] == pytest.approx(3.7 * abs(angle), rel=0.1)
+    assert tilts[1] < 0.3e-3
+
+
+def test_a_line_that_has_not_turned_is_silent_and_its_noise_is_stated() -> None:
+    found = [pointing(seen(0.0, seed), seen(0.0, 100 + seed), CAMERA, PLANE, EXIT) for seed in range(12)]
+    assert all(one.roll == 0.0 and one.notes == () for one in found)
+    assert all(0.01e-3 < one.roll_sigma < 0.1e-3 for one in found)
+
+
+def test_a_line_that_has_turned_far_is_refused() -> None:
+    with pytest.raises(RefusedError, match=r"line .* is turned by .* mrad.*about its own beam.*cell calibrate"):
+        pointing(seen(0.0, 1), seen(0.0, 2, laser=rolled_laser(1e-3)), CAMERA, PLANE, EXIT)

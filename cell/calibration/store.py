@@ -186,6 +186,8 @@ def solve_observations(observations: Observations) -> Solved:
     head = replace(ScanCalibration.of(scan), witness=o.witness)
     refuse_wrong_lead(head.rail_direction, o.rail_lead)
     target = adjust_target(o.target, o.target_camera, o.priors)
+    if target.size is not None:
+        head = replace(head, notes=(*head.notes, *target.size.notes))
     made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made, o.kinematics)
     return Solved(made, scan, target)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.calibration.roll import roll_of, rolled
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import Measured, RefusedError
@@ -78,12 +79,15 @@ class Pointing:
     """How far the light plane has turned since the calibration, rad, and one standard deviation of it.
 
     `confirmed` is how much of the turn a verification has seen on its board. Where the rest is beyond `NOTED_RAD`, the
-    deviation in `stated` has it in it: it may as well be the plate that has moved.
+    deviation in `stated` has it in it: it may as well be the plate that has moved. `roll` is how far the plane has
+    turned about its beam, rad, 0 where it is too small for a word, and `roll_sigma` what is stated of that.
     """
 
     turn: float
     sigma: float
     confirmed: float = 0.0
+    roll: float = 0.0
+    roll_sigma: float = 0.0
 
     @property
     def open(self) -> float:
@@ -97,8 +101,20 @@ class Pointing:
         return replace(self, sigma=float(np.hypot(self.sigma, self.open)))
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """For people, what is not as usual."""
+        made = [self.words] if self.open else []
+        if self.roll:
+            made.append(
+                f"the laser's line on the plate on the claw has turned by {1e3 * self.roll:+.3f} mrad since the "
+                "calibration: the laser about its beam, or the plate; the measurements allow for either. Look at the "
+                "screws of both, then run `cell calibrate`"
+            )
+        return tuple(made)
+
+    @property
     def words(self) -> str:
-        """For people."""
+        """How far it has turned, in words."""
         known = f", of which {1e3 * self.confirmed:+.3f} mrad were seen on a board," if self.confirmed else ""
         return (
             f"the laser points {1e3 * self.turn:+.3f} ± {1e3 * self.sigma:.3f} mrad from where it pointed at the "
@@ -182,7 +198,7 @@ def pointing(
             Measured("the laser's pointing has moved by", 1e3 * found.turn, "mrad", most=1e3 * LARGEST_RAD),
         )
     ways = [found.stated] if confirmed is None else [found.stated, confirmed.since(found).stated]
-    return min(ways, key=lambda way: way.sigma)
+    return replace(min(ways, key=lambda way: way.sigma), roll=found.roll, roll_sigma=found.roll_sigma)
 
 
 def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
@@ -205,16 +221,21 @@ def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPl
             f"{LEAST_ROWS} are needed: is the witness clean and in its place? If so, run `cell calibrate`"
         )
     moved = now.columns[both] - before.columns[both]
-    # A median: a speck on the plate moves some rows only.
-    shift = float(np.median(moved))
-    noise = 1.25 * float(1.4826 * np.median(np.abs(moved - shift))) / np.sqrt(len(both))
     at = np.column_stack([before.columns[both], both.astype(np.float64)])
     points, _ = triangulate(camera, plane, at)
     step = 1e-4
+    by_roll = (_columns(camera, rolled(plane, exit_point, step), points) - at[:, 0]) / step
+    roll = roll_of(moved, by_roll)
+    roll.require()
+    moved = moved - roll.open * by_roll
+    # A median: a speck on the plate moves some rows only.
+    shift = float(np.median(moved))
+    noise = 1.25 * float(1.4826 * np.median(np.abs(moved - shift))) / np.sqrt(len(both))
     per_rad = float(np.median(_columns(camera, turned(plane, exit_point, step), points) - at[:, 0])) / step
     nearer = points * (1.0 - PLATE_M / points[:, 2:])
     plate = float(np.median(_columns(camera, plane, nearer) - at[:, 0]))
-    return Pointing(shift / per_rad, float(np.hypot(noise, plate) / abs(per_rad)))
+    seen = float(np.hypot(noise, plate) / abs(per_rad))
+    return Pointing(shift / per_rad, seen, roll=roll.open, roll_sigma=roll.stated)
 
 
 def turned(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:

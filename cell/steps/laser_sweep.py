@@ -18,17 +18,17 @@ from cell.devices.devices import Devices
 from cell.job import ScanSection
 from cell.reconstruction import ScanGeometry
 from cell.steps.arm_sweep import arm_sweep
-from cell.steps.board_photo import photographed
-from cell.steps.camera_poses import ScanPlan, photo_pose, scan_plans
+from cell.steps.camera_poses import ScanPlan, scan_plans
 from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.step import JobStep
-from cell.steps.stored_sweep import FILE, moved_by, save_sweep
+from cell.steps.stored_sweep import FILE, save_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
+from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import Workplace
-from drivers.errors import CalibrationStale, RefusedError
+from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
 from statemachine.policy import Step
 from statemachine.runner import StepContext
@@ -89,7 +89,9 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     # One that is to be done again holds no more, should this run be cut short now.
     (here.folder / FILE).unlink(missing_ok=True)
     if context.attempt > 1:
-        _require_unmoved(here, context, fix)
+        # After a fault the arm's base may stand elsewhere.
+        require_unmoved(here, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text))
+        context.note(text="the board has not moved since the fault")
     if here.earlier is not None:
         try:
             sweep = here.earlier.confirmed_by(fix)
@@ -102,18 +104,6 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     sweep = _sweep(here, context, fix)
     save_sweep(here.folder, sweep, fix)
     return sweep
-
-
-def _require_unmoved(here: Workplace, context: StepContext, fix: BoardFix) -> None:
-    """After a fault the arm's base may stand elsewhere: photograph the board again. `RefusedError` if it does."""
-    goal = photo_pose(here.job, here.board, fix.base_from_board, here.calibration.target.flange_from_camera)
-    now = photographed(here, goal, lambda share, text: context.progress(0.0, text))
-    if (moved := moved_by(now, fix.base_from_board, fix.covariance)) is not None:
-        raise RefusedError(
-            f"the board has moved by {moved} since it was photographed, before the fault that ended the sweep. See "
-            "that the vehicle and the station stand firm, then run the job again"
-        )
-    context.note(text="the board has not moved since the fault")
 
 
 def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:

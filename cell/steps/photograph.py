@@ -36,6 +36,7 @@ class BoardFix:
     notes: tuple[str, ...] = ()
     flange: Vector = field(default_factory=lambda: np.zeros(6))
     number: int = 0
+    by_mount: Vector = field(default_factory=lambda: np.zeros((6, 6)))
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -98,10 +99,14 @@ def photograph(
     covariance = compose_covariance(
         base_from_camera, hand_eye, camera_from_board, np.mean([pose.covariance for pose in poses], axis=0) / count
     )
+    mount = compose_covariance(
+        base_from_flange, nothing := np.zeros((6, 6)), calibration.flange_from_camera, calibration.hand_eye_covariance
+    )
+    by_mount = compose_covariance(base_from_camera, mount, camera_from_board, nothing)
     centre = transform(camera_from_board, views[0].object_points.mean(axis=0)[None])[0]
     swung = swing(views, float(centre[2]) / calibration.camera.fx)
     seen = base_from_camera * camera_from_board, covariance, residual, obliquity
-    return BoardFix(*seen, tuple(frames), tuple(views), swung, flange=flange)
+    return BoardFix(*seen, tuple(frames), tuple(views), swung, flange=flange, by_mount=by_mount)
 
 
 def _require(pose: BoardPose, limits: PhotoSection) -> None:

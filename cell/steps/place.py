@@ -14,8 +14,10 @@ from cell.job import Job
 from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
+from cell.steps.photograph import BoardFix
 from cell.steps.step import JobStep
 from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
+from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw
@@ -76,8 +78,7 @@ def place(
     when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was expected,
     does not come at all, or begins where the stated uncertainty of the place does not allow it.
     """
-    if part.state is not PartState.HELD:
-        raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
+    require_held(part)
     plan = job.place
     base_from_part = base_from_surface * plan.surface_from_part.se3()
     part_from_flange = job.grasp.flange_from_part.se3().inverse()
@@ -147,8 +148,16 @@ def place(
     return PlaceResult(reached, contact, off, touch)
 
 
+def require_held(part: PartProgress) -> None:
+    """Raise `RefusedError` where the part is not in the claw any more, as far as this program knows."""
+    if part.state is not PartState.HELD:
+        raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
+
+
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
     pose = context.made(PlacePose)
+    require_held(here.part)
+    require_unmoved(here, context.made(BoardFix), "before the sweep", context.progress)
     done = place(
         here.job,
         pose.base_from_surface,
@@ -167,4 +176,4 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
 
 
 # A part that may have touched the surface is not placed a second time by itself.
-STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(PlacePose,))
+STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
         "board_covariance": fix.covariance,
     }
     if sweep.pointing is not None:
-        data["pointing"] = np.array([sweep.pointing.turn, sweep.pointing.sigma, sweep.pointing.confirmed])
+        data["pointing"] = np.array(astuple(sweep.pointing))
     if sweep.slip is not None:
         data["slip"] = np.array(
             [*sweep.slip.shift, sweep.slip.lag, sweep.slip.depth, sweep.slip.hidden], dtype=np.float64

@@ -49,7 +49,7 @@ class SweepRecord:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
-        turned = (self.pointing.words,) if self.pointing is not None and self.pointing.open else ()
+        turned = self.pointing.notes if self.pointing is not None else ()
         return (*turned, *(() if self.slip is None else self.slip.notes), *self.doubts)
 
     def summary(self) -> dict[str, object]:

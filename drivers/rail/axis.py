@@ -141,7 +141,7 @@ class RailAxis(ABC):
         speed = self._checked_speed("speed", self._max_speed if speed is None else speed)
         with self._starting:
             issued = self._free()
-            duration = self._start(position, speed, issued)
+            duration, least = self._start(position, speed, issued)
             readings: Samples = []
             self._motion = RailMotion(
                 self.name,
@@ -149,6 +149,7 @@ class RailAxis(ABC):
                 arrived=self._arrival(position, issued, readings),
                 halt=self._halt(issued),
                 duration=duration,
+                least=least,
                 readings=readings,
             )
             return self._motion
@@ -188,7 +189,7 @@ class RailAxis(ABC):
                     f"stands at {shown(here, 'm')}, the sweep starts at {shown(begin, 'm')}. "
                     "Move to sweep_start() first",
                 )
-            duration = self._start(end, speed, issued)
+            duration, _ = self._start(end, speed, issued)
             sweep = RailSweep(
                 self.name,
                 self._clock,
@@ -261,12 +262,12 @@ class RailAxis(ABC):
         self._motion_issued = issued
         return issued
 
-    def _start(self, position: float, speed: float, issued: int) -> float:
-        """Send it there; the seconds that it should take."""
+    def _start(self, position: float, speed: float, issued: int) -> tuple[float, float]:
+        """Send it there; the seconds that it should take, and those that `speed` alone takes, whatever the ramps."""
         self._require_zero()
         here = self._position()
         self._send(position, speed, issued)
-        return move_duration(position - here, speed, self._acceleration)
+        return move_duration(position - here, speed, self._acceleration), abs(position - here) / speed
 
     def _halt(self, issued: int) -> Callable[[], None]:
         def halt() -> None:

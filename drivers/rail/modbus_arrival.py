@@ -8,7 +8,7 @@ from drivers.quantities import shown
 from drivers.rail.arrival import STANDSTILL_S
 from drivers.rail.axis import Samples
 from drivers.rail.modbus_drive import ModbusDrive
-from drivers.rail.modbus_zero import DriveZero
+from drivers.rail.modbus_zero import ZERO_M, DriveZero
 from drivers.rail.motion import patience
 
 
@@ -17,7 +17,8 @@ class DriveArrival:
 
     `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
     it does not; None where it does not matter. Called again and again: True at the target; raises `Aborted` after a
-    stop and `DeviceFault` for rail.reset, rail.alarm, rail.limit_switch, rail.missed_target and rail.stalled.
+    stop and `DeviceFault` for rail.reset, rail.alarm, rail.limit_switch, rail.missed_target, rail.astray and
+    rail.stalled.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class DriveArrival:
         self._samples = samples
         self._zero = zero
         self._standstill = patience(clock, STANDSTILL_S)
+        self._begun: float | None = None
         self._last: float | None = None
         self._moved = clock.now()
 
@@ -53,11 +55,21 @@ class DriveArrival:
             # A drive that was reset stands at its target, too, if that is 0.
             self._require_zero()
             return True
+        if self._begun is None:
+            self._begun = position
+        if self._astray(position):
+            raise self._failure(position)
         if position != self._last:
             self._last, self._moved = position, stamp
         elif stamp - self._moved > self._standstill and not drive.says(drive.registers.moving):
             raise self._failure(position)
         return False
+
+    def _astray(self, position: float) -> bool:
+        """Whether a reading is none of the way, beyond what a drive may overshoot."""
+        low, high = sorted((self._begun or 0.0, self._target / self._drive.counts))
+        slack = ZERO_M + self._near / self._drive.counts
+        return not low - slack <= position <= high + slack
 
     def _failure(self, position: float) -> DeviceFault:
         drive, registers = self._drive, self._drive.registers
@@ -74,6 +86,14 @@ class DriveArrival:
             self._zero.forget()
         if drive.says(registers.fault):
             return drive.alarmed("in its motion")
+        if self._astray(position):
+            return drive.fault(
+                "rail.astray",
+                f"says that it is at {shown(position, 'm')}, on its way from {shown(self._begun or 0.0, 'm')} to "
+                f"{shown(goal, 'm')}",
+                "See that rail.registers.word_order and the addresses of position and target are right, that it counts "
+                "up the way it is sent up, and that nothing else moves it; then home again.",
+            )
         side, switch = ("right", registers.right_switch) if goal > position else ("left", registers.left_switch)
         if drive.says(switch):
             return drive.fault(

@@ -22,6 +22,10 @@ WALL_FLOOR_S = 0.5
 """No patience with the device is shorter than this on the wall, however fast the clock runs."""
 
 
+_TOO_SOON = 0.6
+"""Of the least time that a motion can take; what comes sooner went faster than it was told."""
+_JUDGED_S = 0.3
+"""Motions that take less are not judged so: the way of a command and a poll count then."""
 Readings = Sequence[tuple[float, float, float]]
 
 
@@ -47,8 +51,9 @@ class RailMotion:
     """A running motion of the rail `name`.
 
     `arrived` is asked again and again: True ends the motion well, a `CellError` ends it with that error. `halt` stops
-    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s. `readings`
-    are those of its way so far, as far as it is told: host time in s, position in m, round trip in s.
+    the rail. `duration` is what the motion should take, in s of `clock`; it fails after twice that and 2 s, and when it
+    has arrived far sooner than in the `least` time that its speed allows. `readings` are those of its way so far, as
+    far as it is told: host time in s, position in m, round trip in s.
     """
 
     def __init__(
@@ -59,6 +64,7 @@ class RailMotion:
         arrived: Callable[[], bool],
         halt: Callable[[], None],
         duration: float,
+        least: float = 0.0,
         readings: Readings = (),
     ) -> None:
         self.readings = readings
@@ -68,6 +74,8 @@ class RailMotion:
         self._halt = halt
         self._limit = clock.now() + patience(clock, 2.0 * duration + 2.0)
         self._duration = duration
+        self._least = least
+        self._begun = clock.now()
         self._error: CellError | None = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name=f"{name} motion", daemon=True)
@@ -114,6 +122,16 @@ class RailMotion:
                     )
                 due = max(due + period, self._clock.now())
                 self._clock.sleep_until(due)
+            taken = self._clock.now() - self._begun
+            if self._least > _JUDGED_S and taken < _TOO_SOON * self._least:
+                raise DeviceFault(
+                    self._name,
+                    "rail.too_fast",
+                    f"was there after {taken:.3g} s, at its speed it takes {self._least:.3g} s at least",
+                    recoverable=True,
+                    hint="Check the lead, the steps or counts of a turn, and in which unit and order of words the "
+                    "speed is written.",
+                )
         except (Aborted, NotConnectedError) as error:
             self._error = error
         except CellError as error:

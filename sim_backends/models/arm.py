@@ -49,6 +49,17 @@ class Power(IntEnum):
     RUNNING = 7
 
 
+_SMALL, _MIDDLE = (180.0, 180.0, 180.0, 360.0, 360.0, 360.0), (180.0,) * 6
+_LONG, _HEAVY = (120.0, 120.0, 180.0, 180.0, 180.0, 180.0), (120.0, 120.0, 150.0, 210.0, 210.0, 210.0)
+SPEED_LIMITS = {
+    **dict.fromkeys(("UR3", "UR3e"), _SMALL),
+    **dict.fromkeys(("UR5", "UR5e", "UR7e"), _MIDDLE),
+    **dict.fromkeys(("UR10", "UR10e", "UR12e", "UR16e"), _LONG),
+    **dict.fromkeys(("UR20", "UR30"), _HEAVY),
+}
+"""The fastest that each joint may turn, deg/s, by the name of the model. Source: the maker's joint limits."""
+
+
 @dataclass(frozen=True)
 class ArmParams:
     """What one particular arm is like.
@@ -71,7 +82,7 @@ class ArmParams:
     carried_centre: tuple[float, float, float] = (0.0, 0.0, 0.06)
     blend_time: float = 0.3
     joint_limit: float = 2 * math.pi
-    speed_limits: Vector = field(default_factory=lambda: np.radians([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]))
+    speed_limits: Vector = field(default_factory=lambda: np.radians(_LONG))
     tracking_lag: float = 0.02
     initial_q: Vector = field(default_factory=lambda: np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0]))
     force_noise: tuple[float, float] = (0.0, 0.0)
@@ -83,7 +94,8 @@ class ArmParams:
     @classmethod
     def of(cls, model: str, **others: Any) -> ArmParams:
         """Those of the maker's `model`, a key of `TABLES`, with `others` as given."""
-        return cls(dh=others.pop("dh", TABLES[model]).copy(), model=model, **others)
+        given = {"dh": TABLES[model].copy(), "speed_limits": np.radians(SPEED_LIMITS[model]), **others}
+        return cls(model=model, **given)
 
 
 class ArmModel:
@@ -295,11 +307,14 @@ class ArmModel:
             self._stopped_at = self.time
             self.suspend()
 
-    def unlock(self) -> bool:
-        """Release a protective stop; False while it is younger than `unlock_delay`."""
+    def unlock(self, at_once: bool = False) -> bool:
+        """Release a protective stop; False while it is younger than `unlock_delay`, unless `at_once`.
+
+        The dashboard makes its clients wait; the primary port does not.
+        """
         with self._lock:
             if self.safety is Safety.PROTECTIVE_STOP:
-                if self.time - self._stopped_at < self.params.unlock_delay:
+                if not at_once and self.time - self._stopped_at < self.params.unlock_delay:
                     return False
                 self.safety = Safety.NORMAL
                 self.fault_text = ""

@@ -136,15 +136,18 @@ class JointMove(Motion):
 class LinearMove(Motion):
     """Tool straight to `target` (4, 4) while turning about one axis.
 
-    `speed` and `acceleration` bound translation in m/s, m/s² and rotation by the same numbers in rad/s, rad/s².
+    `speed` and `acceleration` bound translation in m/s, m/s² and rotation by the same numbers in rad/s, rad/s². One
+    that `slows` goes along its line as fast as the joints can, where that is slower.
     """
 
     from_rest = True
+    shape = "straight line"
 
-    def __init__(self, target: Matrix, speed: float, acceleration: float) -> None:
+    def __init__(self, target: Matrix, speed: float, acceleration: float, slows: bool = False) -> None:
         self._target = target
         self._speed = speed
         self._acceleration = acceleration
+        self._slows = slows
 
     def begin(self, drive: Drive) -> None:
         """Plan the straight line from the present tool pose."""
@@ -158,19 +161,32 @@ class LinearMove(Motion):
 
     def step(self, drive: Drive, dt: float) -> bool:
         """Advance along the line and solve the joints for it; MotionError where they cannot follow."""
-        self._time += dt * drive.speed_fraction
-        distance, _ = self._profile.at(self._time)
-        fraction = distance / self._profile.length if self._profile.length > 0 else 1.0
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_matrix(self._turn * fraction).dot(self._start[:3, :3])
-        pose[:3, 3] = self._start[:3, 3] + self._way * fraction
-        q = drive.kinematics.refine(pose.dot(self._tcp_from_flange), drive.q + dt * drive.qd)
-        if q is None:
-            raise MotionError("the straight line leaves the reach of the arm or passes a singularity")
+        step = dt * drive.speed_fraction
+        q = self._joints(drive, self._time + step, dt)
+        while self._slows and (excess := float((np.abs(q - drive.q) / drive.speed_limits).max()) / dt) > 1.0:
+            step *= 0.99 / excess
+            q = self._joints(drive, self._time + step, dt)
+        self._time += step
         done = self._time >= self._profile.duration
         drive.qd = np.zeros(6) if done else (q - drive.q) / dt
         drive.q = q
         return done
+
+    def _joints(self, drive: Drive, time: float, dt: float) -> Vector:
+        """The joint angles at `time` of the profile, `dt` from now."""
+        distance, _ = self._profile.at(time)
+        fraction = distance / self._profile.length if self._profile.length > 0 else 1.0
+        q = drive.kinematics.refine(self._pose(fraction).dot(self._tcp_from_flange), drive.q + dt * drive.qd)
+        if q is None:
+            raise MotionError(f"the {self.shape} leaves the reach of the arm or passes a singularity")
+        return q
+
+    def _pose(self, fraction: float) -> Matrix:
+        """Tool pose (4, 4) after this much of the way."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_matrix(self._turn * fraction).dot(self._start[:3, :3])
+        pose[:3, 3] = self._start[:3, 3] + self._way * fraction
+        return pose
 
 
 class Stop(Motion):

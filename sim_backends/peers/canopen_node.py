@@ -205,7 +205,10 @@ class CanopenNode:
             self._require_open(parameter)
             if count > 8:
                 raise Abort(WRONG_VALUE)
-            if sum(self._values[mapping, k].value & 0xFF for k in range(1, count + 1)) > 64:
+            entries = [self._values[mapping, k].value for k in range(1, count + 1)]
+            if not all(entries):
+                raise Abort(UNMAPPABLE)
+            if sum(entry & 0xFF for entry in entries) > 64:
                 raise Abort(TOO_LONG)
 
         return write

@@ -68,7 +68,7 @@ class Dashboard:
             "safetymode": lambda: f"Safetymode: {self._safety()}",
             "safetystatus": lambda: f"Safetystatus: {self._safety()}",
             "is in remote control": lambda: str(model.remote).lower(),
-            "running": lambda: f"Program running: {str(program.runtime_state is RuntimeState.PLAYING).lower()}",
+            "running": lambda: f"Program running: {str(_STATES[program.runtime_state] == 'PLAYING').lower()}",
             "programstate": lambda: f"{_STATES[program.runtime_state]} {self._name()}",
             "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
             "isprogramsaved": lambda: f"{str(bool(self._loaded)).lower()} {self._name()}",
@@ -106,7 +106,7 @@ class Dashboard:
         if word.startswith("addtolog"):
             return "Added log message" if word != "addtolog" else "No log message to add"
         if word.startswith("set operational mode "):
-            return self._set_mode(word[21:])
+            return self._set_mode(command.split()[-1])
         if word.startswith("generate flight report"):
             self._reports += 1
             return f"Flight Report generated with id: {self._reports}"
@@ -115,7 +115,7 @@ class Dashboard:
         return f'could not understand: "{command}"'
 
     def _name(self) -> str:
-        return self._loaded or _UNNAMED
+        return Path(self._loaded).name or _UNNAMED
 
     def _safety(self) -> str:
         return "REDUCED" if self._model.safety_mode == 2 else _SAFETY[self._model.safety]
@@ -129,7 +129,7 @@ class Dashboard:
         return f"Loading program: {name}"
 
     def _set_mode(self, mode: str) -> str:
-        if mode not in ("manual", "automatic"):
+        if mode.lower() not in ("manual", "automatic"):
             return f"Failed setting operational mode: {mode}"
         self._mode = mode.upper()
         return f"Operational mode '{mode}' is set"

@@ -11,6 +11,7 @@ import re
 from collections import deque
 from collections.abc import Callable
 from enum import IntEnum
+from typing import NamedTuple
 
 from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.peers.rtde_registers import Registers
@@ -30,8 +31,20 @@ _STOP_SCRIPT, _CONTACT_DETECTED = 255, 254
 
 _log = logging.getLogger(__name__)
 _RESUMING_CYCLES = 50
-Announcement = tuple[str, str]
-"""What the clients of the primary port are told: text, popup, started, stopped or failed, and its words."""
+
+
+class Announcement(NamedTuple):
+    """What the clients of the primary port are told: text, popup, started, stopped or failed, and its words.
+
+    What failed has a place in its script, from 1; 0 where none is known.
+    """
+
+    kind: str
+    words: str
+    line: int = 0
+    column: int = 0
+
+
 _MOST_ANNOUNCED = 200
 _OFFSET = re.compile(r"reg_offset_int\s*=\s*#[^\n]*\n?\s*(\d+)")
 _NAME = re.compile(r"def\s+(\w+)")
@@ -92,7 +105,7 @@ class ControlProgram:
                 context.path = Machine(path[0], context, environment).run
         except ScriptError as error:
             self._note(f"a script was not started: compile error in {text.strip()[:60]!r}: {error}")
-            self._announce("failed", str(error))
+            self._announce("failed", error.told, error.line, error.column)
             return False
         self.stop("another program was started")
         self._model.halt()
@@ -116,8 +129,9 @@ class ControlProgram:
         try:
             Machine(text, Context(self._model, self._registers, 0), environment).run_at_once()
         except (ScriptError, ProgramError) as error:
+            told = error.told if isinstance(error, ScriptError) else str(error)
             self._note(f"a secondary program failed: {error}")
-            self._announce("failed", str(error))
+            self._announce("failed", told, error.line, error.column)
 
     def close_popup(self) -> None:
         """Let a program go on that waits for a person to close its message."""
@@ -166,7 +180,7 @@ class ControlProgram:
             try:
                 self._cycle()
             except ProgramError as error:
-                self._announce("failed", str(error))
+                self._announce("failed", str(error), error.line, error.column)
                 self.stop(str(error))
         self._outputs.hold(self.runtime_state is RuntimeState.PLAYING)
 
@@ -255,8 +269,8 @@ class ControlProgram:
         if limit is not None and silence > limit:
             raise ProgramError(f"watchdog: no input for {silence:.3f} s, at most {limit:.3f} s allowed")
 
-    def _announce(self, kind: str, words: str) -> None:
-        self.announcements.append((kind, words))
+    def _announce(self, kind: str, words: str, line: int = 0, column: int = 0) -> None:
+        self.announcements.append(Announcement(kind, words, line, column))
 
     def _note(self, message: str) -> None:
         self.message = message

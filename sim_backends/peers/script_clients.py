@@ -6,13 +6,13 @@ Primary (30001) and secondary (30002) tell the state ten times a second, the pri
 
 from __future__ import annotations
 
-from sim_backends.models.arm import ArmModel, Power
+from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.peers.controller_ports import Client
 from sim_backends.peers.dashboard import VERSION
 from sim_backends.peers.real_time_port import real_time_packet
 from sim_backends.peers.rtde_registers import View
-from sim_backends.peers.script import ControlProgram
-from sim_backends.peers.script_port import message, robot_state, version_message
+from sim_backends.peers.script import Announcement, ControlProgram
+from sim_backends.peers.script_port import message, robot_state, safety_message, version_message
 from sim_backends.peers.urscript.words import Collector
 
 _PRIMARY, _SECONDARY, _REAL_TIME = (30001, 30011), (30002, 30012), (30003, 30013)
@@ -31,6 +31,7 @@ class ScriptClients:
         self._view = view
         self._texts: dict[Client, Collector] = {}
         self._ports: dict[Client, int] = {}
+        self._safety_mode = model.safety_mode
 
     def serve(self, port: int, client: Client, data: bytes | None) -> None:
         """`data` came from `client` of `port`: b"" for a new one, None for one that has left."""
@@ -48,28 +49,36 @@ class ScriptClients:
 
     def tick(self, count: int) -> None:
         """Tell everybody what is due in the cycle with this number."""
+        changed = self._model.safety_mode != self._safety_mode
+        self._safety_mode = self._model.safety_mode
         if not self._ports:
             self._program.announcements.clear()
             return
-        told = [message(*one, self._model.time) for one in self._program.announcements]
+        time = self._model.time
+        told = [message(one.kind, one.words, time, one.line, one.column) for one in self._program.announcements]
         self._program.announcements.clear()
-        reports = count % _REPORT_EVERY == 0
+        if changed:
+            told.append(safety_message(self._safety_mode, time))
+            if self._model.safety is Safety.PROTECTIVE_STOP:
+                told.append(message("warning", f"Protective stop: {self._model.fault_text}", time))
+        # A client that hears of a stop has a state that shows it.
+        reports = changed or count % _REPORT_EVERY == 0
         state = packet = b""
         for client, port in self._ports.items():
             if port in _REAL_TIME:
                 packet = packet or real_time_packet(self._view)
                 client.offer(packet)
                 continue
-            if told and port in _PRIMARY:
-                client.send(b"".join(told))
             if reports:
                 state = state or robot_state(self._model, self._program.runtime_state, self._view.registers.analog_out)
                 client.send(state)
+            if told and port in _PRIMARY:
+                client.send(b"".join(told))
 
     def _take(self, text: str) -> None:
         """A script, or one of the controller's own commands. In local control nothing is taken."""
         if not self._model.remote:
-            self._program.announcements.append(("read-only", "the arm is in local control"))
+            self._program.announcements.append(Announcement("read-only", "the arm is in local control"))
             return
         match " ".join(text.split()).lower():
             case "power on":
@@ -80,7 +89,7 @@ class ScriptClients:
             case "set robotmode run":
                 self._model.set_power(Power.RUNNING)
             case "set unlock protective stop":
-                self._model.unlock()
+                self._model.unlock(at_once=True)
             case "stop program":
                 self._program.stop("stopped by a client")
             case "pause program":

@@ -29,7 +29,9 @@ def done() -> Job:
 
 
 class ProgramError(Exception):
-    """A run-time error of the program, which ends it."""
+    """A run-time error of the program, which ends it; where in its script, from 1, or 0 where that is not known."""
+
+    line = column = 0
 
 
 class Context:

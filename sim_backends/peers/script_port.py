@@ -19,15 +19,18 @@ _STATE, _MESSAGE = 16, 20
 _LINEARISED = 2
 """The status of an arm that was calibrated in the factory."""
 _PROJECT, _BUILT = b"URControl", b"10-11-2023, 00:00:00"
-_MODELS = {"UR5e": 1, "UR10e": 2, "UR3e": 3, "UR16e": 4, "UR20": 7, "UR30": 8, "UR15": 9}
-"""The controller's numbers of the models."""
+_MODELS = {
+    **dict.fromkeys(("UR5", "UR5e", "UR7e"), 1), **dict.fromkeys(("UR10", "UR10e", "UR12e"), 2),
+    **dict.fromkeys(("UR3", "UR3e"), 3), "UR16e": 4, "UR20": 7, "UR30": 8,
+}  # fmt: skip
+"""The controller's numbers of the models; the newer names of a model have its number."""
 _RUNNING, _OFF = 253, 239
 """What joints and tool say of themselves."""
-_TEXT, _POPUP, _VERSION, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 6, 7, 10
-_VIOLATION = 3
-"""The report level of an error that ends what its sender wanted."""
-_READ_ONLY = 210
-"""Error code of a script that came while the arm was not in remote control."""
+_TEXT, _POPUP, _VERSION, _SAFETY, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 5, 6, 7, 10
+_WARNING, _VIOLATION = 2, 3
+"""Report levels: a protective stop, and an error that ends what its sender wanted."""
+_STOPPED, _READ_ONLY = 209, 210
+"""Error codes: a protective stop was triggered; a script came while the arm was not in remote control."""
 
 
 def version_message(version: tuple[int, int, int, int]) -> bytes:
@@ -35,8 +38,10 @@ def version_message(version: tuple[int, int, int, int]) -> bytes:
     return _message(_VERSION, struct.pack(">b", len(_PROJECT)) + _PROJECT + struct.pack(">BBii", *version) + _BUILT)
 
 
-def message(kind: str, words: str, time: float) -> bytes:
-    """A message of the primary port: text, popup, started or stopped (a program by its name), failed or read-only."""
+def message(kind: str, words: str, time: float, line: int = 0, column: int = 0) -> bytes:
+    """A message of the primary port: text, popup, started or stopped (a program by its name), failed, warning or
+    read-only; what failed has a place in its script.
+    """
     text = words.encode(errors="replace")
     if kind == "text":
         return _message(_TEXT, text, time)
@@ -44,11 +49,17 @@ def message(kind: str, words: str, time: float) -> bytes:
         title = b"Popup"
         return _message(_POPUP, struct.pack(">IB3?B", 0, 0, False, False, False, len(title)) + title + text, time)
     if kind == "failed":
-        return _message(_EXCEPTION, struct.pack(">ii", 0, 0) + text, time)
-    if kind == "read-only":
-        return _message(_ERROR, struct.pack(">iiiII", _READ_ONLY, 0, _VIOLATION, 0, 0) + text, time)
+        return _message(_EXCEPTION, struct.pack(">ii", line, column) + text, time)
+    if kind in ("read-only", "warning"):
+        code, level = (_READ_ONLY, _VIOLATION) if kind == "read-only" else (_STOPPED, _WARNING)
+        return _message(_ERROR, struct.pack(">iiiII", code, 0, level, 0, 0) + text, time)
     title = f"PROGRAM_XXX_{kind.upper()}".encode()
     return _message(_KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text, time)
+
+
+def safety_message(mode: int, time: float) -> bytes:
+    """The message that the safety system has changed to `mode`."""
+    return _message(_SAFETY, struct.pack(">iiBII", 0, 0, mode, 0, 0), time)
 
 
 def robot_state(model: ArmModel, runtime_state: int, analog_out: list[float]) -> bytes:
@@ -122,7 +133,7 @@ def _configuration(model: ArmModel) -> bytes:
     motion = np.column_stack((params.speed_limits, np.full(6, 40.0))).ravel()
     a, d, alpha, theta = TABLES[params.model].T
     numbers = (*limits, *motion, 1.05, 1.4, 0.25, 1.2, 0.25, *a, *d, *alpha, *theta)
-    return _part(6, struct.pack(">53d4i", *numbers, 3, 0, _MODELS.get(params.model, 0), 1))
+    return _part(6, struct.pack(">53d4i", *numbers, 3, 0, _MODELS[params.model], 1))
 
 
 def _part(kind: int, content: bytes) -> bytes:

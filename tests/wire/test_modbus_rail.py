@@ -136,6 +136,30 @@ def test_another_client_reads_from_the_drive_what_the_rail_has_written() -> None
     drive.peer.stop()
 
 
+def test_numbers_whose_words_come_in_the_other_order_end_the_first_motion_at_its_first_reading(drive: Drive) -> None:
+    """Whatever is written reads back, 0 is 0 in either order, and the drive runs off the other way."""
+    other = replace(drive, record=config({**PATHS, "word_order": "low first"}))
+    rail = other.homed()
+    with pytest.raises(DeviceFault, match="word_order") as told:
+        rail.move_to(0.0123, 0.015).wait(30.0)
+    assert told.value.code == "rail.astray"
+    drive.clock.sleep(0.5)
+    assert abs(drive.model.carriage(drive.clock.now())) < 3e-3
+    with pytest.raises(InterlockError, match="homed"):
+        rail.move_to(0.0123, 0.015)
+    rail.close()
+
+
+def test_a_drive_that_takes_its_speed_in_another_unit_is_told_as_too_fast(drive: Drive) -> None:
+    """30 rpm for the configuration, in tenths: written as 300, taken by the drive as 300 rpm."""
+    other = replace(drive, record=config({**PATHS, "speed": {"address": 0x6203, "unit": "0.1 rpm"}}))
+    rail = other.homed()
+    with pytest.raises(DeviceFault, match="in which unit") as told:
+        rail.move_to(0.0050, 0.001).wait(30.0)
+    assert told.value.code == "rail.too_fast"
+    rail.close()
+
+
 def test_a_line_that_repeats_what_is_sent_is_noticed() -> None:
     drive = Drive.of(config(PATHS), echo=True)
     rail = drive.homed()

@@ -7,7 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import pytest
 from arm_bench import ArmBench
@@ -162,14 +162,17 @@ PARTS = [
 
 
 def packages(port: int, address: str, count: int) -> list[bytes]:
-    found, data = [], b""
     with socket.create_connection((address, port), timeout=5.0) as connection:
-        while len(found) < count:
-            data += connection.recv(65536)
-            while len(data) >= 4 and len(data) >= (size := struct.unpack_from(">i", data)[0]):
-                found.append(data[:size])
-                data = data[size:]
-    return found
+        return list(islice(told(connection), count))
+
+
+def told(connection: socket.socket) -> Iterator[bytes]:
+    data = b""
+    while True:
+        data += connection.recv(65536)
+        while len(data) >= 4 and len(data) >= (size := struct.unpack_from(">i", data)[0]):
+            yield data[:size]
+            data = data[size:]
 
 
 @pytest.mark.parametrize("port", [30001, 30002, 30011, 30012])
@@ -211,6 +214,38 @@ def test_the_primary_port_tells_of_programs_and_those_for_reading_take_none(addr
     assert b"takes nothing" not in heard
 
 
+def test_a_protective_stop_is_told_with_a_state_that_shows_it_and_this_port_unlocks_at_once(address: str) -> None:
+    """The maker's library sends its next command on the first of these messages, whatever state it has seen last."""
+    with socket.create_connection((address, 30001), timeout=5.0) as primary:
+        heard = told(primary)
+        next(heard)
+        for command, stopped, mode in (("protective_stop()", 1, 3), ("set unlock protective stop", 0, 1)):
+            primary.sendall(command.encode() + b"\n")
+            state = b""
+            for package in heard:
+                if package[4] == 16:
+                    state = package
+                elif package[14] == 5:
+                    break
+            assert state[22] == stopped, "the flag of the state's first part"
+            assert package[23] == mode and len(package) == 32
+            stamp = struct.unpack_from(">Q", package, 5)[0]
+            if stopped:
+                warning = next(package for package in heard if package[4] == 20)
+                assert warning[14] == 6 and struct.unpack_from(">iii", warning, 15) == (209, 0, 2), "C209A0, a warning"
+                assert b"Protective stop" in warning
+                at = stamp
+        assert stamp - at < 250_000, "the dashboard of this arm would make us wait 300 ms"
+
+
+def test_a_program_that_does_not_compile_is_told_as_a_controller_tells_it(address: str) -> None:
+    with socket.create_connection((address, 30001), timeout=5.0) as primary:
+        primary.sendall(b"def illegal_fun():\n  calldoesntexist()\nend\n")
+        error = next(package for package in told(primary) if package[4] == 20 and package[14] == 10)
+    assert struct.unpack_from(">ii", error, 15) == (2, 3)
+    assert error[23:] == b"compile_error_name_not_found:calldoesntexist:"
+
+
 def test_in_local_control_only_questions_are_answered(address: str, running: ArmBench) -> None:
     running.ask("local_control")
     refused = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
@@ -228,6 +263,7 @@ def test_in_local_control_only_questions_are_answered(address: str, running: Arm
 def test_the_dashboard_answers_as_the_makers_reference_has_it(address: str) -> None:
     asked = {
         "get operational mode": "NONE", "set operational mode manual": "Operational mode 'manual' is set",
+        "set operational mode AUTOMATIC": "Operational mode 'AUTOMATIC' is set",
         "clear operational mode": "No longer controlling the operational mode. Current operational mode: 'NONE'.",
         "get loaded program": "No program loaded", "load nothing.urp": "File not found: nothing.urp",
         "load installation default.installation": "Loading installation: default.installation",
@@ -248,9 +284,15 @@ def test_programs_of_a_folder_are_loaded_played_and_named(tmp_path) -> None:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         address = process.stdout.readline().strip()
         answers = dashboard(address, "load waiting.urp", "get loaded program", "play", "programState", "pause", "stop")
+        asked = ("load /programs/waiting.urp", "programState", "play", "running", "pause", "running", "play", "running")
+        deeper = dashboard(address, *asked)
         process.stdin.close()
         process.wait(10.0)
     assert answers[:5] == [
         "Loading program: waiting.urp", "Loaded program: waiting.urp", "Starting program", "PLAYING waiting.urp",
         "Pausing program",
+    ]  # fmt: skip
+    assert deeper == [
+        "Loading program: /programs/waiting.urp", "STOPPED waiting.urp", "Starting program", "Program running: true",
+        "Pausing program", "Program running: false", "Starting program", "Program running: true",
     ]  # fmt: skip

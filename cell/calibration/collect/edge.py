@@ -8,18 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.calibration.collect.witness import configure_fast
 from cell.calibration.store import CellCalibration
 from cell.calibration.witness import Edge, Witness
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.camera import Array
-from drivers.errors import LimitError, Measured, RefusedError
+from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Frame
 
 SPEED = 2e-3
 SEARCH_SPEED = 5e-3
-RATES_HZ = 30.0, 15.0
-"""The first that the camera can."""
 ROOM_M = 1e-3
 """To an end of the rail's travel, beyond what it takes to gain speed."""
 REACH_M = 10e-3
@@ -132,7 +131,7 @@ def _passed(
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
-    _configure(devices, config.calibration.stripe_exposure)
+    configure_fast(devices, config.calibration.stripe_exposure)
     times, light = [], []
     with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
         sweep, over = rail.sweep(*ends, speed), np.inf
@@ -158,17 +157,6 @@ def _passed(
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
     order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
-
-
-def _configure(devices: Devices, exposure: float) -> None:
-    for rate in RATES_HZ:
-        try:
-            devices.scan_camera.configure(exposure, rate)
-        except LimitError:
-            if rate == RATES_HZ[-1]:
-                raise
-        else:
-            return
 
 
 def _light(image: NDArray[np.generic], witness: Witness) -> Array:

@@ -11,11 +11,12 @@ from cell.calibration.witness import LEAST_ROWS, Witness
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.vision import extract
-from drivers.errors import RefusedError
+from drivers.errors import LimitError, RefusedError
 from drivers.interfaces import Frame
 
-PICTURES = 4
-RATE_HZ = 10.0
+PICTURES = 12
+RATES_HZ = 30.0, 15.0, 10.0
+"""The first that the camera can."""
 
 
 def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness | None:
@@ -25,7 +26,7 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
         return None
     devices.rail.move_to(position).wait(30.0)
     camera = devices.scan_camera
-    camera.configure(config.calibration.stripe_exposure, RATE_HZ)
+    configure_fast(devices, config.calibration.stripe_exposure)
     profiles = []
     with devices.interlocks.purpose("calibration"), devices.laser.lit():
         for k in range(PICTURES):
@@ -38,6 +39,18 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     mean = np.where(seen, columns.mean(axis=0), np.nan)
     found = Witness(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
     return _on_the_plate(found)
+
+
+def configure_fast(devices: Devices, exposure: float) -> None:
+    """The scan camera for `exposure`, s, at the highest of `RATES_HZ` that it can; `LimitError` when it can none."""
+    for rate in RATES_HZ:
+        try:
+            devices.scan_camera.configure(exposure, rate)
+        except LimitError:
+            if rate == RATES_HZ[-1]:
+                raise
+        else:
+            return
 
 
 def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness:

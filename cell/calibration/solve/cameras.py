@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.solve.adjustment import Priors
+from cell.calibration.solve.adjustment import Adjustment, Priors
+from cell.calibration.solve.board_size import board_size
 from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped
 from cell.calibration.solve.joint import Joint, Staged, solve_joint, solve_staged
 from cell.calibration.solve.joint_checks import joint_checks
@@ -63,7 +65,11 @@ def _solve(
         poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
         alone = [view for view in joint.views if not view.same_rest]
         refuse_slipped(camera, names, joint.adjusted, alone, poses)
+    pitch = next(o.view.spec.pitch for o in observations if o.view is not None)
+    problem = Adjustment(joint.views, joint.free, joint.adjusted.priors)
+    size = board_size(board, pitch, problem, joint.adjusted)
+    size.require()
     wrong = [check.text for check in joint_checks(joint, nominal) if check.verdict == "refused"]
     if wrong:
         raise RefusedError(f"the {camera} camera's calibration: {'; '.join(wrong)}")
-    return joint
+    return replace(joint, adjusted=size.allowed_for(joint.adjusted), size=size)

@@ -163,7 +163,8 @@ def refuse_slipped(
         raise RefusedError(
             f"the {camera} camera's mount slipped on the flange before {names[first]}: from there on the camera sits "
             f"{1e3 * shift:.2f} mm and {np.degrees(turn):.3f}° from where it was, allowed {1e3 * LARGEST_SLIP_M:g} mm "
-            f"and {np.degrees(LARGEST_SLIP_RAD):.2f}°; tighten the mount and the claw, then run `cell calibrate`"
+            f"and {np.degrees(LARGEST_SLIP_RAD):.2f}°; tighten the mount and the claw"
+            f"{', see whether the rail loses steps' if camera == 'scan' else ''}, then run `cell calibrate`"
         )
 
 

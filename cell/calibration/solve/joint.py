@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cell.calibration.observations import ScanObservation
 from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
 from cell.calibration.solve.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
+from cell.calibration.solve.board_size import BoardSize
 from cell.calibration.solve.bow import with_bow
 from cell.calibration.solve.hand_eye import HandEye, solve_hand_eye
 from cell.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
@@ -47,13 +48,19 @@ class Staged:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Staged and joint solution, the data they were made of, and how well held-out views are predicted."""
+    """Staged and joint solution, the data they were made of, and how well held-out views are predicted.
+
+    `free` (27,) says which shared parameters moved; `size` how large the arm's ways say that the board is, where that
+    was asked.
+    """
 
     staged: Staged
     adjusted: Adjusted
     views: list[ViewData]
     held_out_px: float
     held_out_stripe_m: float
+    free: NDArray[np.bool_]
+    size: BoardSize | None = None
 
 
 def solve_staged(
@@ -169,7 +176,7 @@ def solve_joint(
     px, stripe = float("nan"), float("nan")
     if held_out and len(views) > FOLDS:
         px, stripe = _held_out(views, free, adjusted)
-    return Joint(staged, adjusted, views, px, stripe)
+    return Joint(staged, adjusted, views, px, stripe, free)
 
 
 def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:

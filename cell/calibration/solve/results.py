@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pinocchio as pin
 
+from cell.calibration.roll import rolled
 from cell.calibration.solve.blocks import HAND, SHARED, State
 from cell.calibration.solve.bow import FLAT
 from cell.calibration.solve.joint import Joint, effective_hand_eye_covariance
@@ -102,7 +103,7 @@ class ScanCalibration:
             reference,
             bow.sigma * joint.adjusted.inflation,
             bow.gain[:KEPT],
-            (bow.words,) if bow.sigma else (),
+            (*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
@@ -115,7 +116,7 @@ class ScanCalibration:
 
     def pointed(self, pointing: Pointing, exit_point: Array) -> ScanCalibration:
         """With the light plane as the laser points now; `exit_point` (3,) of the laser in m, camera frame, as drawn."""
-        plane = turned(self.light_plane, exit_point, pointing.turn)
+        plane = rolled(turned(self.light_plane, exit_point, pointing.turn), exit_point, pointing.roll)
         return replace(self, light_plane=plane, pointing=pointing, exit_point=exit_point)
 
     def variants(self) -> list[ScanGeometry]:
@@ -145,6 +146,9 @@ class ScanCalibration:
         if self.pointing is not None:
             plane = turned(self.light_plane, self.exit_point, self.pointing.sigma)
             made.append(replace(self.geometry(), light_plane=plane))
+            if self.pointing.roll_sigma:
+                plane = rolled(self.light_plane, self.exit_point, self.pointing.roll_sigma)
+                made.append(replace(self.geometry(), light_plane=plane))
         return made
 
     def as_dict(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
+from traceback import walk_tb
 from typing import Any
 
 from sim_backends.peers.script_context import Context, Job, ProgramError
@@ -53,6 +54,7 @@ class Machine:
         except RecursionError as error:
             raise ScriptError("its expressions or blocks are nested too deeply") from error
         self.name = program.name
+        self._places = program.places
         self._threads: dict[int, Thread] = {}
         self._turns = 0
         self._names: dict[str, Any] = known | {
@@ -102,13 +104,24 @@ class Machine:
                 next(thread)
             except StopIteration:
                 self._threads.pop(number, None)
-            except (ProgramError, _Halt):
+            except _Halt:
                 raise
-            except NameError as error:
-                raise ProgramError(f"variable {str(error.name).removeprefix('u_')!r} is not defined") from error
             except Exception as error:
                 # Whatever a script brings about ends the script, not the controller.
-                raise ProgramError(f"{self.name}: {str(error) or type(error).__name__}") from error
+                raise self._located(error) from error
+
+    def _located(self, error: Exception) -> ProgramError:
+        """`error` in the words of the program, with the statement that brought it about."""
+        if isinstance(error, ProgramError):
+            found = ProgramError(str(error))
+        elif isinstance(error, NameError):
+            found = ProgramError(f"variable {str(error.name).removeprefix('u_')!r} is not defined")
+        else:
+            found = ProgramError(f"{self.name}: {str(error) or type(error).__name__}")
+        for frame, number in walk_tb(error.__traceback__):
+            if frame.f_code.co_filename == f"<{self.name}>":
+                found.line, found.column = self._places[number - 1]
+        return found
 
     def _close(self) -> None:
         for number in list(self._threads):

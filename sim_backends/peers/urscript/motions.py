@@ -1,6 +1,7 @@
 """URScript's commands that move the arm: moves, streams, stops and compliance. Source: the maker's script manual.
 
-Blend radii are not modelled: the arm stops at every way point. A circle is two straight lines, by its via point.
+A move that is asked to be faster than the joints can takes longer. Blend radii are not modelled: the arm stops at
+every way point.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_backends.models.arm_circle import ArcMove
 from sim_backends.models.arm_kinematics import Matrix, Vector
 from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
@@ -46,20 +48,23 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
 
     def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
         goal = joints(q)
+        limit = e.context.model.params.joint_limit
+        farthest = int(np.abs(goal).argmax())
+        if abs(goal[farthest]) > limit:
+            raise ProgramError(f"movej: joint {farthest} to {goal[farthest]:.6g} rad, its limit is {limit:.6g} rad")
         length = float(np.abs(goal - e.context.model.drive.q).max())
         yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
 
     def movel(pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
         goal, here = tool(pose), e.context.model.drive.base_from_tcp()
         length = math.dist(goal[:3, 3], here[:3, 3])
-        yield from e.move(LinearMove(goal, *_timed(length, t, v, a)))
+        yield from e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
 
     def movep(pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
         yield from movel(pose, a, v)
 
     def movec(pose_via: Any, pose_to: Any, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
-        yield from movel(pose_via, a, v)
-        yield from movel(pose_to, a, v)
+        yield from e.move(ArcMove(tool(pose_via)[:3, 3], tool(pose_to), v, a, fixed=mode == 1))
 
     def optimovej(q: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
         yield from movej(q, a * _MOST_ACCELERATION, v * _leading(e))

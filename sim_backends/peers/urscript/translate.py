@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from sim_backends.peers.urscript.words import ScriptError, Token, tokens
+from sim_backends.peers.urscript.words import ScriptError, Token, syntax_error, tokens
 
 _LEVELS = (("or",), ("xor",), ("and",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
 """Binary operators, those that bind least first."""
@@ -40,22 +40,27 @@ class Translation:
 
     source: str
     name: str
+    places: list[tuple[int, int]]
+    """Line and column of the script for each line of the source."""
 
 
 def translate(text: str, commands: Collection[str], waiting: Collection[str]) -> Translation:
     """`commands` are those that act at once, `waiting` those that take time. Raises `ScriptError`."""
-    return _Translator(tokens(text), commands, waiting).program()
+    return _Translator(text, commands, waiting).program()
 
 
 class _Translator:
-    def __init__(self, words: list[Token], commands: Collection[str], waiting: Collection[str]) -> None:
-        self._words = words
+    def __init__(self, text: str, commands: Collection[str], waiting: Collection[str]) -> None:
+        self._text = text
+        self._words = words = tokens(text)
         self._at = 0
         self._commands, self._waiting = commands, waiting
         pairs = list(pairwise(words))
         self._functions = {after.text for word, after in pairs if word.text in ("def", "thread")}
         self._globals = {after.text for word, after in pairs if word.text == "global"}
         self._lines: list[str] = []
+        self._places: list[tuple[int, int]] = []
+        self._place = (1, 1)
         self._indent = 0
         self._function = _Function(outermost=True)
         self._choices = 0
@@ -72,7 +77,7 @@ class _Translator:
         while self._at < len(self._words):
             if self._take().kind != "end":
                 raise self._error("goes on after its end")
-        return Translation("\n".join(self._lines) + "\n", name)
+        return Translation("\n".join(self._lines) + "\n", name, self._places)
 
     # --- words ---
 
@@ -98,10 +103,14 @@ class _Translator:
         return word.text
 
     def _error(self, what: str) -> ScriptError:
-        return ScriptError(f"line {self._now.line} {what}")
+        return syntax_error(self._text, self._now.line, self._now.column, f" {what}")
 
     def _write(self, line: str) -> None:
-        self._lines.append("    " * self._indent + line)
+        self._insert(len(self._lines), line)
+
+    def _insert(self, at: int, line: str) -> None:
+        self._lines.insert(at, "    " * self._indent + line)
+        self._places.insert(at, self._place)
 
     # --- functions ---
 
@@ -136,7 +145,7 @@ class _Translator:
         self._statements(until)
         shared = sorted(f"u_{name}" for name in function.assigned - function.mine)
         if shared:
-            self._lines.insert(place, "    " * self._indent + "global " + ", ".join(shared))
+            self._insert(place, "global " + ", ".join(shared))
         self._indent -= 1
         self._function = outer
 
@@ -161,6 +170,7 @@ class _Translator:
 
     def _statement(self) -> None:
         word = self._now.text
+        self._place = self._now.line, self._now.column
         if word in ("def", "thread"):
             self._define()
         elif word == "while":
@@ -231,6 +241,7 @@ class _Translator:
     def _if(self) -> None:
         word = "if"
         while word in ("if", "elif"):
+            self._place = self._now.line, self._now.column
             self._take()
             self._write(f"{word} {self._condition()}:")
             self._block("elif", "else", "end")
@@ -342,7 +353,11 @@ class _Translator:
             return f"(yield from {name}{self._arguments('')})"
         if name in self._commands:
             return f"{name}{self._arguments('')}"
-        raise self._error(f"calls {name!r}, which is neither a function of it nor a command of this controller")
+        word = self._words[self._at - 1]
+        raise ScriptError(
+            f"line {word.line} calls {name!r}, which is neither a function of it nor a command of this controller",
+            word.line, word.column, f"compile_error_name_not_found:{name}:",
+        )  # fmt: skip
 
     def _elements(self) -> str:
         values = []

@@ -7,7 +7,21 @@ from dataclasses import dataclass
 
 
 class ScriptError(Exception):
-    """The text is no URScript: it does not compile, and nothing of it is run."""
+    """The text is no URScript: it does not compile, and nothing of it is run.
+
+    `line` and `column` count from 1, 0 where they are not known; `told` is how a controller says it to its clients.
+    """
+
+    def __init__(self, words: str, line: int = 0, column: int = 0, told: str = "") -> None:
+        super().__init__(words)
+        self.line, self.column, self.told = line, column, told or words
+
+
+def syntax_error(text: str, line: int, column: int, what: str) -> ScriptError:
+    """The error of a program `text` at a place; a controller repeats the whole line."""
+    rows = text.split("\n")
+    row = rows[line - 1] if line <= len(rows) else ""
+    return ScriptError(f"line {line}{what}", line, column, f"syntax_error_on_line:{line}:{row}:")
 
 
 @dataclass(frozen=True)
@@ -17,6 +31,7 @@ class Token:
     kind: str
     text: str
     line: int
+    column: int
 
 
 _TOKEN = re.compile(
@@ -37,21 +52,23 @@ _UNFINISHED = frozenset(
 def tokens(text: str) -> list[Token]:
     """The tokens of `text`; comments and the editor's `$` labels are dropped. Raises `ScriptError`."""
     found: list[Token] = []
-    at, line, depth = 0, 1, 0
+    at, line, begun, depth = 0, 1, 0, 0
     while at < len(text):
         match = _TOKEN.match(text, at)
         if match is None:
-            raise ScriptError(f"line {line}: {text[at : at + 20]!r} is no URScript")
+            raise syntax_error(text, line, at - begun + 1, f": {text[at : at + 20]!r} is no URScript")
+        column = at - begun + 1
         at, kind, word = match.end(), str(match.lastgroup), match[0]
         if kind == "end":
             whole = depth == 0 and found and found[-1].kind != "end" and found[-1].text not in _UNFINISHED
             if whole:
-                found.append(Token("end", "\n", line))
-            line += word == "\n"
+                found.append(Token("end", "\n", line, column))
+            if word == "\n":
+                line, begun = line + 1, at
         elif kind != "space":
             depth += (word in "([") - (word in ")]") if kind == "sign" else 0
-            found.append(Token(kind, word, line))
-    found.append(Token("end", "\n", line))
+            found.append(Token(kind, word, line, column))
+    found.append(Token("end", "\n", line, len(text) - begun + 1))
     return found
 
 

@@ -1,0 +1,50 @@
+"""A vehicle or a station that has moved since the board was photographed is seen before the part is put down."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.devices.direct import VirtualCell
+from cell.lab.bench.whole_job import JobRecord, NoFrames
+from cell.steps.unmoved import require_unmoved
+from drivers.errors import RefusedError
+from tests.report_runs import CONFIG, at_station, pot, work_of
+
+
+def looked(record: JobRecord, further: float, folder: Path) -> str:
+    """The refusal of a look at the board with the vehicle so many metres from where it stood; "" for none."""
+    job, nominal = pot()
+    cell = VirtualCell(CONFIG, record.seed, record.level)
+    at_station(cell, record, further)
+    cell.devices.vehicle.brake()
+    work = work_of(cell, job, nominal, record, NoFrames(), folder)
+    try:
+        require_unmoved(work, record.results["board_photo"], "before the sweep", lambda share, text: None)
+    except RefusedError as refused:
+        assert refused.numbers[0].name == "board moved by"
+        return str(refused)
+    return ""
+
+
+@pytest.mark.parametrize("further", [0.0, 1.0e-3])
+def test_a_vehicle_that_was_pushed_after_the_photograph_is_refused(
+    placed_pot: JobRecord, tmp_path: Path, further: float
+) -> None:
+    said = looked(placed_pot, further, tmp_path)
+    if not further:
+        assert said == ""
+        return
+    (shift,) = re.findall(r"the board has moved by (\d\.\d\d) mm .* before the sweep.*run the job again", said)
+    assert float(shift) == pytest.approx(1.0, abs=0.3)
+
+
+def test_what_the_cameras_mounting_is_off_by_does_not_hide_it(placed_pot: JobRecord) -> None:
+    fix = placed_pot.results["board_photo"]
+    # Part of what is stated of the board, and no more than that.
+    assert np.linalg.eigvalsh(fix.by_mount).min() > -1e-12
+    assert np.linalg.eigvalsh(fix.covariance - fix.by_mount).min() > -1e-12
+    assert np.trace(fix.by_mount) > 0.0
