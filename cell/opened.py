@@ -81,6 +81,9 @@ class Opened:
         # Beside a real scan camera the simulated world has nothing to do with where the part comes to lie.
         if self.simulated is not None and "scan_camera" in self.simulated.simulated:
             return self.simulated.truth
+        # What a claw holds that is not told to open stays there.
+        if self.simulated is not None and "claw" in self.simulated.simulated:
+            return None
         return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     def recorded(

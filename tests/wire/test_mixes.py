@@ -123,7 +123,10 @@ def placed(folder: Path, sim: str, job: str = "pot") -> None:
     report = json.loads((outcome.folder / "report.json").read_text(encoding="utf-8"))
     print(sim, outcome, json.dumps({key: report[key] for key in ("following", "truth")}))
     assert outcome.outcome == "placed", outcome.reason
-    assert report["truth"]["error_mm"]["d"]["mean"] < 0.30
+    if sim == "claw":
+        assert report["truth"] is None, "nobody knows: the real claw has kept its part"
+    else:
+        assert report["truth"]["error_mm"]["d"]["mean"] < 0.30
     assert set(report["simulated"]) == set(sim.split(","))
     assert {name for name, serial in serials.items() if serial.startswith("simulated-")} == set(sim.split(",")) & set(
         serials
