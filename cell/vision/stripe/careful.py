@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MOST_WANDER = 8.0
-WIDEST = 36.0
-"""σ in px of the widest stripe that is one; what is wider is light and shade on the scenery."""
+WIDEST = 48.0
+"""σ in px of the Gaussian that fits the widest stripe best, 45 of a flat top of 30 px; what is wider is light and shade
+on the scenery."""
 
 
 @dataclass(frozen=True)
