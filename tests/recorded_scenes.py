@@ -44,10 +44,11 @@ def scene(
     laser: bool = True,
     board: str = BOARD.name,
     focal: float = 1.0,
+    tilt: float = 0.45,
 ) -> list[RecordedFrame]:
     """Frames with poses. `bend` in m at the board's edge; turns about `axes` axes; `second`: frames of another line.
 
-    `focal`: the boards are seen with so many times the focal length.
+    `focal`: the boards are seen with so many times the focal length. `tilt`: at most, rad, each way.
     """
     rng = np.random.default_rng(seed)
     spec = parse_board(board)
@@ -57,9 +58,9 @@ def scene(
     real[:, 2] += bend * ((points[:, 0] - middle[0]) / (np.ptp(points[:, 0]) / 2)) ** 2
     frames = []
     for k in range(count):
-        tilt = rng.uniform((-0.45, -0.45, -0.9), (0.45, 0.45, 0.9)) * (axes > 1, axes > 1, axes > 0)
-        tilt += (0.25, 0.1, 0.3) if axes < 2 else (0.0, 0.0, 0.0)
-        turn = _turn(2, tilt[2]) @ _turn(0, tilt[0]) @ _turn(1, tilt[1])
+        angles = rng.uniform((-tilt, -tilt, -0.9), (tilt, tilt, 0.9)) * (axes > 1, axes > 1, axes > 0)
+        angles += (0.25, 0.1, 0.3) if axes < 2 else (0.0, 0.0, 0.0)
+        turn = _turn(2, angles[2]) @ _turn(0, angles[0]) @ _turn(1, angles[1])
         at = np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.035, 0.035), 0.4 + rng.uniform(-0.06, 0.06)])
         camera_from_board = pin.SE3(turn, at - turn @ middle)
         frame = RecordedFrame(Path(f"frame{k:04d}.png"), f"frame{k:04d}.png")

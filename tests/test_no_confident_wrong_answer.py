@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
 from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
 from cell.calibration.solve.blocks import HAND
 from cell.calibration.solve.board_shape import moved_by_bend
+from cell.calibration.solve.camera_checks import camera_checks
 from cell.calibration.solve.choice import choose_solution, with_doubt_of_camera
 from cell.calibration.solve.foreign import foreign_view, own_cameras
 from cell.calibration.solve.intrinsics import choose_lens
@@ -288,6 +290,18 @@ def test_few_views_of_a_bent_board_state_how_little_they_tell(seed):
     """A bend of 0.2 mm that four views cannot tell moved the focal length by three times what was stated."""
     found, _ = choose_lens([f.view for f in scene(seed=seed, count=4, bend=2e-4, laser=False)])
     assert abs(found.camera.fx - MATRIX[0, 0]) < 2 * found.sigma[0] < 0.1 * MATRIX[0, 0]
+
+
+@pytest.mark.parametrize(("tilt", "verdict"), [(0.08, "doubt"), (0.45, "ok")])
+def test_a_board_that_was_hardly_tilted_is_a_doubt_with_its_angle(tilt, verdict):
+    """A bend that nobody sees and the focal length look alike: 8 pictures of a real board were 5 deviations off."""
+    frames = scene(seed=6, count=8, laser=False, tilt=tilt)
+    views = [frame.view for frame in frames]
+    found, _ = choose_lens(views)
+    (check,) = (c for c in camera_checks(found, views, [f.name for f in frames]) if c.name.startswith("tilt"))
+    assert check.verdict == verdict
+    if verdict == "doubt":
+        assert re.search(r"tilted by 1?\d° at most.*tilt it by 45°", check.text)
 
 
 @pytest.mark.parametrize("seed", [4, 5])
