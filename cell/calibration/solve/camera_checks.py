@@ -93,7 +93,7 @@ def _tilt(views: Sequence[BoardView], camera: CameraModel) -> Check:
     facing = np.array([board_pose(view, camera).camera_from_board.rotation[:, 2] for view in views])
     tilt = float(np.degrees(np.arccos(np.clip(facing @ facing.T, -1.0, 1.0)).max()))
     return Check(
-        "intrinsics", "tilt that is needed, of the board's", LEAST_TILT_DEG / max(tilt, 0.1), 1.0, np.inf, "times",
+        "intrinsics", "needed tilt of the board over what it had", LEAST_TILT_DEG / max(tilt, 0.1), 1.0, np.inf, "",
         f"from one picture to another the board was tilted by {tilt:.0f}° at most, so that a board that is bent a "
         f"little, too little to be seen, moves fx = {camera.fx:.0f} px by more than is stated; tilt it by 45°, to "
         "several sides",
