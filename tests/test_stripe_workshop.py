@@ -10,7 +10,9 @@ from scipy.ndimage import gaussian_filter
 from cell.lab.bench.stripe_profiles import measure, within_limits
 from cell.lab.bench.stripe_workshop import Scene, draw
 from cell.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
+from cell.vision.stripe.careful import Careful
 from cell.vision.stripe.extract import extract
+from cell.vision.stripe.pieces import with_pieces
 from cell.vision.stripe.planes import as_picture, range_of
 from cell.vision.stripe.stream import StripeStream
 
@@ -191,3 +193,70 @@ def test_colours_are_read_in_the_sensors_frame_whatever_the_picture_says(tmp_pat
     seen = read_colours(tmp_path / "side.jpg")
     assert seen.shape == (40, 60, 3) == (*read_picture(tmp_path / "side.jpg").shape, 3)
     assert seen[20, 5, 0] > 150 > 50 > seen[20, 40, 0]
+
+
+def line_of(width: np.ndarray, seed: int, light: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A line whose rows are `width` (rows,) px wide, with `light` (rows,) times the usual; its true centres."""
+    rng = np.random.default_rng(seed)
+    row = np.arange(len(width))
+    centres = 320 + 0.05 * (row - row.mean())
+    height = 120 * light * np.sqrt(np.minimum(1.0, 2.0 / width))
+    stripe = height[:, None] * np.exp(-0.5 * ((np.arange(640) - centres[:, None]) / width[:, None]) ** 2)
+    noisy = rng.poisson((8 + stripe) * 40) / 40 + rng.normal(0, 0.4, stripe.shape)
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8), centres
+
+
+@pytest.mark.parametrize(
+    "width",
+    [np.linspace(1.5, 8, 480), np.linspace(2, 15, 480), np.repeat([1.0, 3.0, 9.0], 160)],
+    ids=["1.5 to 8", "2 to 15", "1, 3, 9"],
+)
+def test_pieces_of_a_line_that_are_much_wider_or_narrower_than_the_rest_are_read(width):
+    """Out of focus, on what shines: of these a tenth to a third was not found."""
+    for seed in (1, 2):
+        image, centres = line_of(width, seed)
+        profile = extract(image)
+        error = profile.centres - centres
+        assert np.isfinite(error).mean() > 0.98
+        assert np.nanmax(np.abs(error)) < 0.7
+        for piece in np.array_split(np.arange(480), 3):
+            score = np.sqrt(np.nanmean((error / profile.sigma)[piece] ** 2))
+            assert 0.4 < score < 1.25, score
+
+
+def careful(centres: np.ndarray, light: float = 240.0) -> Careful:
+    """What the careful way found: a line 2 px wide."""
+    seen = np.isfinite(centres)
+    width, zero = np.where(seen, 2.0, np.nan), np.zeros(len(centres))
+    return Careful(centres.copy(), 0.02 * width, 0.5 * light * width / 2, width, zero > 0, zero, width / 2, None)
+
+
+@pytest.mark.parametrize(
+    ("piece", "taken"),
+    [
+        (lambda on: careful(on), True),
+        (lambda on: careful(on, 100.0), True),
+        (lambda on: careful(on + 5.0), False),
+        (lambda on: careful(on, 20.0), False),
+        (lambda on: careful(np.where(np.arange(len(on)) % 3 > 0, on, np.nan)), False),
+    ],
+    ids=["the line", "a darker part of it", "beside it", "a reflection", "specks"],
+)
+def test_a_gap_of_a_line_is_filled_only_with_the_same_line(piece, taken):
+    centres = 320 + 0.05 * np.arange(480)
+    line = careful(np.where(np.arange(480) < 330, centres, np.nan))
+    asked = []
+
+    def read(rows: slice) -> Careful:
+        asked.append(rows)
+        return piece(centres[rows])
+
+    with_pieces(line, read)
+    assert len(asked) == 1 and asked[0].start == pytest.approx(330, abs=6) and asked[0].stop == 480
+    assert np.isfinite(line.centres[340:]).all() == taken
+    assert np.isfinite(line.centres[:320]).all()
+
+
+def test_where_little_of_a_picture_shows_a_line_nothing_is_added_to_it():
+    line = careful(np.where(np.arange(480) < 140, 320.0, np.nan))
+    with_pieces(line, lambda rows: pytest.fail("read again"))

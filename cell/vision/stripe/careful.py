@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
 from cell.vision.stripe.learning import FREE_SCALE, learn_profile
 from cell.vision.stripe.look import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
+from cell.vision.stripe.pieces import with_pieces
 from cell.vision.stripe.planes import MIXES, Laser, Picture
 from cell.vision.stripe.shape import Shape
 from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
@@ -68,8 +69,23 @@ def read_carefully(
 ) -> Careful:  # fmt: skip
     """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
 
-    `starts` (lines,) in px, NaN where there is none, spare the following.
+    `starts` (lines,) in px, NaN where there is none, spare the following. Pieces of another width are read where the
+    picture itself teaches the profile.
     """
+    line = _of_one_width(picture, off, laser, settings, like, starts)
+    if like is None:
+        with_pieces(
+            line,
+            lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, None),
+        )
+    return line
+
+
+def _of_one_width(
+    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None,
+    starts: Array | None,
+) -> Careful:  # fmt: skip
+    """`read_carefully` without what differs in width from the rest by more than twice."""
     lines = picture.value.shape[0]
     mix = like.mix if like is not None else choose_mix(picture, off, laser)
     value, usable, shade = difference(picture, off, mix)

@@ -66,6 +66,10 @@ class Picture:
         """True when the three colours differ."""
         return self.value.ndim == 3
 
+    def rows(self, part: slice) -> Picture:
+        """Some rows of it."""
+        return Picture(self.value[part], self.saturated[part], self.plain, self.full)
+
     def turned(self) -> Picture:
         """The picture with its columns as rows."""
         turn = (1, 0, 2) if self.coloured else (1, 0)
