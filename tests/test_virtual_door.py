@@ -360,3 +360,14 @@ def test_the_command_line_says_what_time_passed_here_and_there(
     assert command(monkeypatch, *virtual) == 0
     assert re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", capsys.readouterr().out)
     assert command(monkeypatch, *virtual, "--speed", "2") == 2
+
+
+def test_a_run_goes_at_the_pace_that_was_set() -> None:
+    times = []
+    for share in (1.0, 0.5):
+        with opened() as cell:
+            cell.pace = share
+            report = cell.run("pot.toml", until="board_photo").report
+        times.append({step["name"]: step["duration_s"] for step in report["steps"]})
+    for step in ("drive_to_target", "board_photo"):
+        assert 1.4 < times[1][step] / times[0][step] < 2.0, step

@@ -29,6 +29,7 @@ from cell.report.truth import Witness
 from cell.run.folder import new_run, write_json
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
+from cell.run.pace import Pace
 from cell.run.run import Run
 from cell.run.sweeping import Sweeping
 from cell.steps.kinds import Kind
@@ -109,7 +110,7 @@ class JobRun:
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
-    `truth` asks a simulated world.
+    `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned.
     """
 
     run: Run[Any]
@@ -124,6 +125,7 @@ class JobRun:
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
     truth: Callable[[], dict[str, Any]] | None = None
+    pace: Pace = field(default_factory=Pace)
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -163,6 +165,7 @@ class JobRun:
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
                 registered=self._registered,
+                pace=self.pace,
             )
             runner = Runner(
                 sequence=self.kind.sequence(),

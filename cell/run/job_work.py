@@ -73,6 +73,7 @@ class JobWork:
             self.inline,
             earlier,
             cell.truth,
+            cell.pace,
         )
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)

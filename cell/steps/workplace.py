@@ -17,6 +17,7 @@ from cell.devices.devices import Devices
 from cell.inversion import NominalSurface
 from cell.job import Job
 from cell.run.frames import FrameStore
+from cell.run.pace import Pace
 from cell.steps.moves import Mover
 from cell.steps.part import PartProgress
 from cell.steps.photograph import BoardFix, photograph
@@ -42,7 +43,7 @@ class Workplace:
     `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `whereabouts` is
     kept over retries and runs: the vehicle may stand anywhere when a step is done again. `sweeping` is told who takes
     the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface),
-    `registered` where it was found.
+    `registered` where it was found. `pace` says how fast arm and vehicle go, of what is planned.
     """
 
     config: CellConfig
@@ -58,13 +59,14 @@ class Workplace:
     sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
+    pace: Pace = field(default_factory=Pace)
     _photographs: int = field(default=0, init=False)
 
     @cached_property
     def mover(self) -> Mover:
         """Planned moves of the arm with the job's part in the claw."""
         devices = self.devices
-        return Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks)
+        return Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
 
     @cached_property
     def board(self) -> BoardSpec:
