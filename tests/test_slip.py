@@ -146,6 +146,19 @@ def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
         lose(lambda k: k % 4 == 0)
 
 
+@pytest.mark.parametrize("most_hz", [16.0, 10.0])
+def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float) -> None:
+    virtual, before, _ = cell
+    spec = virtual.scan_camera.model.spec
+    virtual.scan_camera.model.spec = replace(spec, frame_rate_max=most_hz)
+    try:
+        edge = look_at_edge(CONFIG, virtual.devices, let_go, before, None)
+    finally:
+        virtual.scan_camera.model.spec = spec
+    assert edge is not None
+    assert edge.place == pytest.approx(before.edge.place, abs=1e-5)
+
+
 def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused() -> None:
     axes = np.eye(3)[[1, 2, 0]]
     small, some, far = (Slip(size, 0.0, 0.0) for size in (0.9 * NOTED_M, 1.5 * NOTED_M, 1.1 * LARGEST_M))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.collect.witness import configure_fast
+from cell.calibration.collect.witness import RATES_HZ, configure_fast
 from cell.calibration.store import CellCalibration
 from cell.calibration.witness import Edge, Witness
 from cell.config import CellConfig
@@ -19,6 +20,7 @@ from drivers.interfaces import Frame
 
 SPEED = 2e-3
 SEARCH_SPEED = 5e-3
+"""With the fastest camera; a slower one is taken over the edge as much slower, for the pictures to lie as close."""
 ROOM_M = 1e-3
 """To an end of the rail's travel, beyond what it takes to gain speed."""
 REACH_M = 10e-3
@@ -82,32 +84,29 @@ def look_at_edge(
     low, high = config.rail.travel
     room = SEARCH_SPEED**2 / (2 * config.rail.acceleration) + ROOM_M
     low, high = low + room, high - room
+    rate = configure_fast(devices, config.calibration.stripe_exposure)
+    speed, search = (share * rate / RATES_HZ[0] for share in (SPEED, SEARCH_SPEED))
+    passed = partial(_passed, devices, keep, witness)
     # Away from the nearer end of the travel.
     way = 1.0 if high - witness.rail > witness.rail - low else -1.0
     if near is None:
         begin, end = (float(np.clip(witness.rail + way * far, low, high)) for far in (0.0, REACH_M))
-        near = _crossing(*_passed(config, devices, keep, witness, (begin, end), SEARCH_SPEED), way)
+        near = _crossing(*passed((begin, end), search), way)
         if near is None:
             return None
     begin, end = (float(np.clip(near + way * beside, low, high)) for beside in (-BESIDE_M, BESIDE_M))
-    fro = _crossing(*_passed_whole(config, devices, keep, witness, (begin, end)), way)
-    to = _crossing(*_passed_whole(config, devices, keep, witness, (end, begin)), way)
+    fro = _crossing(*_whole(lambda: passed((begin, end), speed)), way)
+    to = _crossing(*_whole(lambda: passed((end, begin), speed)), way)
     if fro is None or to is None:
         return None
-    return Edge(0.5 * (fro + to), way * (fro - to) / (2.0 * SPEED))
+    return Edge(0.5 * (fro + to), way * (fro - to) / (2.0 * speed))
 
 
-def _passed_whole(
-    config: CellConfig,
-    devices: Devices,
-    keep: Callable[[str, Frame], None],
-    witness: Witness,
-    ends: tuple[float, float],
-) -> tuple[Array, Array]:
-    """`_passed`, again where pictures were lost at the edge; `RefusedError` when they always are."""
+def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
+    """What `passed` gives, again where pictures were lost at the edge; `RefusedError` when they always are."""
     left_open = 0.0
     for _ in range(PASSES):
-        places, shares = _passed(config, devices, keep, witness, ends, SPEED)
+        places, shares = passed()
         left_open = _left_open(places, shares)
         if left_open <= OPEN_M:
             return places, shares
@@ -121,17 +120,11 @@ def _passed_whole(
 
 
 def _passed(
-    config: CellConfig,
-    devices: Devices,
-    keep: Callable[[str, Frame], None],
-    witness: Witness,
-    ends: tuple[float, float],
-    speed: float,
+    devices: Devices, keep: Callable[[str, Frame], None], witness: Witness, ends: tuple[float, float], speed: float
 ) -> tuple[Array, Array]:
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
-    configure_fast(devices, config.calibration.stripe_exposure)
     times, light = [], []
     with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
         sweep, over = rail.sweep(*ends, speed), np.inf

@@ -41,16 +41,16 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     return _on_the_plate(found)
 
 
-def configure_fast(devices: Devices, exposure: float) -> None:
-    """The scan camera for `exposure`, s, at the highest of `RATES_HZ` that it can; `LimitError` when it can none."""
-    for rate in RATES_HZ:
+def configure_fast(devices: Devices, exposure: float) -> float:
+    """Set the scan camera to `exposure`, s, and the highest of `RATES_HZ` that it can: that rate, or its `LimitError`."""
+    for rate in RATES_HZ[:-1]:
         try:
             devices.scan_camera.configure(exposure, rate)
         except LimitError:
-            if rate == RATES_HZ[-1]:
-                raise
-        else:
-            return
+            continue
+        return rate
+    devices.scan_camera.configure(exposure, RATES_HZ[-1])
+    return RATES_HZ[-1]
 
 
 def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness:
