@@ -42,5 +42,5 @@ class TestContract(CameraContract):
         # A tick that a busy machine has it miss is no exposure, and it counts none.
         periods = RATE_HZ * np.diff([frame.host_time for frame in made]) / ids
         assert np.median(periods) == pytest.approx(1.0, abs=0.2)
-        assert periods == pytest.approx(np.maximum(1.0, np.round(periods)), abs=0.5)
+        assert periods.min() > 0.5 and periods.max() < 2.5
         assert [frame.received for frame in made] == sorted(frame.received for frame in made)
