@@ -18,7 +18,7 @@ SHAPES = 3
 SIGNIFICANT, CERTAIN = 4.0, 2.0
 """Deviations, by leaving views out, from which a bend is believed."""
 USUAL = 1.5e-3
-"""Share of its diagonal by which a board may be bent without a doubt: `camera_checks` has the same."""
+"""Share of its diagonal by which a board may be bent without a doubt."""
 LEAST_RISE = 1e-6
 
 

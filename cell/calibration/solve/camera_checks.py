@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cell.calibration.solve.adjustment import DISTORTION_PRIOR
+from cell.calibration.solve.board_shape import USUAL
 from cell.calibration.solve.checks import Check
 from cell.calibration.solve.intrinsics import CENTRED_LENS, Intrinsics
 from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
@@ -66,7 +67,7 @@ def camera_checks(
     if found.bend is not None and found.bend.believed:
         made.append(
             Check(
-                "intrinsics", "bend of the board", 100 * found.bend.share, 0.15, 3.0, "% of its diagonal",
+                "intrinsics", "bend of the board", 100 * found.bend.share, 100 * USUAL, 3.0, "% of its diagonal",
                 f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx by "
                 f"{abs(found.bend.camera[0]):.1f} px and the principal point by "
                 f"{float(np.hypot(*found.bend.camera[2:4])):.1f} px; glue it to something flat",
