@@ -171,6 +171,8 @@ class Cell:
 
     @pace.setter
     def pace(self, share: float) -> None:
+        if share == self.pace:
+            return
         self._here.pace.share = share
         log.info("arm and vehicle move at %.0f %% of their planned speed from the next motion on", 100 * share)
 
