@@ -46,25 +46,21 @@ def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_
 
 
 def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
-    fastest = []
-    for share in (1.0, 0.5):
-        site, pace = Site(), Pace()
-        pace.share, fast = share, 0.0
+    def fastest(share: float) -> float:
+        site, pace, speeds = Site(), Pace(), [0.0]
+        pace.share = share
         site.whereabouts.say_at_start()
         site.vehicle.enable()
         site.whereabouts.enter(JOB)
-
-        def look() -> None:
-            nonlocal fast
-            fast = max(fast, abs(site.vehicle.state().speed))  # noqa: B023
-
         drive_to_target(
-            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, site.cell.clock, look,
+            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, site.cell.clock,
+            lambda: speeds.append(abs(site.vehicle.state().speed)),
             lambda share, text: None, site.notes.append, pace=pace,
         )  # fmt: skip
-        fastest.append(fast)
-    assert fastest[0] == pytest.approx(JOB.approach.speed, rel=0.1)
-    assert fastest[1] == pytest.approx(0.5 * JOB.approach.speed, rel=0.1)
+        return max(speeds)
+
+    for share in (1.0, 0.5):
+        assert fastest(share) == pytest.approx(share * JOB.approach.speed, rel=0.1)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9 * LEAST, 1.01, float("nan"), True, "fast", None])
