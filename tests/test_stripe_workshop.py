@@ -12,7 +12,7 @@ from cell.lab.bench.stripe_workshop import Scene, draw
 from cell.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
 from cell.vision.stripe.careful import Careful
 from cell.vision.stripe.extract import extract
-from cell.vision.stripe.pieces import with_pieces
+from cell.vision.stripe.pieces import fill_gaps
 from cell.vision.stripe.planes import as_picture, range_of
 from cell.vision.stripe.stream import StripeStream
 
@@ -251,7 +251,7 @@ def test_a_gap_of_a_line_is_filled_only_with_the_same_line(piece, taken):
         asked.append(rows)
         return piece(centres[rows])
 
-    with_pieces(line, read)
+    fill_gaps(line, read)
     assert len(asked) == 1 and asked[0].start == pytest.approx(330, abs=6) and asked[0].stop == 480
     assert np.isfinite(line.centres[340:]).all() == taken
     assert np.isfinite(line.centres[:320]).all()
@@ -259,4 +259,4 @@ def test_a_gap_of_a_line_is_filled_only_with_the_same_line(piece, taken):
 
 def test_where_little_of_a_picture_shows_a_line_nothing_is_added_to_it():
     line = careful(np.where(np.arange(480) < 140, 320.0, np.nan))
-    with_pieces(line, lambda rows: pytest.fail("read again"))
+    fill_gaps(line, lambda rows: pytest.fail("read again"))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
 from cell.vision.stripe.learning import FREE_SCALE, learn_profile
 from cell.vision.stripe.look import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
-from cell.vision.stripe.pieces import with_pieces
+from cell.vision.stripe.pieces import fill_gaps
 from cell.vision.stripe.planes import MIXES, Laser, Picture
 from cell.vision.stripe.shape import Shape
 from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
@@ -74,7 +74,7 @@ def read_carefully(
     """
     line = _of_one_width(picture, off, laser, settings, like, starts)
     if like is None:
-        with_pieces(
+        fill_gaps(
             line,
             lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, None),
         )

@@ -28,7 +28,7 @@ MOST_LIGHT = 4.0
 """Times more or less light than the rest of the line: a laser has the same everywhere, a surface takes its share."""
 
 
-def with_pieces(line: Careful, read: Callable[[slice], Careful]) -> None:
+def fill_gaps(line: Careful, read: Callable[[slice], Careful]) -> None:
     """Fill into `line` what `read` finds in its longer gaps, where that is the same line in another width."""
     seen = np.isfinite(line.centres)
     if seen.mean() < LEAST_LINE:
