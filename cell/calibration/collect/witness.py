@@ -42,7 +42,7 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
 
 
 def configure_fast(devices: Devices, exposure: float) -> float:
-    """Set the scan camera to `exposure`, s, and the highest of `RATES_HZ` that it can: that rate, or its `LimitError`."""
+    """Set the scan camera to `exposure`, s, and the highest of `RATES_HZ` that it can; that rate, or a `LimitError`."""
     for rate in RATES_HZ[:-1]:
         try:
             devices.scan_camera.configure(exposure, rate)
