@@ -12,8 +12,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cell.calibration.solve.adjustment import Priors
+from cell.calibration.solve.adjustment import Adjustment, Priors
+from cell.calibration.solve.blocks import PLANE
 from cell.calibration.solve.joint import Joint, solve_joint, solve_staged
+from cell.calibration.solve.one_more import one_more
 from cell.calibration.solve.results import ScanCalibration
 from cell.calibration.store import nominal_camera
 from cell.config import load_config
@@ -102,3 +104,20 @@ def test_rays_meet_the_bowed_sheet_and_its_derivatives_are_right() -> None:
         assert (moved - points) / step == pytest.approx(by_ray[:, :, k], rel=1e-4, abs=1e-5)
     moved = replace(sheet, distance=sheet.distance + step).intersect(rays)
     assert (moved - points) / step == pytest.approx(by_distance, rel=1e-4)
+
+
+def test_one_parameter_more_is_what_it_would_be_if_it_were_free() -> None:
+    _, joint = solved(0.0, 3)
+    distance, priors = PLANE.stop - 1, joint.adjusted.priors
+    held = joint.free.copy()
+    held[distance] = False
+    problem = Adjustment(joint.views, held, priors)
+    plane = joint.adjusted.state.plane
+    off = replace(joint.adjusted.state, plane=replace(plane, distance=plane.distance + 10e-6))
+    there = problem.solve(off, variance_rounds=0).state
+    more = one_more(problem, there, "stripe", lambda k, rows: rows[:, distance])
+    free = Adjustment(joint.views, joint.free, priors).solve(there, variance_rounds=0)
+    assert more.value == pytest.approx(free.state.plane.distance - there.plane.distance, rel=0.03)
+    assert more.sigma == pytest.approx(float(np.sqrt(free.covariance[distance, distance])), rel=0.01)
+    moved = free.state.camera.parameters - there.camera.parameters
+    assert more.gain[:8] * more.value == pytest.approx(moved[:8], rel=0.06, abs=1e-6)

@@ -1,7 +1,7 @@
 """The board's size against the arm's ways: a board that is printed larger or smaller than its name says shows here.
 
 Camera, rail and laser take their metres from the board, the flange's poses theirs from the arm. How much larger the
-board would have to be is asked of the adjustment's normal equations, with all else left free to take its part of it.
+board would have to be is one more parameter of the adjustment.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 
 from cell.calibration.solve.adjustment import Adjusted, Adjustment
 from cell.calibration.solve.blocks import SHARED
+from cell.calibration.solve.one_more import one_more
 from cell.geometry.camera import Array
 from drivers.errors import Measured, RefusedError
 
@@ -80,28 +81,16 @@ class BoardSize:
 def board_size(board: str, pitch: float, problem: Adjustment, found: Adjusted) -> BoardSize:
     """Of an adjustment's minimum. Its deviation counts the scatter of the arm that was found there."""
     state = found.state
-    normal = problem.normal_at(state)
-    normal.right[:], normal.right_own[:] = 0.0, 0.0
-    information, slope = 0.0, 0.0
-    for k, view in enumerate(problem.views):
-        for name, rows, residual, _ in problem.rows_of(k, state):
-            if name != "dots":
-                continue
-            # A larger board moves its points away from its origin.
-            away = view.points @ state.base_from_board.rotation.T
-            by_size = np.einsum("nij,nj->ni", rows[:, 21:24].reshape(-1, 2, 3), away).ravel()
-            information += float(by_size @ by_size)
-            slope += float(by_size @ residual)
-            mixed = by_size @ rows
-            normal.right += mixed[:SHARED]
-            normal.right_own[k] += mixed[SHARED:]
-    right = np.concatenate([normal.right, normal.right_own.ravel()])
-    follow = -normal.step(1e-9)
-    left = information + float(right @ follow)
-    if not left > 1e-9 * information:
+
+    def by_size(k: int, rows: Array) -> Array:
+        # A larger board moves its points away from its origin.
+        away = problem.views[k].points @ state.base_from_board.rotation.T
+        return np.asarray(np.einsum("nij,nj->ni", rows[:, 21:24].reshape(-1, 2, 3), away).ravel())
+
+    larger = one_more(problem, state, "dots", by_size)
+    if not larger.information > 0:
         return BoardSize(board, pitch, 0.0, np.inf, np.zeros(SHARED))
     # The stripe is weighed in m, by depths that are held still: a smaller board would fit it better by up to so much.
-    pull = normal.groups["stripe"].squares / left
-    scatter = float(np.linalg.norm([found.inflation / np.sqrt(left), ARM_SHARE, pull]))
-    share = slope / left
-    return BoardSize(board, pitch, share, scatter, share * follow[:SHARED])
+    pull = problem.normal_at(state).groups["stripe"].squares / larger.information
+    scatter = float(np.linalg.norm([found.inflation * larger.sigma, ARM_SHARE, pull]))
+    return BoardSize(board, pitch, larger.value, scatter, larger.value * larger.gain)

@@ -1,7 +1,7 @@
 """The bow of the light sheet: found beside everything else of the joint adjustment, and only where the stripes show it.
 
-A flat sheet is the rule. Whether it is bowed is asked of the adjustment's normal equations: what the stripes' residuals
-say of a bow, with all that other parameters can take of it left to them. docs/theory.md, section 6.
+A flat sheet is the rule. A bow is one more parameter of the adjustment, and kept only where the stripes' residuals ask
+for it. docs/theory.md, section 6.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.calibration.solve.adjustment import Adjusted, Adjustment, huber
-from cell.calibration.solve.blocks import SHARED, State, stripe_block
+from cell.calibration.solve.adjustment import Adjusted, Adjustment
+from cell.calibration.solve.blocks import SHARED, State
+from cell.calibration.solve.one_more import OneMore, one_more
 from cell.geometry.camera import Array
 
 EVIDENCE = 5.0
@@ -52,47 +53,30 @@ def with_bow(problem: Adjustment, flat: Adjusted) -> Adjusted:
     if flat.state.plane is None:
         return flat
     found = flat
-    change, sigma, gain = _asked(problem, found.state)
-    if not abs(change) > EVIDENCE * sigma:
+    more = _asked(problem, found.state)
+    if not abs(more.value) > EVIDENCE * more.sigma:
         return flat
     for _ in range(ROUNDS):
         assert found.state.plane is not None
-        plane = found.state.plane.bowed(found.state.plane.bow + change)
+        plane = found.state.plane.bowed(found.state.plane.bow + more.value)
         found = problem.solve(replace(found.state, plane=plane))
-        change, sigma, gain = _asked(problem, found.state)
-        if abs(change) < 0.1 * sigma:
+        more = _asked(problem, found.state)
+        if abs(more.value) < 0.1 * more.sigma:
             break
     assert found.state.plane is not None
-    bow = Bow(found.state.plane.bow, sigma, gain)
-    covariance = found.covariance + sigma**2 * np.outer(gain, gain)
+    bow = Bow(found.state.plane.bow, more.sigma, more.gain)
+    covariance = found.covariance + more.sigma**2 * np.outer(more.gain, more.gain)
     return replace(found, covariance=covariance, bow=bow)
 
 
-def _asked(problem: Adjustment, state: State) -> tuple[float, float, Array]:
-    """By how much more the sheet seems bowed at a minimum, its standard deviation, and how the shared parameters (27,)
-    follow."""
-    normal = problem.normal_at(state)
-    normal.right[:], normal.right_own[:] = 0.0, 0.0
-    information, slope = 0.0, 0.0
-    for k, (view, flange, rail) in enumerate(zip(problem.views, state.flanges, state.rails, strict=True)):
-        if not len(view.stripe):
-            continue
-        assert state.plane is not None
-        residual, jacobian, sigma = stripe_block(state, view, flange, float(rail))
-        sigma = problem.priors.stripe_scale * sigma
-        weight, _ = huber(np.abs(residual / sigma))
-        root = np.sqrt(weight) / sigma
+def _asked(problem: Adjustment, state: State) -> OneMore:
+    """By how much more the sheet seems bowed at a minimum."""
+    plane = state.plane
+    assert plane is not None
+
+    def by_bow(k: int, rows: Array) -> Array:
         # A bow moves a point as the plane's distance does, by the bow's shape there.
-        points = state.plane.intersect(state.camera.rays(view.stripe))
-        by_bow = jacobian[:, 11] * state.plane.shape(points) * root
-        information += float(by_bow @ by_bow)
-        slope += float(by_bow @ (residual * root))
-        mixed = by_bow @ (jacobian * root[:, None])
-        normal.right += mixed[:SHARED]
-        normal.right_own[k] += mixed[SHARED:]
-    right = np.concatenate([normal.right, normal.right_own.ravel()])
-    follow = -normal.step(1e-9)
-    left = information + float(right @ follow)
-    if not left > 1e-9 * information:
-        return 0.0, np.inf, np.zeros(SHARED)
-    return slope / left, 1.0 / float(np.sqrt(left)), follow[:SHARED]
+        points = plane.intersect(state.camera.rays(problem.views[k].stripe))
+        return np.asarray(rows[:, 11] * plane.shape(points))
+
+    return one_more(problem, state, "stripe", by_bow)
