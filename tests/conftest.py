@@ -70,6 +70,7 @@ GROUPS = (
         "test_confirmed_turn.py",
         "test_quiet.py",
         "test_unmoved.py",
+        "test_second_look.py",
         "test_timing.py",
         "test_fixed_vehicle.py",
         "test_record.py",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import pinocchio as pin
+
 from cell.calibration import ScanCalibration
 from cell.calibration.collect.edge import require_edge
 from cell.calibration.collect.witness import require_witness
@@ -106,21 +108,27 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     return sweep
 
 
-def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
+def swept(
+    here: Workplace,
+    fix: BoardFix,
+    head: ScanCalibration,
+    scan: ScanSection,
+    keep_frame: Callable[[Frame], None],
+    check: Callable[[], None],
+    progress: Callable[[float, str], None],
+    sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None,
+) -> SweepRecord:
+    """`laser_sweep` where a job is done, over the strips of `scan`; raises what it raises.
+
+    The board tells where the surface is; `sweeping` is told it beside who takes the frames.
+    """
     base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
     base_from_surface = base_from_place * here.job.surface.place_from_surface.se3()
     devices = here.devices
-    if not devices.rail.state().homed_here:
-        context.progress(0.0, "homing the rail")
-        devices.rail.home().wait(60.0)
-    head = here.calibration.scan
-    pointing, slip = _seen_on_plate(here, context)
-    timing, doubts = times_known(head, here.config)
-    if pointing is not None:
-        head = head.pointed(pointing, here.config.laser.exit_point)
-    record = laser_sweep(
-        scan_plans(here.config, here.job, base_from_surface, head),
-        unhurried(here.job.scan, context.attempt),
+    _home(here, progress)
+    return laser_sweep(
+        scan_plans(here.config, here.job.model_copy(update={"scan": scan}), base_from_surface, head),
+        scan,
         head.geometry(),
         SweepErrors(
             here.repeatability,
@@ -128,19 +136,46 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
             SHIFT_SHARE * here.job.place.tolerance,
             devices.clock.rate,
             math.hypot(here.config.scan_camera.late, here.config.rail.late),
-            timing,
+            times_known(here.calibration.scan, here.config)[0],
         ),
         here.mover,
         devices,
+        keep_frame,
+        check,
+        progress,
+        lambda collector: sweeping(collector, base_from_surface),
+    )
+
+
+def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
+    head = here.calibration.scan
+    _home(here, context.progress)
+    pointing, slip = _seen_on_plate(here, context)
+    doubts = times_known(head, here.config)[1]
+    if pointing is not None:
+        head = head.pointed(pointing, here.config.laser.exit_point)
+    record = swept(
+        here,
+        fix,
+        head,
+        unhurried(here.job.scan, context.attempt),
         lambda frame: here.frames.keep("stripe", frame),
         context.check,
         context.progress,
-        lambda collector: here.sweeping(collector, base_from_surface),
+        here.sweeping,
     )
-    record = replace(record, pointing=pointing, slip=slip, doubts=(*unwatched(head.witness), *doubts, *here.notes))
+    rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
+    doubts = (*unwatched(head.witness), *doubts, *here.notes)
+    record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)
     for note in record.notes:
         context.note(text=note)
     return record
+
+
+def _home(here: Workplace, progress: Callable[[float, str], None]) -> None:
+    if not here.devices.rail.state().homed_here:
+        progress(0.0, "homing the rail")
+        here.devices.rail.home().wait(60.0)
 
 
 def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | None, tuple[str, ...]]:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.inversion import PlacePose
+from cell.inversion.moved import SurfaceMotion
 from cell.job import Job
 from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.photograph import BoardFix
+from cell.steps.reconstruct import Reconstruction
+from cell.steps.second_look import require_in_place
 from cell.steps.step import JobStep
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
 from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import Workplace
@@ -31,12 +35,14 @@ FAST_FORCE = 3.0
 @dataclass(frozen=True, eq=False)
 class PlaceResult:
     """Where the flange was when the part was let go, how far that was from where it was expected, in m, pressed on as
-    it was, and where the part had touched first; None from an arm that tells too few states."""
+    it was, and where the part had touched first; None from an arm that tells too few states. `moved` is how far the
+    surface seemed to have gone between its sweep and the descent."""
 
     base_from_flange: pin.SE3
     contact: bool
     depth_error: float
     touch: TouchCheck | None = None
+    moved: SurfaceMotion | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -51,6 +57,7 @@ class PlaceResult:
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
+            "surface_moved": None if self.moved is None else self.moved.as_dict(),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
             "base_from_flange_units": {"translation": "m", "rotation_vector": "rad"},
         }
@@ -157,7 +164,7 @@ def require_held(part: PartProgress) -> None:
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
     pose = context.made(PlacePose)
     require_held(here.part)
-    require_unmoved(here, context.made(BoardFix), "before the sweep", context.progress)
+    moved = _looked_again(here, pose, context)
     done = place(
         here.job,
         pose.base_from_surface,
@@ -172,8 +179,28 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     )
     for note in done.notes:
         context.note(text=note)
-    return done
+    return replace(done, moved=moved)
+
+
+def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SurfaceMotion | None:
+    """`RefusedError` when the surface is not where it was measured; None where it was measured without a sweep."""
+    fix = context.made(BoardFix)
+    try:
+        sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
+    except LookupError:
+        # A kind of job that measures in another way.
+        require_unmoved(here, fix, "before its place was measured", context.progress)
+        return None
+    if pose.verdict.unseen:
+        # Where only the board decides, the surface tells nothing.
+        require_unmoved(here, fix, "before the sweep", context.progress)
+    return require_in_place(here, fix, sweep, scan, pose, context)
 
 
 # A part that may have touched the surface is not placed a second time by itself.
-STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))
+STEP = JobStep(
+    Step("place", 180.0, on_failure=OnFailure.STOP),
+    _at,
+    PlaceResult,
+    needs=(BoardFix, SweepRecord, Reconstruction, PlacePose),
+)

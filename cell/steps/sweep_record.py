@@ -11,20 +11,22 @@ from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
 from cell.steps.swath import Swath
 from cell.vision import StripeProfile
-from drivers.interfaces import Frame, Vector
+from drivers.interfaces import ArmMotion, Frame, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
     """What the sweeps brought, in their order; at least one. `pointing` of the laser and `slip` of the head, where a
     witness told them; `doubts` for people: what of calibration and arm is not as one would have it. `earlier` names the
-    run that swept, where it was another one."""
+    run that swept, where it was another one. `rest` is the motion that brought the arm to where it stood meanwhile, if
+    it did: as long as that is the arm's newest, it stands there."""
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
     doubts: tuple[str, ...] = ()
     slip: Slip | None = None
     earlier: str = ""
+    rest: ArmMotion | None = None
 
     @property
     def base_from_flange(self) -> pin.SE3:

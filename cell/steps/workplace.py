@@ -80,6 +80,13 @@ class Workplace:
         return self._scattered(arm.repeatability, arm.repeatability_angle)
 
     @property
+    def settling(self) -> Vector:
+        """Covariance (6, 6) of base_from_flange for an arm that stands still, m² and rad²: what creeps and warms up
+        meanwhile is as much, at most, as configured of its repeatability."""
+        arm = self.config.arm
+        return np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
+
+    @property
     def kinematic(self) -> Vector:
         """Covariance (6, 6) of a measured place in the base that the arm realises when it goes there, m² and rad²."""
         arm = self.config.arm
