@@ -198,9 +198,4 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sur
 
 
 # A part that may have touched the surface is not placed a second time by itself.
-STEP = JobStep(
-    Step("place", 180.0, on_failure=OnFailure.STOP),
-    _at,
-    PlaceResult,
-    needs=(BoardFix, SweepRecord, Reconstruction, PlacePose),
-)
+STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))
