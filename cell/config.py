@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, SerializeAsAny, TypeAdapter, ValidationError, WrapValidator, model_validator
 
-from cell.addresses import Folder, Name, checked_endpoint, is_example
+from cell.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
 from cell.device_config import (
     ArmConfig,
     CalibrationConfig,
@@ -67,6 +67,8 @@ class CellSection(Table):
     confirm: Confirm = "person"
     record: bool = True
     """Whether runs leave `record.mcap`."""
+    meshes: Annotated[str, AfterValidator(lambda text: text and checked_folder(text))] = ""
+    """A folder of the links' meshes for the 3-D scene, beside this file; empty for none."""
     sim: Annotated[tuple[str, ...], AfterValidator(lambda names: _devices(names))] = ()
     """The devices that are simulated beside real ones."""
 

@@ -10,14 +10,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from cell.config import load_config
-from cell.console.scene import MOST_TRIANGLES, coarser, scene
+from cell.console.meshes import LINKS, MOST_TRIANGLES, coarser, link_meshes
+from cell.console.scene import scene
 from cell.console.scene_now import MOST_POINTS, SceneNow
 from cell.devices.interlocks import Situation
 from cell.job import load_job
 from cell.motion.bodies import BASE, PLACED, box, station_bodies
+from drivers.errors import ConfigError
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 
 PAGE = Path(__file__).parent.parent / "cell" / "console" / "page"
@@ -154,3 +157,49 @@ def test_the_page_asks_nobody_else_and_has_nothing_inline() -> None:
         assert not re.search(r"https?://|@import|url\(|eval\(|new Function|innerHTML", text), file.name
         for imported in re.findall(r"from '([^']+)'", text):
             assert (PAGE / imported).is_file(), f"{file.name} imports {imported}"
+
+
+def mesh_files(folder: Path, *names: str, size: float = 0.1) -> Path:
+    """A folder of boxes under these names."""
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        trimesh.creation.box((size, size, size)).apply_translation((0.0, 0.0, size)).export(folder / name)
+    return folder
+
+
+def test_links_that_have_a_mesh_are_drawn_by_it_and_the_others_as_the_planner_has_them(tmp_path: Path) -> None:
+    folder = mesh_files(tmp_path / "meshes", "forearm.stl", "vehicle.ply")
+    (folder / "README.txt").write_text("whose they are")
+    made = scene(load_config(None), "pot", meshes=folder)
+    assert json.loads(json.dumps(made, allow_nan=False)) == made
+    forearm, vehicle = made["meshes"]
+    assert (forearm["on"], vehicle["on"]) == ("forearm", "vehicle")
+    corners = np.array(forearm["vertices"]).reshape(-1, 3)
+    np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [[-0.05, -0.05, 0.05], [0.05, 0.05, 0.15]])
+    arm = {body["name"]: body["parent"] for body in made["bodies"]}
+    assert LINKS.index("forearm") not in arm.values()
+    assert {"base", "upper arm", "wrist 1", "part", "claw"} <= set(arm)
+    assert scene(load_config(None), "pot")["meshes"] == []
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        (("elbow.stl",), r"elbow\.stl belongs to no link; the names are base, shoulder.*vehicle"),
+        (("forearm.stl", "forearm.ply"), r"forearm\.stl and forearm\.ply .* are the same link; keep one"),
+        ((), r"holds no mesh"),
+    ],
+)
+def test_a_folder_of_other_meshes_is_refused_by_name(tmp_path: Path, files: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        link_meshes(mesh_files(tmp_path, *files))
+
+
+def test_a_mesh_in_millimetres_one_that_is_none_and_no_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"measures 100 m \(allowed: 0\.005 to 5 m\); export it in metres"):
+        link_meshes(mesh_files(tmp_path / "large", "base.stl", size=100.0))
+    (tmp_path / "base.stl").write_bytes(b"solid nothing")
+    with pytest.raises(ConfigError, match=r"base\.stl (cannot be read as a mesh|holds 0 triangles)"):
+        link_meshes(tmp_path)
+    with pytest.raises(ConfigError, match=r"the folder .*none cannot be read"):
+        link_meshes(tmp_path / "none")

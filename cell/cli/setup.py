@@ -51,7 +51,8 @@ def init(
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
     from cell.check.fit import require_fit
-    from cell.config import DEVICES, example_addresses, find_config, load_config, require_confirm
+    from cell.config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
+    from cell.console.meshes import link_meshes
     from cell.devices.mix import require_possible
     from cell.job import job_path, load_job
     from cell.report.figures import simulated_words
@@ -65,6 +66,8 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         checked, mesh = load_job(job)
         told["job_file"] = str(job_path(job))
         require_fit(checked, loaded, mesh)
+        if loaded.cell.meshes:
+            link_meshes(beside(source) / loaded.cell.meshes)
     except ConfigError as error:
         if json:
             print_json({**told, "problems": [line.strip() for line in str(error).splitlines()]})

@@ -50,7 +50,7 @@ def cell_facts(cell: Cell, job: str) -> dict[str, Any]:
         "jog": [entry for name in there for entry in _jogs(cell, name)],
         "job": job, "jobs": jobs(job), "steps": list(find_kind(loaded.job.kind).names),
         "interlocks": [rule.name for rule in RULES if rule.check is not None and rule.liftable],
-        "scene": scene(config, job, table),
+        "scene": scene(config, job, table, cell.folder / config.cell.meshes if config.cell.meshes else None),
     }  # fmt: skip
 
 

@@ -16,6 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.config import CellConfig
+from cell.console.meshes import LINKS, coarser, link_meshes
 from cell.device_config import CameraConfig
 from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job
@@ -29,17 +30,20 @@ from drivers.link_table import LinkTable
 
 ON_RAIL = "scan head"
 """The body that the rail moves; the planner keeps free all that it sweeps over."""
-MOST_TRIANGLES = 8_000
-"""A finer surface is drawn coarser."""
 SIGHT_M = {"scan": 0.15, "target": 0.30}
 """How far the cameras' pyramids are drawn."""
 
 
-def scene(config: CellConfig, job: str | Path | None = None, table: LinkTable | None = None) -> dict[str, Any]:
+def scene(
+    config: CellConfig, job: str | Path | None = None, table: LinkTable | None = None, meshes: Path | None = None
+) -> dict[str, Any]:
     """What stands and moves in the cell, as a JSON object (docs/console.md); without a job neither part nor station.
 
-    `table` is what the arm's controller told of its links. Raises `ConfigError` for a job that cannot be read.
+    `table` is what the arm's controller told of its links, `meshes` a folder of pictures of them (`link_meshes`).
+    Raises `ConfigError` for a job or a mesh that cannot be read.
     """
+    shown = [] if meshes is None else link_meshes(meshes)
+    pictured = {LINKS.index(mesh["on"]) for mesh in shown if mesh["on"] in LINKS}
     loaded, mesh = (None, None) if job is None else load_job(job)
     kinematics = arm_kinematics(config.arm.model, table)
     carried = mounted(config)
@@ -56,7 +60,11 @@ def scene(config: CellConfig, job: str | Path | None = None, table: LinkTable | 
             "joint6_from_flange": numbers(kinematics.joint6_from_flange),
             "home": HOME.round(6).tolist(),
         },
-        "bodies": [_body(body) for body in (*arm_bodies(config.arm.model), *swept, *fixed)],
+        "bodies": [
+            *(_body(body) for body in arm_bodies(config.arm.model) if body.parent not in pictured),
+            *(_body(body) for body in (*swept, *fixed)),
+        ],
+        "meshes": shown,
         "rail": {
             "travel": list(carried.travel),
             "head": _body(head),
@@ -94,23 +102,6 @@ def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, Any]:
         "base_from_place": numbers(base_from_place_at_target(config, job)),
         "place_from_start": numbers(job.approach.start.se3()),
     }
-
-
-def coarser(
-    vertices: NDArray[np.float64], triangles: NDArray[np.int64], most: int = MOST_TRIANGLES
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The mesh of vertices (n, 3) m and triangles (m, 3), or one of at most `most`: one vertex for all in a cube."""
-    edge = float(np.ptp(vertices, axis=0).max()) / 512
-    points, faces = vertices, triangles
-    while len(faces) > most:
-        cubes = np.floor((vertices - vertices.min(axis=0)) / edge).astype(np.int64)
-        _, owner = np.unique(cubes @ np.array([1, 1 << 20, 1 << 40]), return_inverse=True)
-        count = np.bincount(owner)
-        points = np.column_stack([np.bincount(owner, weights=vertices[:, axis]) / count for axis in range(3)])
-        faces = owner[triangles]
-        apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        faces, edge = faces[apart], 1.5 * edge
-    return points, faces
 
 
 def _sheet(config: CellConfig, job: Job | None) -> dict[str, Any]:

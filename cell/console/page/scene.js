@@ -17,6 +17,7 @@ const LOOKS = [
   [/./, 0xb9c7d6, 1],
 ];
 const BASE = 0, FLANGE = 7;
+const LINKS = ['base', 'shoulder', 'upper_arm', 'forearm', 'wrist_1', 'wrist_2', 'wrist_3'];
 const FRAME_MS = 50;
 
 // A pose of 16 numbers, row after row, as three.js has it.
@@ -58,6 +59,22 @@ function mesh(body, dotted) {
   if (board) made.material.splice(4, 2, dotted, dotted);
   made.name = body.name;
   return place(made, body.placement);
+}
+
+function triangulated({ vertices, triangles }) {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute('position', new THREE.Float32BufferAttribute(vertices, 3));
+  geometry.setIndex(triangles);
+  geometry.computeVertexNormals();
+  return geometry;
+}
+
+// A link as its mesh shows it, in the frame of what it is on.
+function picture(mesh) {
+  const material = new THREE.MeshLambertMaterial({ color: mesh.on === 'vehicle' ? 0x55606e : 0xb9c7d6, side: THREE.DoubleSide });
+  const made = new THREE.Mesh(triangulated(mesh), material);
+  made.name = `mesh ${mesh.on}`;
+  return made;
 }
 
 export class CellScene {
@@ -136,6 +153,11 @@ export class CellScene {
       frames[body.parent].add(made);
     }
     this.partInClaw = this.part?.matrix.clone();
+    const wheels = place(new THREE.Group(), matrix(scene.vehicle_from_base).invert());
+    this.base.add(wheels);
+    const pictures = new Map(scene.meshes.map((one) => [one.on, picture(one)]));
+    pictures.forEach((made, on) => (on === 'vehicle' ? wheels : frames[on === 'flange' ? FLANGE : LINKS.indexOf(on)]).add(made));
+    if (!pictures.has('vehicle')) wheels.add(...vehicle());
     this.flange = flange;
     this.carriage = new THREE.Group();
     this.railWay = new THREE.Vector3(...scene.rail.direction);
@@ -148,8 +170,6 @@ export class CellScene {
     const target = place(new THREE.Group(), scene.cameras.target.flange_from_camera);
     target.add(sight(scene.cameras.target.sight));
     flange.add(target);
-    const wheels = place(new THREE.Group(), matrix(scene.vehicle_from_base).invert());
-    this.base.add(wheels.add(...vehicle()));
     const material = new THREE.LineBasicMaterial({ color: 0x1f9d55 });
     this.way = new THREE.Line(new THREE.BufferGeometry(), material);
     this.way.frustumCulled = false;
@@ -161,12 +181,9 @@ export class CellScene {
 
   furnishStation(station, dotted) {
     for (const body of station.bodies) if (body.name !== 'surface') this.root.add(mesh(body, dotted));
-    const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute('position', new THREE.Float32BufferAttribute(station.surface.vertices, 3));
-    geometry.setIndex(station.surface.triangles);
-    geometry.computeVertexNormals();
     const look = { color: 0x58a6a0, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 };
-    this.root.add(place(new THREE.Mesh(geometry, new THREE.MeshLambertMaterial(look)), station.surface.place_from_surface));
+    const surface = new THREE.Mesh(triangulated(station.surface), new THREE.MeshLambertMaterial(look));
+    this.root.add(place(surface, station.surface.place_from_surface));
   }
 
   fan(corners) {
