@@ -11,6 +11,7 @@ import pinocchio as pin
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.inversion import PlacePose
 from cell.inversion.moved import SurfaceMotion
+from cell.inversion.standing import highest_standing, require_bare
 from cell.job import Job
 from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
@@ -183,7 +184,8 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
 
 
 def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SurfaceMotion | None:
-    """`RefusedError` when the surface is not where it was measured; None where it was measured without a sweep."""
+    """`RefusedError` when the surface is not where it was measured, or not bare; None where it was measured without a
+    sweep."""
     fix = context.made(BoardFix)
     try:
         sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
@@ -191,6 +193,11 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sur
         # A kind of job that measures in another way.
         require_unmoved(here, fix, "before its place was measured", context.progress)
         return None
+    job, base_from_surface = here.job, pose.base_from_surface
+    lies = job.place.surface_from_part.se3()
+    require_bare(
+        highest_standing(scan.cloud, here.nominal, base_from_surface, lies, job.grasp.size), job.place.tolerance
+    )
     if pose.verdict.unseen:
         # Where only the board decides, the surface tells nothing.
         require_unmoved(here, fix, "before the sweep", context.progress)
