@@ -18,6 +18,7 @@ from cell.geometry.poses import from_ur
 from cell.job import load_job
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan
+from cell.steps.frame_times import step_of_clock
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors
@@ -86,6 +87,11 @@ def drive_the_rail_slower(cell: VirtualCell) -> None:
     model.configure(now, slower)
 
 
+def set_the_clock(cell: VirtualCell, by: float = 0.010) -> None:
+    model = cell.scan_camera.model
+    model.spec = dataclasses.replace(model.spec, epoch=model.spec.epoch + by)
+
+
 def lose(count: int) -> Meddle:
     def meddle(cell: VirtualCell) -> None:
         cell.scan_camera.model.fault("camera.frame_loss", count)
@@ -112,6 +118,34 @@ def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream() -> 
 
 def test_a_rail_that_somebody_drives_slower_meanwhile_is_uneven() -> None:
     assert "off an even motion" in refused("rail.uneven_sweep", drive_the_rail_slower)
+
+
+def test_a_camera_whose_clock_is_set_meanwhile_is_a_fault() -> None:
+    told = refused("camera.clock_stepped", set_the_clock)
+    (step,) = re.findall(r"stepped by about ([+-]\d+\.\d) ms", told)
+    assert float(step) == pytest.approx(10.0, abs=4.0)
+    assert len(sweep(lambda cell: set_the_clock(cell, 0.001)).lines) == pytest.approx(20, abs=2)
+
+
+def test_only_what_pace_and_arrival_both_tell_is_a_step_of_the_clock() -> None:
+    rng, numbers = np.random.default_rng(0), np.arange(100)
+    true, late = 1e5 + numbers / 30.0, rng.exponential(0.004, 100)
+    stepped = true + 0.012 * (numbers >= 60)
+    assert step_of_clock(numbers, stepped, true + late) == pytest.approx(0.012, abs=0.004)
+    assert step_of_clock(numbers, 2 * true - stepped, true + late) == pytest.approx(-0.012, abs=0.004)
+    # A machine that was busy for a while, a camera that paused, lost pictures, stamps that scatter.
+    busy = late + 0.05 * (numbers >= 60)
+    paused = true + 0.05 * (numbers >= 60)
+    some = np.delete(numbers, slice(40, 46))
+    noisy = true + 0.002 * rng.standard_normal(100)
+    for times, arrived, kept in (
+        (true, true + busy, numbers),
+        (paused, paused + late, numbers),
+        (true, true + late, some),
+        (noisy, true + late, numbers),
+    ):
+        assert abs(step_of_clock(kept, times[kept], arrived[kept])) < 0.003
+    assert step_of_clock(numbers[:9], stepped[55:64], true[55:64]) == 0.0
 
 
 def test_an_arm_that_is_pushed_meanwhile_is_a_fault() -> None:

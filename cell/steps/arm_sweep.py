@@ -92,6 +92,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     within &= even
     lines, flanges, done = seen[within], flanges[within], done[within]
     middle = collector.require_frames(camera.name, lines)
+    collector.require_one_clock(camera.name, errors)
     if len(lines) < 3:
         raise DeviceFault(
             arm.name,

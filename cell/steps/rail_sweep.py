@@ -49,6 +49,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     times = np.array(collector.times) - late
     lines = np.flatnonzero((times >= begin) & (times <= end))
     middle = collector.require_frames(devices.scan_camera.name, lines)
+    collector.require_one_clock(devices.scan_camera.name, errors)
     moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
     if moved > MAX_FLANGE_MOTION:
         raise DeviceFault(

@@ -16,12 +16,15 @@ from cell.calibration.timing import Timing
 from cell.geometry.poses import from_matrix
 from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
+from cell.steps.frame_times import require_one_clock
 from cell.vision import StripeProfile, StripeStream
 from cell.vision.stripe.rehearsal import drawn
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Vector
 
 MAX_LOST_FRACTION = 0.05
+STEP_SHARE = 0.5
+"""Of what a sweep may lie off as a whole, by which its lines may lie apart."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ class Collector:
     progress: Callable[[float, str], None]
     keep_profile: Callable[[StripeProfile], None] | None = None
     times: list[float] = field(default_factory=list)
+    received: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     frame_ids: list[int] = field(default_factory=list)
     middle: tuple[Frame, StripeProfile] | None = None
@@ -176,6 +180,7 @@ class Collector:
             self.keep_profile(profile)
         self.counts.append(self.builder.see(profile))
         self.times.append(frame.mid_exposure)
+        self.received.append(frame.received)
         self.frame_ids.append(frame.frame_id)
         if self.middle is None and len(self.times) >= self.expected / 2:
             self.middle = frame, profile
@@ -191,3 +196,8 @@ class Collector:
                 hint="Lower scan.frame_rate or look at the camera's link.",
             )
         return self.middle
+
+    def require_one_clock(self, camera: str, errors: SweepErrors) -> None:
+        """Raise `DeviceFault` where the camera's clock stepped meanwhile."""
+        allowed = STEP_SHARE * errors.shift
+        require_one_clock(camera, self.frame_ids, self.times, self.received, self.scan.speed, allowed)
