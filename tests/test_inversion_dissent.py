@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.inversion import Prior
+from cell.geometry.poses import difference
+from cell.inversion import Prior, invert_pose
 from cell.inversion.correspondences import Scan
 from cell.inversion.dissent import Dissent, dissent
 from cell.inversion.registration import register
@@ -67,6 +68,18 @@ def test_what_the_calibration_explains_is_no_dissent() -> None:
     pose = register(seen, nominal("pot"), Prior(TRUE, BOARD)).base_from_surface
     assert dissent(seen, pose, nominal("pot"), TOLERANCE).excess > 0.5
     assert dissent(seen, pose, nominal("pot"), TOLERANCE, moved).excess < 0.05
+
+
+@pytest.mark.parametrize("worn", [0.1e-3, 0.2e-3])
+def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_known(worn: float) -> None:
+    cloud = scan(
+        PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + worn * np.maximum(x, 0) / 0.035
+    )
+    found = invert_pose(cloud, nominal("pot"), Prior(TRUE, BOARD), TOLERANCE)
+    tilt = np.abs(difference(found.base_from_surface, TRUE)[4])
+    assert 0.1 < found.parts_differ < 0.5
+    assert tilt > 5.0 * np.sqrt(found.random[4, 4]) and tilt > 0.5 * worn / 0.07
+    assert tilt < 2.5 * found.sigma[4]
 
 
 def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:

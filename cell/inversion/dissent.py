@@ -31,6 +31,8 @@ REACH = 0.006
 TUKEY = 4.7
 """Standard deviations from which on a point counts nothing."""
 MOST_STEPS = 15
+BETWEEN = 0.6
+"""Share of a quarter's difference that the whole may be off by, one standard deviation."""
 RIDGE = 3e-6
 """A motion that moves a quarter by less than this within the tolerance cannot be told from none, m."""
 
@@ -40,13 +42,22 @@ class Dissent:
     """The quarter of the surface that differs most from the whole.
 
     `shift` (m) and `turn` (rad) from the whole's place to the quarter's own; `excess` the larger of them beyond three
-    standard deviations, in tolerances. `middle` (3,) m is where the quarter lies, surface frame.
+    standard deviations, in tolerances. `middle` (3,) m is where the quarter lies, surface frame. `ways` (6, 3) are
+    motions by one tolerance each, along the surface's normal and in its two tilts.
     """
 
     shift: float
     turn: float
     excess: float
     middle: Array
+    ways: Array
+
+    def covariance(self, tolerance: Tolerance) -> Array:
+        """What the place may be off by because of it, (6, 6), base axes: a fit to all of the surface lies between what
+        its parts say."""
+        size = np.array([self.shift / tolerance.translation, *[self.turn / tolerance.rotation] * 2])
+        unknown = self.ways * (BETWEEN * max(0.0, self.excess) * size / max(float(size.max()), 1e-12))
+        return np.asarray(unknown @ unknown.T)
 
 
 def dissent(
@@ -74,7 +85,7 @@ def dissent(
         motion = ways @ own
         shift, turn = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
         excess = _beyond_noise(motion, ways @ spread, tolerance)
-        found.append(Dissent(shift, turn, excess, np.median(local[mine], axis=0)))
+        found.append(Dissent(shift, turn, excess, np.median(local[mine], axis=0), ways))
     return max(found, key=lambda each: each.excess)
 
 

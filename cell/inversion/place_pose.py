@@ -123,13 +123,17 @@ def invert_pose(
         pose = found.base_from_surface
     explained = np.concatenate(displaced, axis=2) if displaced else None
     with _shown(pose, *numbers):
-        parts_differ = require_agreement(dissent(scan, pose, nominal, tolerance, explained), tolerance, demands)
+        parts = dissent(scan, pose, nominal, tolerance, explained)
+        parts_differ = require_agreement(parts, tolerance, demands)
     _, by_patches = shared_by_patches(found)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
     shared = shared + by_patches
+    if len(cloud.each_sweep()) == 1:
+        # What several sweeps differ by is told apart from the pose already.
+        shared = shared + parts.covariance(tolerance)
     correction = difference(pose, prior.base_from_surface)
     with _shown(pose, *numbers):
         disagreement = require_board(shared, prior, correction)
