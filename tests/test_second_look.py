@@ -129,13 +129,16 @@ def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_pa
         looked(placed_pot, tmp_path, (0.0, 0.045))
 
 
-def test_a_second_look_takes_few_lines_of_one_strip() -> None:
-    scan = pot()[0].scan
-    few = sparse(scan)
-    assert few.speed == scan.speed and len(few.swath) == 1
+def test_a_second_look_takes_few_lines_of_one_strip_no_faster_than_before(placed_pot: JobRecord) -> None:
+    scan, (swath,) = pot()[0].scan, placed_pot.results["laser_sweep"].swaths
+    few = sparse(scan, swath)
+    assert few.speed == pytest.approx(scan.speed, rel=0.01) and len(few.swath) == 1
     assert few.length / few.speed * few.frame_rate == pytest.approx(LINES)
     slow = scan.model_copy(update={"frame_rate": 5.0, "speed": 0.02})
-    assert sparse(slow).frame_rate == 5.0
+    assert sparse(slow, swath).frame_rate == 5.0
+    # A sweep that was repeated went half as fast.
+    again = sparse(scan, replace(swath, times=2.0 * swath.times))
+    assert again.speed == pytest.approx(0.5 * scan.speed, rel=0.01)
 
 
 def test_a_look_that_loses_frames_tells_as_much(placed_pot: JobRecord, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def _swept_again(
     if sweep.pointing is not None:
         head = head.pointed(sweep.pointing, here.config.laser.exit_point)
     again = swept(
-        here, fix, head, sparse(here.job.scan),
+        here, fix, head, sparse(here.job.scan, sweep.swaths[0]),
         lambda frame: here.frames.keep("second-look", frame), context.check,
         lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
         most_lost=MOST_LOST,
@@ -110,10 +110,12 @@ def by_times(swath: Swath) -> Vector:
     return shared
 
 
-def sparse(scan: ScanSection) -> ScanSection:
-    """One strip of a scan with the same speed and about `LINES` lines."""
-    rate = min(scan.frame_rate, max(1.0, LINES * scan.speed / scan.length))
-    return scan.model_copy(update={"frame_rate": rate, "swath": scan.swath[:1]})
+def sparse(scan: ScanSection, swept: Swath) -> ScanSection:
+    """One strip of a scan in about `LINES` lines, no faster than it was `swept`: a repetition is slower."""
+    ways = np.linalg.norm(swept.flanges[-1, :3, 3] - swept.flanges[0, :3, 3]) + abs(swept.rail[-1] - swept.rail[0])
+    speed = min(scan.speed, float(ways / (swept.times[-1] - swept.times[0])))
+    rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
+    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": scan.swath[:1]})
 
 
 def require_points(cloud: Cloud) -> Cloud:
