@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from cell.calibration.collect.witness import configure_fast
 from cell.inversion import PlacePose
 from cell.inversion.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
 from cell.job import ScanSection
@@ -19,7 +20,7 @@ from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction, build_cloud
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.workplace import Workplace
-from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
+from drivers.errors import Measured, RefusedError
 from statemachine.runner import StepContext
 
 LINES = 32
@@ -38,8 +39,11 @@ def require_in_place(
     head = here.calibration.scan
     if sweep.pointing is not None:
         head = head.pointed(sweep.pointing, here.config.laser.exit_point)
+    few = sparse(here.job.scan)
+    # A camera of a few frame rates takes all the lines.
+    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = swept(
-        here, fix, head, _scan_of(here),
+        here, fix, head, few.model_copy(update={"frame_rate": rate}),
         lambda frame: here.frames.keep("second-look", frame), context.check,
         lambda share, text: context.progress(0.1 * share, f"whether the surface lies where it did: {text}"),
     )  # fmt: skip
@@ -56,21 +60,6 @@ def require_in_place(
     )
     require_unmoved(found)
     return found
-
-
-def _scan_of(here: Workplace) -> ScanSection:
-    """In few lines; in all of a scan's where the camera has no such frame rate."""
-    few = sparse(here.job.scan)
-    try:
-        here.devices.scan_camera.configure(few.exposure, few.frame_rate)
-    except LimitError:
-        pass
-    except DeviceFault as fault:
-        if fault.code != "camera.setting":
-            raise
-    else:
-        return few
-    return few.model_copy(update={"frame_rate": here.job.scan.frame_rate})
 
 
 def sparse(scan: ScanSection) -> ScanSection:
