@@ -21,7 +21,7 @@ from cell.reconstruction import Cloud, flange_motions, merge
 from cell.reconstruction.cloud import Filled
 from cell.steps.kinds import PLACE
 from cell.steps.second_look import LINES, SecondLook, require_in_place, require_points, sparse
-from drivers.errors import RefusedError
+from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext
 from tests.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
@@ -127,6 +127,32 @@ def test_one_that_slid_over_its_table_is_refused(
 def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="does not lie any more where it was swept"):
         looked(placed_pot, tmp_path, (0.0, 0.045))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        LimitError("scan_camera", "30 Hz"),
+        DeviceFault("scan_camera", "camera.setting", "it took 30 Hz", recoverable=False, hint=""),
+    ],
+    ids=["limit", "setting"],
+)
+def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CellError
+) -> None:
+    site = Site(placed_pot, tmp_path, *pot())
+    camera, rates = site.cell.scan_camera, []
+    usual = camera.configure
+
+    def configure(exposure: float, frame_rate: float) -> None:
+        if frame_rate != 30.0:
+            raise error
+        rates.append(frame_rate)
+        usual(exposure, frame_rate)
+
+    monkeypatch.setattr(camera, "configure", configure)
+    assert not site.look_again().moved.moved
+    assert set(rates) == {30.0}
 
 
 def test_a_second_look_takes_few_lines_of_one_strip_no_faster_than_before(placed_pot: JobRecord) -> None:
