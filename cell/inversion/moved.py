@@ -30,8 +30,9 @@ SPREAD = 2.5
 the median."""
 OUTLIER = 5.0
 """Median absolute deviations from the motion found."""
-CHANCE = 1e-3
-"""Of taking a surface that lies still for one that has moved."""
+EVIDENCE = 32.0
+"""Squared Mahalanobis distance above which it has moved: 6 times F(6, 28) at 0.999, for some thirty lines. Of ten lines
+that scatter by themselves 0.2 % come that far."""
 NEIGHBOURS = 4
 ROUNDS = 3
 MOST_POINTS = 40_000
@@ -49,25 +50,18 @@ class SurfaceMotion:
     """By what `motion` (6,) (shift m, turn rad; base axes, about the surface's origin) the surface seems to have moved.
 
     Its `covariance` (6, 6); `matched`, the share of the second scan's points beside the surface as it was found, in
-    units of the first one's; `lines` of the second scan that were compared. `found` is where one that has moved lies,
-    as `motion`; None where it was not found.
+    units of the first one's. `found` is where one that has moved lies, as `motion`; None where it was not found.
     """
 
     motion: Array
     covariance: Array
     matched: float
-    lines: int = 0
     found: Array | None = None
-
-    @property
-    def evidence(self) -> float:
-        """Squared Mahalanobis distance that chance does not exceed: what lines scatter is known from few of them."""
-        return 6.0 * float(scipy.special.fdtri(6, max(1, self.lines - 6), 1.0 - CHANCE))
 
     @property
     def times(self) -> float:
         """How many times as far as chance takes it."""
-        return float(np.sqrt(self.motion @ np.linalg.solve(self.covariance, self.motion) / self.evidence))
+        return float(np.sqrt(self.motion @ np.linalg.solve(self.covariance, self.motion) / EVIDENCE))
 
     @property
     def moved(self) -> bool:
@@ -78,7 +72,7 @@ class SurfaceMotion:
         """In words the motions, about the surface's axes, that would be larger than `tolerance` before they show."""
         unit = np.array([tolerance.translation] * 3 + [tolerance.rotation] * 3)
         turned = np.kron(np.eye(2), base_from_surface.rotation)
-        covariance = self.evidence * turned.T @ self.covariance @ turned
+        covariance = EVIDENCE * turned.T @ self.covariance @ turned
         values, ways = np.linalg.eigh(covariance / np.outer(unit, unit))
         ways = unit[:, None] * ways[:, values > 1.0]
         return [_least(way, covariance, radius) for way in sorted_out(ways, radius)] if ways.size else []
@@ -151,7 +145,7 @@ def _compared(before: _Beside, tree: scipy.spatial.cKDTree, now: _Beside, radius
         motion, covariance = _fitted(rows[kept], risen[kept], lines[kept], poses[kept], free)
         left = risen - rows @ motion
         kept = np.abs(left) <= OUTLIER * float(np.median(np.abs(left))) + 1e-9
-    return SurfaceMotion(motion, covariance, matched, len(np.unique(lines)))
+    return SurfaceMotion(motion, covariance, matched)
 
 
 def _fitted(rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, free: Array) -> tuple[Array, Array]:
