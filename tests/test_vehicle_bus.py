@@ -164,14 +164,15 @@ def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, sp
 
 @pytest.mark.parametrize("end", ["stop", "brake", "enable", "close"])
 def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, end: str) -> None:
-    """At once: neither the vehicle's own time limit nor the driver's for a velocity that nobody renews is waited for."""
+    """At once: neither the vehicle's own time limit nor the driver's for a velocity that is not renewed is awaited."""
     bench.drive_until_fast()
     bench.bus.frames.clear()
     getattr(bench.vehicle, end)()
+    bench.until(lambda: bytes(8) in bench.velocities())
     sent = bench.velocities()
     still = sent.index(bytes(8))
     assert set(sent[still:]) == {bytes(8)}
-    assert still <= 1, "one that was on its way already"
+    assert still <= 10, "what was on its way already; the driver's limit takes some 25"
     if end != "enable":
         assert abs(bench.speed()) < 0.02
 
