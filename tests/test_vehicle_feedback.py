@@ -90,6 +90,23 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
         bench.feedback.check(in_command=False, driving=False)
 
 
+def test_each_bit_of_a_motors_driver_is_a_fault_but_the_two_that_say_it_works() -> None:
+    told = {bit: driver_trouble(1, 1 << bit) for bit in range(8)}
+    assert [bit for bit, words in told.items() if not words] == [6, 7]
+    assert len({words for words in told.values() if words}) == 6
+    assert told[5] == ("motor 1: driver fails",)
+
+
+def test_whoever_took_command_away_is_for_a_person_to_find_out() -> None:
+    bench = Bench()
+    bench.tell(0, 0, mode=0)
+    bench.feedback.check(in_command=False, driving=False)
+    with pytest.raises(DeviceFault, match="left CAN command") as caught:
+        bench.feedback.check(in_command=True, driving=False)
+    assert (caught.value.code, caught.value.recoverable) == ("vehicle.command_lost", False)
+    assert bench.interruption()[0] == 1
+
+
 def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands() -> None:
     bench = Bench()
     bench.clock.time += 0.6
