@@ -28,7 +28,7 @@ from cell.steps.drive_to_target import stand_at_target
 from cell.steps.photograph import BoardFix
 from cell.steps.whereabouts import Whereabouts
 from drivers.clock import Clock
-from drivers.errors import ConfigError, InterlockError, RefusedError
+from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
 
@@ -51,8 +51,14 @@ def test_it_stands_braked_and_is_not_driven() -> None:
     state = vehicle.state()
     assert (state.braked, state.speed, state.emergency_stop, state.trouble) == (True, 0.0, False, ())
     vehicle.drive(0.0, 0.0)
-    with pytest.raises(InterlockError, match=r'vehicle\.driver = "fixed".*Bring the station'):
-        vehicle.drive(0.1, 0.0)
+    for velocity in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)):
+        with pytest.raises(InterlockError, match=r'vehicle\.driver = "fixed".*Bring the station'):
+            vehicle.drive(*velocity)
+    vehicle.close()
+    vehicle.stop()
+    for asked in (vehicle.state, vehicle.check, vehicle.enable, vehicle.brake, lambda: vehicle.drive(0.0, 0.0)):
+        with pytest.raises(NotConnectedError):
+            asked()
 
 
 def fixed_cell(folder: Path) -> Path:

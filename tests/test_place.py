@@ -29,7 +29,6 @@ from cell.vision import parse_board
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from sim_backends.world.nominal import inverse
-from statemachine.cancel import Cancelled
 from statemachine.journal import Journal
 from statemachine.policy import OnFailure
 from statemachine.runner import StepContext
@@ -80,8 +79,7 @@ class Site:
 
     def place(self, too_low: float = 0.0, **exchanged: Any) -> PlaceResult:
         """Place where the surface is taken to be `too_low` m below where it truly is."""
-        usual = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state)}
-        given: dict[str, Any] = {"check": lambda: None, **usual, **exchanged}
+        given = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state), **exchanged}
         return place(
             JOB,
             self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
@@ -90,7 +88,7 @@ class Site:
             self.arm,
             given["claw"],
             self.part,
-            given["check"],
+            lambda: None,
             lambda share, text: None,
             given["note"],
         )
@@ -179,17 +177,6 @@ def test_a_part_that_meets_nothing_is_not_released() -> None:
     assert site.held
     assert site.noted == []
     assert site.height_above() > 0.5 * JOB.place.approach
-
-
-def test_whoever_wants_the_end_before_the_descent_is_heard() -> None:
-    def check() -> None:
-        raise Cancelled("enough")
-
-    site = Site()
-    with pytest.raises(Cancelled):
-        site.place(check=check)
-    assert site.held
-    assert site.height_above() > 0.9 * JOB.place.approach
 
 
 def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
