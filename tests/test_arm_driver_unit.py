@@ -379,6 +379,33 @@ def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, s
     dashboard.close()
 
 
+def test_a_stop_that_comes_before_a_protective_stop_is_unlocked_leaves_it_locked(server):
+    asked = []
+
+    def serve():
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Connected\n")
+            for question in client.makefile("rb"):
+                asked.append(question.decode().strip())
+                client.sendall(b"Safetystatus: PROTECTIVE_STOP\n")
+
+    def stopped():
+        raise Aborted("stopped meanwhile")
+
+    threading.Thread(target=serve, daemon=True).start()
+    dashboard = Dashboard("arm", server.getsockname()[0])
+    with pytest.raises(Aborted, match="meanwhile"):
+        unlock("arm", dashboard, Clock(), True, stopped)
+    dashboard.close()
+    assert asked == ["safetystatus"]
+
+
+def test_the_age_of_a_state_is_in_seconds_of_the_clock():
+    assert feed(Clock(20.0)).age(snapshot(time.monotonic() - 0.1)) == pytest.approx(2.0, abs=1.0)
+    assert feed(Clock()).age(snapshot(time.monotonic() - 0.1)) == pytest.approx(0.1, abs=0.05)
+
+
 def test_a_clock_that_runs_faster_leaves_the_wire_its_time():
     moving = UrMotion("arm", "move", 1, Clock(rate=100.0), lambda: None)
     threading.Timer(0.1, lambda: moving.end("arrived")).start()
