@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,15 @@ import pytest
 from test_rail_sweep import CONFIG, sweep
 from test_stored_calibration import made
 
+from cell.calibration.slip import Slip
+from cell.calibration.witness import Pointing
 from cell.geometry.poses import from_parts
 from cell.job import load_job
 from cell.run.resumption import UnfinishedRun, job_hash
 from cell.steps.laser_sweep import SweepRecord
 from cell.steps.photograph import BoardFix
-from cell.steps.stored_sweep import FILE, StoredSweep
-from drivers.errors import CalibrationStale, ConfigError
+from cell.steps.stored_sweep import FILE, StoredSweep, save_sweep
+from drivers.errors import CalibrationStale, ConfigError, RefusedError
 from statemachine.journal import Journal
 
 CALIBRATION = made()
@@ -52,6 +55,31 @@ def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way:
     moved = pin.SE3(pin.exp3(step[3:]), step[:3])
     with pytest.raises(CalibrationStale, match="the board has moved by"):
         stored.confirmed_by(fix(BOARD * moved))
+
+
+def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: StoredSweep) -> None:
+    """A turn of the station about the board's origin shifts a point elsewhere by turn × way: also with what sign."""
+    (before,), (after,) = stored.sweep.swaths, stored.confirmed_by(fix(BOARD)).swaths
+    way = before.base_from_flange.translation - BOARD.translation
+    moves = np.eye(6)
+    for axis in range(3):
+        moves[:3, 3 + axis] = np.cross(np.eye(3)[axis], way)
+    expected = moves @ (2.0 * SEEN) @ moves.T
+    assert after.covariance - before.covariance == pytest.approx(expected, rel=1e-9, abs=1e-18)
+
+
+def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: StoredSweep, tmp_path: Path) -> None:
+    pointing, slip = Pointing(1e-4, 2e-5, 3e-5, 4e-5, 5e-5), Slip(1e-5, -2e-5, 3e-3, True, 0.08)
+    save_sweep(tmp_path, replace(stored.sweep, pointing=pointing, slip=slip), fix(BOARD))
+    with np.load(tmp_path / FILE) as kept:
+        data = dict(kept)
+    assert data["pointing"].tolist() == [1e-4, 2e-5, 3e-5, 4e-5, 5e-5]
+    assert data["slip"].tolist() == [1e-5, -2e-5, 3e-3, 0.08, 1.0]
+    assert data["base_from_board"].tolist() == BOARD.homogeneous.tolist()
+    assert data["board_covariance"].tolist() == SEEN.tolist()
+    np.savez(tmp_path / FILE, **{**data, "format": np.array(3)})
+    with pytest.raises(RefusedError, match="format 3, this program reads"):
+        StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point)
 
 
 def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
