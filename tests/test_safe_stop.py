@@ -101,10 +101,36 @@ def test_who_closes_the_cell_closes_each_device_and_the_arm_last(cell: VirtualCe
     assert len(names) == len(set(names)) == 7
 
 
+class Stuck:
+    """A device whose end fails."""
+
+    def __init__(self, bare: object) -> None:
+        self.bare = bare
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.bare, name)
+
+    def close(self) -> None:
+        raise RuntimeError("its port is stuck")
+
+
+def test_a_device_that_cannot_be_closed_keeps_no_other_open(cell: VirtualCell) -> None:
+    """The laser's driver is the first to be closed; the arm, closed last, takes its output off nevertheless."""
+    cell.devices.laser.bare = Stuck(cell.devices.laser.bare)  # type: ignore[assignment]
+    cell.arm.set_digital_output(CONFIG.laser.output, True)
+    cell.devices.vehicle.brake()
+    cell.devices.arm.move_joints(HOME, 0.5, 1.0)
+    cell.clock.sleep(0.2)
+    assert cell.devices.close() == ["laser closed: its port is stuck"]
+    assert not cell.world.arm.digital_outputs >> CONFIG.laser.output & 1
+    assert stays(cell, lambda: cell.arm.state().joints)
+
+
 @pytest.mark.parametrize(
     ("name", "recoverable"),
     [
         ("arm.protective_stop", True),
+        ("arm.safeguard_stop", False),
         ("arm.emergency_stop", False),
         ("vehicle.emergency_stop", False),
         ("vehicle.motor_fault", True),
