@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config import load_config
@@ -104,6 +105,44 @@ def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(se
     site.run()
     assert moved(stood, site.truth()) < 0.002
     assert site.cell.world.collisions.found == ()
+
+
+@pytest.mark.parametrize("off", [Planar(0.0, 0.04, 0.0), Planar(0.0, 0.0, math.radians(3)), Planar(-0.04, 0.0, 0.0)])
+def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_braked(off: Planar) -> None:
+    site = Site()
+    target = Planar.of(JOB.approach.target.se3())
+    stands, model = target * off, site.cell.world.vehicle
+    model._x, model._y, model._yaw = stands.x, stands.y, stands.yaw
+    site.cell.clock.sleep(0.1)
+    arrival = site.run()
+    left = target.inverse() * site.truth()
+    assert max(abs(left.x), abs(left.y)) < JOB.approach.tolerance
+    assert abs(left.yaw) < JOB.approach.tolerance_angle
+    assert (arrival.error_along, arrival.error_across) == pytest.approx((left.x, left.y), abs=1e-4)
+    assert arrival.error_yaw == pytest.approx(left.yaw, abs=1e-3)
+    assert model.feedback(site.cell.clock.now()).braked
+
+
+def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked() -> None:
+    """The board is seen turned about the vehicle by a degree more each time: however it turns, it is off."""
+    site, seen = Site(), 0.0
+    target = Planar.of(JOB.approach.target.se3())
+    model = site.cell.world.vehicle
+    model._x, model._y, model._yaw = target.x, target.y, target.yaw
+    site.cell.clock.sleep(0.1)
+    photograph = site.photograph
+
+    def turned() -> BoardFix:
+        nonlocal seen
+        seen += math.radians(1.0)
+        fix = photograph()
+        about = VEHICLE_FROM_BASE.inverse() * pin.SE3(pin.exp3(np.array([0.0, 0.0, seen])), np.zeros(3))
+        return replace(fix, base_from_board=about * VEHICLE_FROM_BASE * fix.base_from_board)
+
+    site.photograph = turned  # type: ignore[method-assign]
+    with pytest.raises(RefusedError, match=r"mm across and .* from its target after 9 photographs"):
+        site.run()
+    assert model.feedback(site.cell.clock.now()).braked
 
 
 class LateVehicle:
