@@ -57,7 +57,8 @@ def sweep(
 ) -> Swath:
     """Sweep 20 mm, at 20 mm/s if not told otherwise; half-way `meddle` is called once.
 
-    Replies of rail and camera come so many s late."""
+    Replies of rail and camera come so many s late.
+    """
     cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
     devices = cell.devices
     devices.vehicle.brake()

@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -16,14 +16,19 @@ from test_stored_calibration import made
 
 from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts
 from cell.job import load_job
+from cell.lab.bench.whole_job import NoFrames
 from cell.run.resumption import UnfinishedRun, job_hash
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.laser_sweep import STEP, SweepRecord
 from cell.steps.photograph import BoardFix
 from cell.steps.stored_sweep import FILE, StoredSweep, save_sweep
-from drivers.errors import CalibrationStale, ConfigError, RefusedError
+from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
+from drivers.errors import CalibrationStale, ConfigError, InterlockError, RefusedError
 from statemachine.journal import Journal
+from statemachine.step import Event, StepContext
 
 CALIBRATION = made()
 SIGMA_M, SIGMA_RAD = 1e-4, 2e-4
@@ -80,6 +85,38 @@ def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: Store
     np.savez(tmp_path / FILE, **{**data, "format": np.array(3)})
     with pytest.raises(RefusedError, match="format 3, this program reads"):
         StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point)
+
+
+def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> list[str]:
+    """What the step of the sweep tells before anything moves, in a cell that is stopped."""
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.devices.gate.shut()
+    (folder / FILE).write_bytes(b"of the attempt before")
+    nothing_known = cast(Any, None)
+    job = load_job("pot")[0]
+    whereabouts = Whereabouts(cell.devices.vehicle)
+    here = Workplace(
+        CONFIG, job, nothing_known, nothing_known, cell.devices, NoFrames(), folder, whereabouts, earlier=stored
+    )
+    events: list[Event] = []
+    context = StepContext(STEP.policy, attempt, 1e9, {"board_photo": fix(seen)}, cell.clock, events.append)
+    with pytest.raises((InterlockError, AttributeError)):
+        STEP.work(here, context)
+    assert not (folder / FILE).exists(), "should this run be cut short now, it is not resumed with that"
+    return [str(event.data.get("text")) for event in events]
+
+
+def test_an_earlier_sweep_is_not_taken_where_the_board_has_moved_but_swept_anew(
+    stored: StoredSweep, tmp_path: Path
+) -> None:
+    said = begun(stored, tmp_path, BOARD * from_parts((0.01, 0.0, 0.0)), 1)
+    assert "the board has moved by 10.00 mm" in said[-1] and "sweeping again" in said[-1]
+
+
+def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_board(
+    stored: StoredSweep, tmp_path: Path
+) -> None:
+    assert begun(stored, tmp_path, BOARD, 2)[0] == "looking whether the board still stands where it did"
 
 
 def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
