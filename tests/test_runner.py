@@ -665,6 +665,16 @@ def test_what_a_step_leaves_behind_is_ended_with_it(tmp_path):
     assert tokens[1].reason == "board_photo has ended"
 
 
+def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
+    run, told = CancelToken(), []
+    run.cancel("enough")
+    late = CancelToken(run)
+    late.on_cancel(told.append)
+    assert (late.reason, told, late.event.is_set()) == ("enough", ["enough"], True)
+    assert not late.cancel("later")
+    assert late.reason == "enough"
+
+
 def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(tmp_path):
     def observe(event):
         if event.kind == "confirm_needed":

@@ -222,6 +222,18 @@ def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
     assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
 
 
+def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.whereabouts.forget_word()
+    site.whereabouts.enter(JOB)
+    with pytest.raises(RefusedError, match="start of another job, which did not begin to drive"):
+        site.whereabouts.pose()
+    site.whereabouts.see(Planar.of(JOB.approach.staging.se3()))
+    site.whereabouts.forget_word()
+    site.whereabouts.pose()
+
+
 def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:
     """Turned by 30° and said to be at its start: it goes that way once, sees nothing, and is not driven again."""
     site = Site()
