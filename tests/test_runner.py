@@ -13,7 +13,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from statemachine.cancel import CancelToken
+from statemachine.cancel import Cancelled, CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
@@ -663,6 +663,43 @@ def test_what_a_step_leaves_behind_is_ended_with_it(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: tokens.update({context.attempt: context.token}))
     bench.run()
     assert tokens[1].reason == "board_photo has ended"
+
+
+def test_a_recovery_that_does_not_end_is_cut_short(tmp_path):
+    bench = Bench(tmp_path, board_photo=failing(ConnectionError("link lost"))).policy("board_photo", 5.0, 1)
+    bench.runner.policy = replace(bench.runner.policy, recovery_deadline_s=0.2)
+
+    def recover(error, token, confirmed):
+        assert token.event.wait(3.0)
+        token.check()
+
+    bench.runner.recover = recover
+    begun = time.monotonic()
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "the recovery did not end within its deadline" in result.reason
+    assert time.monotonic() - begun < 2.0
+
+
+def test_a_retry_is_for_the_named_errors_and_those_that_derive_from_them():
+    step = Step("any", 1.0, 1, ("OSError",))
+    assert step.retries(OSError())
+    assert step.retries(ConnectionResetError())
+    assert not step.retries(ValueError())
+    assert not step.retries(Exception())
+
+
+def test_held_work_ends_with_its_own_token_though_the_run_stays_paused():
+    """Its deadline, or another fault, ends it where it is held."""
+    control, token = RunControl(), CancelToken()
+    control.pause()
+    threading.Timer(0.05, lambda: token.cancel("overrun")).start()
+    threading.Timer(2.0, control.go_on).start()
+    begun = time.monotonic()
+    with pytest.raises(Cancelled, match="overrun"):
+        control.safe_point(token, lambda held: None)
+    assert time.monotonic() - begun < 1.0
+    assert 0.0 < control.held_s < 1.0
 
 
 def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
