@@ -191,13 +191,13 @@ def test_an_exception_that_is_not_named_is_not_retried(tmp_path):
 def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path):
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
-    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover: {error}")
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover: {error}, {confirmed}")
     result = bench.run()
     assert result.outcome is Outcome.PLACED
     start = bench.log.index("laser_sweep")
     again = "stop: recovered, before laser_sweep is tried again"
     assert bench.log[start : start + 5] == [
-        "laser_sweep", "stop: laser_sweep failed", "recover: protective stop", again, "laser_sweep",
+        "laser_sweep", "stop: laser_sweep failed", "recover: protective stop, False", again, "laser_sweep",
     ]  # fmt: skip
     changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
     assert changes[3:6] == [
