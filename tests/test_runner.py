@@ -205,6 +205,15 @@ def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path
     ]  # fmt: skip
 
 
+def test_what_no_recovery_can_clear_is_not_recovered(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=failing(OSError("the emergency stop is pressed")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.FAULTED, "the emergency stop is pressed")
+    assert "recover" not in bench.log
+
+
 def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
     def recover(error, token, confirmed):
         raise OSError("the link is gone")
