@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -263,6 +263,58 @@ def test_a_drive_that_does_not_begin_to_search_is_not_homed(drive: Drive) -> Non
     with pytest.raises(DeviceFault, match=r"rail\.not_begun"):
         rail.home().wait(60.0)
     assert not rail.state().homed_here
+    rail.close()
+
+
+@contextmanager
+def shown(model: RailModel, name: str, told: Callable[[float], Any]) -> Iterator[None]:
+    """The drive shows this instead of what is so."""
+    setattr(model, name, told)
+    try:
+        yield
+    finally:
+        delattr(model, name)
+
+
+@pytest.fixture
+def edges() -> Iterator[Drive]:
+    """The drive whose map has the switches."""
+    made = Drive.of(config(EDGES))
+    yield made
+    made.peer.stop()
+
+
+def test_what_speaks_against_a_zero_when_nobody_watched_ends_the_trust_in_it(edges: Drive) -> None:
+    drive = edges
+    drive.homed().close()
+    for name in ("stalled", "left_switch", "right_switch"):
+        with shown(drive.model, name, lambda t: True):
+            rail = drive.rail()
+        assert drive.peer.drive._homed
+        assert not rail.state().homed, name
+        with pytest.raises(InterlockError, match="not homed"):
+            rail.move_to(0.01)
+        rail.close()
+    rail = drive.rail()
+    assert rail.state().homed
+    rail.close()
+
+
+def test_a_search_that_ends_elsewhere_in_an_alarm_or_by_a_stop_finds_no_zero(edges: Drive) -> None:
+    drive, rail = edges, edges.rail()
+    true, off = drive.model.position, round(0.002 / drive.record.lead * drive.record.counts_per_turn)
+    with shown(drive.model, "position", lambda t: true(t) + off):
+        with pytest.raises(DeviceFault, match=r"counts 2 mm there .*rail\.setting"):
+            rail.home().wait(60.0)
+        assert not rail.state().homed_here
+    search = rail.home()
+    with shown(drive.model, "stalled", lambda t: True), pytest.raises(DeviceFault, match=r"while it searched"):
+        search.wait(60.0)
+    search = rail.home()
+    rail.stop()
+    with pytest.raises(Aborted):
+        search.wait(60.0)
+    assert not rail.state().homed
     rail.close()
 
 
