@@ -82,7 +82,7 @@ def sweep(
     *, start: float = 0.02, stop: float = 0.06, ran: float = 0.02, bend: float = 0.0, count: int = 41,
     arrived: Callable[[], bool] = lambda: True,
 ) -> RailSweep:  # fmt: skip
-    """From 5 mm before `start` to 5 mm behind `stop`, told to run at 20 mm/s; it ran at `ran`, `bend` m off half-way."""
+    """From 5 mm before `start` to 5 mm behind `stop`, told 20 mm/s; it ran at `ran`, `bend` m off half-way."""
     way = np.sign(stop - start)
     places = np.linspace(start - 0.005 * way, stop + 0.005 * way, count)
     seconds = np.abs(places - places[0]) / ran
