@@ -211,6 +211,39 @@ def test_late_answers_never_become_those_to_later_questions(late: float) -> None
     listener.close()
 
 
+@pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
+def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
+    listener, ready = socket.create_server(("127.0.0.1", 0)), threading.Event()
+    spoiling = itertools.count()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(8):
+                address, count = struct.unpack(">HH", request[2:6])
+                spoil = ready.is_set() and next(spoiling) == 0
+                unit = UNIT + (spoil and spoilt == "another drive's")
+                function = 3 + (spoil and spoilt == "another function's")
+                body = bytes([unit, function, 2 * count]) + struct.pack(">H", address + spoil) * count
+                reply = bytearray(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+                if spoil and spoilt == "a bit":
+                    reply[4] ^= 0x10
+                connection.sendall(reply)
+
+    threading.Thread(target=serve, daemon=True).start()
+    statistics = LinkStatistics()
+    link = ModbusLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
+        stop_action=Action(1, 1), clock=Clock(), statistics=statistics,
+    )  # fmt: skip
+    assert link.read(7, 2) == [7, 7]
+    ready.set()
+    assert link.read(16, 2) == [16, 16]
+    assert next(spoiling) >= 2, "it was asked for again"
+    link.close()
+    listener.close()
+
+
 def test_a_register_that_the_drive_does_not_have_is_named() -> None:
     wrong = {**PATHS, "homed": {"address": 0x1004, "bit": 6}}
     drive = Drive.of(config(PATHS))
