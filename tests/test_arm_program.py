@@ -159,7 +159,13 @@ def test_an_arm_has_been_stopped_when_it_shows_rest_after_it_was_told(arm: Arm) 
 
 
 @pytest.mark.parametrize(
-    "moving", [{"speeds": (0.0, 0.1, 0.0, 0.0, 0.0, 0.0)}, {"runtime": 4}], ids=["moves", "paused"]
+    "moving",
+    [
+        {"speeds": (0.0, 0.1, 0.0, 0.0, 0.0, 0.0)},
+        {"speeds": (0.0, -0.1, 0.0, 0.0, 0.0, 0.0), "runtime": 1},
+        {"runtime": 4},
+    ],
+    ids=["moves", "moves though its program has ended", "paused"],
 )
 def test_an_arm_that_goes_on_or_may_go_on_is_not_stopped(arm: Arm, moving: dict[str, Any]) -> None:
     arm.shows(**moving)
