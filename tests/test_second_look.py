@@ -15,7 +15,7 @@ from cell.inversion.moved import SurfaceMotion
 from cell.lab.bench.whole_job import JobRecord, NoFrames
 from cell.steps.kinds import PLACE
 from cell.steps.second_look import LINES, require_in_place, sparse
-from drivers.errors import RefusedError
+from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
 from statemachine.runner import StepContext
 from tests.report_runs import CONFIG, at_station, pot, work_of
 
@@ -32,11 +32,16 @@ def slid(cell: VirtualCell, shift: tuple[float, float], turn: float) -> None:
 
 
 def looked(
-    record: JobRecord, folder: Path, shift: tuple[float, float] = (0.0, 0.0), turn: float = 0.0, further: float = 0.0
+    record: JobRecord,
+    folder: Path,
+    shift: tuple[float, float] = (0.0, 0.0),
+    turn: float = 0.0,
+    further: float = 0.0,
+    cell: VirtualCell | None = None,
 ) -> SurfaceMotion:
     """A look at the surface of `record`, slid by so much, from a vehicle so many metres from where it stood."""
     job, nominal = pot()
-    cell = VirtualCell(CONFIG, record.seed, record.level)
+    cell = cell or VirtualCell(CONFIG, record.seed, record.level)
     at_station(cell, record, further)
     cell.devices.vehicle.brake()
     slid(cell, shift, turn)
@@ -80,6 +85,32 @@ def test_one_that_slid_over_its_table_is_refused(
 def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="does not lie any more where it was swept"):
         looked(placed_pot, tmp_path, (0.0, 0.045))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        LimitError("scan_camera", "30 Hz"),
+        DeviceFault("scan_camera", "camera.setting", "it took 30 Hz", recoverable=False, hint=""),
+    ],
+    ids=["limit", "setting"],
+)
+def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CellError
+) -> None:
+    cell = VirtualCell(CONFIG, placed_pot.seed, placed_pot.level)
+    camera, rates = cell.scan_camera, []
+    usual = camera.configure
+
+    def configure(exposure: float, frame_rate: float) -> None:
+        if frame_rate != 30.0:
+            raise error
+        rates.append(frame_rate)
+        usual(exposure, frame_rate)
+
+    monkeypatch.setattr(camera, "configure", configure)
+    assert not looked(placed_pot, tmp_path, cell=cell).moved
+    assert set(rates) == {30.0}
 
 
 def test_a_second_look_takes_few_lines_of_one_strip() -> None:

@@ -56,7 +56,7 @@ class Press:
     def over(self) -> str | None:
         """Why it is over, or None while the button is held."""
         if self.ended is None and (silent := time.monotonic() - self.heard) > ATTENDED_S:
-            self.end(f"no beat came for {1e3 * silent:.0f} ms")
+            self.end(f"no beat came for {1e3 * silent:.0f} ms (at most {1e3 * ATTENDED_S:.0f}); let go and press again")
         return self.ended
 
     def wait(self, seconds: float) -> None:

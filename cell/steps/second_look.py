@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from cell.calibration.collect.witness import configure_fast
 from cell.inversion import PlacePose
 from cell.inversion.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
 from cell.job import ScanSection
@@ -38,8 +39,11 @@ def require_in_place(
     head = here.calibration.scan
     if sweep.pointing is not None:
         head = head.pointed(sweep.pointing, here.config.laser.exit_point)
+    few = sparse(here.job.scan)
+    # A camera of a few frame rates takes all the lines.
+    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = swept(
-        here, fix, head, sparse(here.job.scan),
+        here, fix, head, few.model_copy(update={"frame_rate": rate}),
         lambda frame: here.frames.keep("second-look", frame), context.check,
         lambda share, text: context.progress(0.1 * share, f"whether the surface lies where it did: {text}"),
     )  # fmt: skip

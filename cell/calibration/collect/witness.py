@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from cell.calibration.witness import LEAST_ROWS, Witness
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.vision import extract
-from drivers.errors import LimitError, RefusedError
+from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Frame
 
 PICTURES = 12
@@ -41,16 +41,22 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     return _on_the_plate(found)
 
 
-def configure_fast(devices: Devices, exposure: float) -> float:
-    """Set the scan camera to `exposure`, s, and the highest of `RATES_HZ` that it can; that rate, or a `LimitError`."""
-    for rate in RATES_HZ[:-1]:
+def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = RATES_HZ) -> float:
+    """Set the scan camera to `exposure`, s, and the first of `rates`, Hz, that it takes; that rate, or what it raises
+    at the last of them."""
+    for rate in rates[:-1]:
         try:
             devices.scan_camera.configure(exposure, rate)
         except LimitError:
             continue
-        return rate
-    devices.scan_camera.configure(exposure, RATES_HZ[-1])
-    return RATES_HZ[-1]
+        except DeviceFault as fault:
+            # A camera that says what it can only by what it makes of a wish.
+            if fault.code != "camera.setting":
+                raise
+        else:
+            return rate
+    devices.scan_camera.configure(exposure, rates[-1])
+    return rates[-1]
 
 
 def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness:
