@@ -187,6 +187,19 @@ def test_what_is_to_be_done_again_is_given_nothing_of_what_came_after_it(tmp_pat
     assert bench.seen == [*once, *once]
 
 
+def test_a_script_is_asked_about_refusals_alone(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def decide(step: str, failure: Failure) -> Again:
+        asked.append(step)
+        return Again("photo", "whatever it was")
+
+    bench = Bench(tmp_path, 1, Script(on_refusal=decide))
+    bench.runner.classify = lambda error: Failure(Outcome.FAULTED, str(error), "fault")
+    assert bench.run().outcome is Outcome.FAULTED
+    assert asked == []
+
+
 def test_without_a_decision_a_refusal_ends_the_run(tmp_path: Path) -> None:
     result = Bench(tmp_path, 1, Script(on_refusal=lambda step, failure: None)).run()
     assert (result.outcome, result.reason) == (Outcome.REFUSED, "too few points")

@@ -280,6 +280,7 @@ def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
 def test_a_run_that_has_put_its_part_down_is_not_resumed(tmp_path: Path) -> None:
     """Whether it was killed or faulted afterwards: the journal had it before the retreat began."""
     journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
+    journal.event("note", "place", {"part": "unknown", "base_from_part": [0.0] * 6})
     journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
     journal.close()
     with pytest.raises(ConfigError, match="had put its part down already, only the retreat failed"):

@@ -177,6 +177,17 @@ def test_a_sweep_that_a_script_rejected_is_not_used(tmp_path: Path) -> None:
     assert "had not finished its sweep" in why
 
 
+def test_a_sweep_that_failed_when_it_was_done_again_is_not_used(tmp_path: Path) -> None:
+    run, job = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    journal.step_ended(journal.step_started("laser_sweep", 2), 1.0, error="the arm was pushed")
+    journal.close()
+    sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
+    assert sweep is None
+    assert "had not finished its sweep" in why
+
+
 def test_a_sweep_that_was_begun_again_is_not_used(tmp_path: Path) -> None:
     run, job = cut_short(tmp_path)
     journal = Journal(run.folder, "later", run.info)
