@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration import ScanCalibration, TargetCalibration
+from cell.calibration.archive import _pose
 from cell.calibration.finding import find_calibration
 from cell.calibration.sessions import marked, serial_numbers
 from cell.calibration.solve.results import KEPT, Quality
@@ -172,3 +173,10 @@ def test_a_file_of_another_format_or_with_a_number_missing_is_none(tmp_path: Pat
         (tmp_path / "own.json").write_text(json.dumps(spoilt), encoding="utf-8")
         with pytest.raises(CalibrationStale, match=r"unreadable \(own\.json\)"):
             found(tmp_path)
+
+
+def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
+    assert _pose(pin.SE3.Random().homogeneous, "view 1")
+    for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.001, 1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=1) * 1e-3):
+        with pytest.raises(ValueError, match="view 1 is no rotation and translation"):
+            _pose(wrong, "view 1")
