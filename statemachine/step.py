@@ -110,6 +110,12 @@ class StepContext:
 
         self._control.safe_point(self.token, say, self._look)
 
+    def was_held(self) -> bool:
+        """A `safe_point`, and whether the run was held there: what was seen before may have changed meanwhile."""
+        before = self._control.held_s
+        self.safe_point()
+        return self._control.held_s > before
+
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""
         self.check()

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cell.devices.direct import VirtualCell
-from cell.inversion.moved import SurfaceMotion
+from cell.inversion import NominalSurface
+from cell.inversion.moved import SurfaceMotion, surface_motion
+from cell.job import Job
 from cell.lab.bench.whole_job import JobRecord, NoFrames
+from cell.reconstruction import Cloud, flange_motions, merge
+from cell.reconstruction.cloud import Filled
 from cell.steps.kinds import PLACE
-from cell.steps.second_look import LINES, require_in_place, sparse
+from cell.steps.second_look import LINES, SecondLook, require_in_place, require_points, sparse
+from cell.steps.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
-from statemachine.runner import StepContext
-from tests.report_runs import CONFIG, at_station, pot, work_of
+from statemachine.control import RunControl
+from statemachine.runner import Event, StepContext
+from tests.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
 
 
-def slid(cell: VirtualCell, shift: tuple[float, float], turn: float) -> None:
+def slid(cell: VirtualCell, shift: tuple[float, float], turn: float = 0.0) -> None:
     """Push the surface over its table, m and rad; the board stays."""
     world = cell.world
     pose = world.scene.world_from_surface.copy()
@@ -31,29 +39,58 @@ def slid(cell: VirtualCell, shift: tuple[float, float], turn: float) -> None:
     world._cameras.show(world.scene, world.station)
 
 
+@dataclass
+class Site:
+    """A cell that stands where `record` placed, `further` metres on, its vehicle braked, and what was made before.
+
+    `tell` hears what the steps tell.
+    """
+
+    record: JobRecord
+    folder: Path
+    job: Job
+    nominal: NominalSurface
+    further: float = 0.0
+    tell: Callable[[Event], None] = lambda event: None
+    control: RunControl = field(default_factory=RunControl)
+    look: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self.cell = cell = VirtualCell(CONFIG, self.record.seed, self.record.level)
+        at_station(cell, self.record, self.further)
+        cell.devices.vehicle.brake()
+        self.work = work_of(cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
+        cell.devices.interlocks.work_with(self.work.calibration.configuration)
+        self.made = {name: self.record.results[name] for name in NAMES[:-1]}
+
+    def sweep_here(self) -> None:
+        """Photograph, sweep and find the surface anew: the arm stays where it swept."""
+        for name in NAMES[1:-1]:
+            self.made[name] = PLACE.work(self.work)[name](self.context)
+
+    @property
+    def context(self) -> StepContext:
+        step = PLACE.policy().of("place")
+        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.tell, self.control, self.look)
+
+    def look_again(self) -> SecondLook:
+        made = (self.made[name] for name in ("board_photo", "laser_sweep", "reconstruct", "invert_pose"))
+        return require_in_place(self.work, *made, self.context)
+
+
 def looked(
-    record: JobRecord,
-    folder: Path,
-    shift: tuple[float, float] = (0.0, 0.0),
-    turn: float = 0.0,
-    further: float = 0.0,
-    cell: VirtualCell | None = None,
-) -> SurfaceMotion:
+    record: JobRecord, folder: Path, shift: tuple[float, float] = (0.0, 0.0), turn: float = 0.0, further: float = 0.0
+) -> SecondLook:
     """A look at the surface of `record`, slid by so much, from a vehicle so many metres from where it stood."""
-    job, nominal = pot()
-    cell = cell or VirtualCell(CONFIG, record.seed, record.level)
-    at_station(cell, record, further)
-    cell.devices.vehicle.brake()
-    slid(cell, shift, turn)
-    work = work_of(cell, job, nominal, record, NoFrames(), folder)
-    cell.devices.interlocks.work_with(work.calibration.configuration)
-    made = [record.results[name] for name in ("board_photo", "laser_sweep", "reconstruct", "invert_pose")]
-    context = StepContext(PLACE.policy().of("place"), 1, math.inf, {}, cell.clock, lambda event: None)
-    return require_in_place(work, *made, context)
+    site = Site(record, folder, *pot(), further)
+    slid(site.cell, shift, turn)
+    return site.look_again()
 
 
 def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: Path) -> None:
-    found = looked(placed_pot, tmp_path)
+    look = looked(placed_pot, tmp_path)
+    found = look.moved
+    assert look.notes == ()
     assert np.linalg.norm(found.motion[:3]) < 0.2e-3 and np.linalg.norm(found.motion[3:]) < 0.5e-3
     assert not found.moved and found.times < 0.9
     assert found.matched == pytest.approx(1.0, abs=0.1)
@@ -64,8 +101,14 @@ def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: 
 
 @pytest.mark.parametrize(
     ("shift", "turn", "further"),
-    [((0.5e-3, 0.0), 0.0, 0.0), ((0.0, -0.5e-3), 0.0, 0.0), ((0.0, 0.0), 3e-3, 0.0), ((0.0, 0.0), 0.0, 0.5e-3)],
-    ids=["along", "across", "turned", "the vehicle was pushed"],
+    [
+        ((0.5e-3, 0.0), 0.0, 0.0),
+        ((0.0, -0.5e-3), 0.0, 0.0),
+        ((0.0, 0.0), 3e-3, 0.0),
+        ((0.0, 0.0), 0.0, 0.5e-3),
+        ((0.0, 4e-3), 0.0, 0.0),
+    ],
+    ids=["along", "across", "turned", "the vehicle was pushed", "far"],
 )
 def test_one_that_slid_over_its_table_is_refused(
     placed_pot: JobRecord, tmp_path: Path, shift: tuple[float, float], turn: float, further: float
@@ -98,8 +141,8 @@ def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_pa
 def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CellError
 ) -> None:
-    cell = VirtualCell(CONFIG, placed_pot.seed, placed_pot.level)
-    camera, rates = cell.scan_camera, []
+    site = Site(placed_pot, tmp_path, *pot())
+    camera, rates = site.cell.scan_camera, []
     usual = camera.configure
 
     def configure(exposure: float, frame_rate: float) -> None:
@@ -109,14 +152,112 @@ def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
         usual(exposure, frame_rate)
 
     monkeypatch.setattr(camera, "configure", configure)
-    assert not looked(placed_pot, tmp_path, cell=cell).moved
+    assert not site.look_again().moved.moved
     assert set(rates) == {30.0}
 
 
-def test_a_second_look_takes_few_lines_of_one_strip() -> None:
-    scan = pot()[0].scan
-    few = sparse(scan)
-    assert few.speed == scan.speed and len(few.swath) == 1
+def test_a_second_look_takes_few_lines_of_one_strip_no_faster_than_before(placed_pot: JobRecord) -> None:
+    scan, (swath,) = pot()[0].scan, placed_pot.results["laser_sweep"].swaths
+    few = sparse(scan, swath)
+    assert few.speed == pytest.approx(scan.speed, rel=0.01) and len(few.swath) == 1
     assert few.length / few.speed * few.frame_rate == pytest.approx(LINES)
     slow = scan.model_copy(update={"frame_rate": 5.0, "speed": 0.02})
-    assert sparse(slow).frame_rate == 5.0
+    assert sparse(slow, swath).frame_rate == 5.0
+    # A sweep that was repeated went half as fast.
+    again = sparse(scan, replace(swath, times=2.0 * swath.times))
+    assert again.speed == pytest.approx(0.5 * scan.speed, rel=0.01)
+
+
+def test_a_look_that_loses_frames_tells_as_much(placed_pot: JobRecord, tmp_path: Path) -> None:
+    lost: list[int] = []
+
+    def losing(event: Event) -> None:
+        if event.data.get("text", "").endswith("3 profiles"):
+            site.cell.scan_camera.model.fault("camera.frame_loss", 4)
+            lost.append(4)
+
+    site = Site(placed_pot, tmp_path, *pot(), tell=losing)
+    assert not site.look_again().moved.moved
+    assert sum(lost) > MAX_LOST_FRACTION * LINES
+
+
+def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobRecord, tmp_path: Path) -> None:
+    job, nominal = pot()
+    site = Site(placed_pot, tmp_path, changed(job, "place", tolerance=2e-3), nominal)
+    site.sweep_here()
+    slid(site.cell, (0.25e-3, 0.0))
+    with pytest.raises(RefusedError, match=r"has moved by 0\.2\d mm .* times as far as chance brings"):
+        site.look_again()
+    # Replies that came late may have shifted the sweep as far.
+    sweep = site.made["laser_sweep"]
+    (swath,) = sweep.swaths
+    loose = replace(swath, shift=0.15e-3)
+    site.made["laser_sweep"] = replace(sweep, swaths=(loose,), rest=site.cell.devices.interlocks.situation.last)
+    look = site.look_again()
+    assert not look.moved.moved and look.notes == ()
+    # A place that is wanted more exactly than that is asked of the board, too.
+    site.work.job = changed(job, "place", tolerance=0.2e-3)
+    taken = len(site.cell.target_camera.shots)
+    (note,) = site.look_again().notes
+    assert len(site.cell.target_camera.shots) > taken
+    assert re.search(r"translation along the x axis of the surface frame shows from 0\.\d+ mm on.* nobody touch", note)
+
+
+def test_after_a_pause_it_is_looked_at_anew(placed_pot: JobRecord, tmp_path: Path) -> None:
+    held: list[bool] = []
+
+    def tell(event: Event) -> None:
+        if "9 profiles" in event.data.get("text", "") and not held:
+            site.control.pause()
+
+    def reach_in() -> None:
+        held.append(True)
+        slid(site.cell, (0.0, 1e-3))
+        site.control.go_on()
+
+    site = Site(placed_pot, tmp_path, *pot(), tell=tell, look=reach_in)
+    with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
+        PLACE.work(site.work)["place"](site.context)
+    assert held == [True]
+
+
+# --- two clouds, one beside the other ---
+
+
+def lines_of(cloud: Cloud, lines: slice, kept: float = 1.0) -> Cloud:
+    """Some lines of a cloud of one sweep, and a share of their points."""
+    names = ("points", "stripe_spread", "rail_spread", "centres", "rail", "rejected", "flanges")
+    some = {name: getattr(cloud, name)[lines].copy() for name in names}
+    some["points"][np.random.default_rng(1).random(some["points"].shape[:2]) > kept] = np.nan
+    return replace(cloud, **some, sweeps=np.zeros(len(some["rail"]), dtype=np.intp), filled=Filled())
+
+
+def compared(record: JobRecord, first: Cloud, second: Cloud) -> SurfaceMotion:
+    """A motion between two clouds of arms that stood where they say."""
+    by_poses = tuple(partial(flange_motions, cloud, covariances=[np.zeros((6, 6))]) for cloud in (first, second))
+    return surface_motion(first, second, pot()[1], record.results["invert_pose"].base_from_surface, by_poses)
+
+
+@pytest.mark.parametrize(("every", "kept"), [(5, 1.0), (1, 0.01)], ids=["lines 5 mm apart", "few points in all"])
+def test_a_first_sweep_that_was_coarse_is_one_to_compare_with(placed_pot: JobRecord, every: int, kept: float) -> None:
+    cloud = placed_pot.results["reconstruct"].cloud
+    first, second = lines_of(cloud, slice(0, None, every), kept), lines_of(cloud, slice(2, None, max(2, every)))
+    found = compared(placed_pot, first, second)
+    assert found.matched == pytest.approx(1.0, abs=0.15)
+    assert np.linalg.norm(found.motion[:3]) < 0.1e-3
+
+
+def test_one_strip_of_several_is_held_against_itself(placed_pot: JobRecord) -> None:
+    cloud = placed_pot.results["reconstruct"].cloud
+    aside = replace(cloud, points=cloud.points + np.array([0.0, 0.0, 0.3e-3]))
+    strips = merge([cloud, aside])
+    assert strips.of_sweep(0).size == cloud.size
+    assert np.array_equal(strips.of_sweep(1).points, aside.points, equal_nan=True)
+    assert strips.of_sweep(1).each_sweep() == [slice(0, cloud.shape[0])]
+
+
+def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord) -> None:
+    nothing = lines_of(placed_pot.results["reconstruct"].cloud, slice(0, 30), 0.0)
+    with pytest.raises(RefusedError, match=r"0 points were seen in 30 profiles .* gone, or the laser"):
+        require_points(nothing)
+    assert compared(placed_pot, nothing, nothing).moved

@@ -121,3 +121,9 @@ def test_one_parameter_more_is_what_it_would_be_if_it_were_free() -> None:
     assert more.sigma == pytest.approx(float(np.sqrt(free.covariance[distance, distance])), rel=0.01)
     moved = free.state.camera.parameters - there.camera.parameters
     assert more.gain[:8] * more.value == pytest.approx(moved[:8], rel=0.06, abs=1e-6)
+    # What the parameters that are free already can do together is nothing more, however little of it they leave.
+    whole = Adjustment(joint.views, joint.free, priors)
+    stripes = [rows for k in range(len(whole.views)) for name, rows, *_ in whole.rows_of(k, there) if name == "stripe"]
+    plane_rows = np.concatenate(stripes)[:, PLANE]
+    for way in np.linalg.eigh(plane_rows.T @ plane_rows)[1].T:
+        assert one_more(whole, there, "stripe", lambda k, rows, way=way: rows[:, PLANE] @ way).sigma == np.inf

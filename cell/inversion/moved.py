@@ -6,7 +6,7 @@ lie beside each other. A motion shows in all of them, noise and a vehicle that r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -15,18 +15,24 @@ from numpy.typing import NDArray
 
 from cell.inversion.closest import Array
 from cell.inversion.correspondences import Scan, correspondences
+from cell.inversion.motions import name, sorted_out
 from cell.inversion.nominal import NominalSurface
+from cell.inversion.observability import Tolerance
 from cell.reconstruction.cloud import Cloud
 from cell.reconstruction.seams import Motions
 
 GATE_M = 5e-3
 """Points farther from where the surface was are not of it; where it has moved farther, few are left."""
 BESIDE_M = 1e-3
-"""Between points of the two scans that are compared."""
+"""Between points of the two scans that are compared; more where the lines of the first one lie farther apart."""
+SPREAD = 2.5
+"""Of distances to the lines of a scan, which are uniform up to half of what is between two lines, the largest is twice
+the median."""
 OUTLIER = 5.0
 """Median absolute deviations from the motion found."""
 EVIDENCE = 32.0
-"""Squared Mahalanobis distance above which it has moved: 6 times F(6, 28) at 0.999, for some thirty lines."""
+"""Squared Mahalanobis distance above which it has moved: 6 times F(6, 28) at 0.999, for some thirty lines. Of ten lines
+that scatter by themselves 0.2 % come that far."""
 NEIGHBOURS = 4
 ROUNDS = 3
 MOST_POINTS = 40_000
@@ -34,6 +40,9 @@ LEAST_M = 3e-6
 """Noise of a point that is believed."""
 LEAST_MATCHED = 0.5
 """Share of the second scan's points beside the surface, against the first one's, above which it can be the same."""
+SETTLED_M = 0.05e-3
+MOST_STEPS = 8
+"""Until a surface that has moved far is found where it lies now."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +50,13 @@ class SurfaceMotion:
     """By what `motion` (6,) (shift m, turn rad; base axes, about the surface's origin) the surface seems to have moved.
 
     Its `covariance` (6, 6); `matched`, the share of the second scan's points beside the surface as it was found, in
-    units of the first one's.
+    units of the first one's. `found` is where one that has moved lies, as `motion`; None where it was not found.
     """
 
     motion: Array
     covariance: Array
     matched: float
+    found: Array | None = None
 
     @property
     def times(self) -> float:
@@ -58,6 +68,15 @@ class SurfaceMotion:
         """Whether it has moved, or is not there any more."""
         return self.matched < LEAST_MATCHED or self.times > 1.0
 
+    def hidden(self, base_from_surface: pin.SE3, tolerance: Tolerance, radius: float) -> list[str]:
+        """In words the motions, about the surface's axes, that would be larger than `tolerance` before they show."""
+        unit = np.array([tolerance.translation] * 3 + [tolerance.rotation] * 3)
+        turned = np.kron(np.eye(2), base_from_surface.rotation)
+        covariance = EVIDENCE * turned.T @ self.covariance @ turned
+        values, ways = np.linalg.eigh(covariance / np.outer(unit, unit))
+        ways = unit[:, None] * ways[:, values > 1.0]
+        return [_least(way, covariance, radius) for way in sorted_out(ways, radius)] if ways.size else []
+
     def as_dict(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
@@ -68,50 +87,85 @@ class SurfaceMotion:
         }
 
 
-def surface_motion(
-    first: Cloud, second: Cloud, nominal: NominalSurface, pose: pin.SE3, prior: Array, by_poses: tuple[Motions, Motions]
-) -> SurfaceMotion:
-    """Between two scans of the `nominal` surface, which the first one found at `pose` (base_from_surface).
+def _least(way: Array, covariance: Array, radius: float) -> str:
+    """The least motion along `way` (6,) that shows, as `covariance` (6, 6) has it, in words."""
+    turn = float(np.linalg.norm(way[3:]))
+    block, own, unit = (
+        (slice(0, 3), way[:3], "mm") if turn * radius < np.linalg.norm(way[:3]) else (slice(3, 6), way[3:], "mrad")
+    )
+    own = own / np.linalg.norm(own)
+    least = float(np.sqrt(own @ covariance[block, block] @ own))
+    if least * (1.0 if unit == "mm" else radius) > GATE_M:
+        return f"{name(way, radius)} does not show"
+    return f"{name(way, radius)} shows from {1e3 * least:.2g} {unit} on"
 
-    `prior` (6, 6) is how far it may have moved at all; `by_poses` how the points of each scan move by one standard
-    deviation of what the arm's poses are off by.
+
+def surface_motion(
+    first: Cloud, second: Cloud, nominal: NominalSurface, pose: pin.SE3, by_poses: tuple[Motions, Motions]
+) -> SurfaceMotion:
+    """Between two scans of the same strip of the `nominal` surface; in the first it lay at `pose` (base_from_surface).
+
+    `by_poses` is how the points of each scan move by one standard deviation of what the arm's poses are off by.
     """
     before = _Beside.of(first, nominal, pose, by_poses[0])
-    now = _Beside.of(second, nominal, pose, by_poses[1])
     tree = scipy.spatial.cKDTree(before.feet)
-    apart, pairs = map(np.asarray, tree.query(now.feet, k=NEIGHBOURS, distance_upper_bound=BESIDE_M))
-    near = np.isfinite(apart).all(axis=1)
-    matched = now.share * float(near.mean()) / before.share if near.any() else 0.0
-    if matched < LEAST_MATCHED:
-        return SurfaceMotion(np.zeros(6), prior, matched)
+    seen = _compared(before, tree, _Beside.of(second, nominal, pose, by_poses[1]), nominal.radius)
+    if seen.matched < LEAST_MATCHED or not seen.moved:
+        return seen
+    # From afar its heights tell how far it went only roughly: it is followed there.
+    step, there = seen.motion, pose
+    for _ in range(MOST_STEPS):
+        there = pin.SE3(pin.exp3(step[3:]) @ there.rotation, there.translation + step[:3])
+        if np.linalg.norm(step[:3]) + nominal.radius * np.linalg.norm(step[3:]) < SETTLED_M:
+            turn = pin.log3(there.rotation @ pose.rotation.T)
+            return replace(seen, found=np.concatenate([there.translation - pose.translation, turn]))
+        left = _compared(before, tree, _Beside.of(second, nominal, there, by_poses[1]), nominal.radius)
+        if left.matched < LEAST_MATCHED:
+            break
+        step = left.motion
+    return seen
+
+
+def _compared(before: _Beside, tree: scipy.spatial.cKDTree, now: _Beside, radius: float) -> SurfaceMotion:
+    """How far the points of `now` have risen over those of `before`, whose feet are in the `tree`, as a motion."""
+    # As far as the gate lets it be told, where the points tell nothing.
+    free = np.array([GATE_M] * 3 + [GATE_M / radius] * 3)
+    if not (len(now.heights) and len(before.heights) >= NEIGHBOURS):
+        return SurfaceMotion(np.zeros(6), np.diag(free**2), 0.0)
+    apart, pairs = map(np.asarray, tree.query(now.feet, k=NEIGHBOURS))
+    near = apart[:, -1] <= max(BESIDE_M, SPREAD * float(np.median(apart[:, -1])))
+    matched = now.share * float(near.mean()) / before.share
     pairs = pairs[near]
     risen = now.heights[near] - before.heights[pairs].mean(axis=1)
     rows, lines = now.jacobian[near], now.lines[near]
     poses = np.concatenate([now.by_poses[near], before.by_poses[pairs].mean(axis=1)], axis=1)
     kept = np.ones(len(risen), dtype=np.bool_)
-    motion, covariance = np.zeros(6), prior
+    motion, covariance = np.zeros(6), np.diag(free**2)
     for _ in range(ROUNDS):
-        motion, covariance = _fitted(rows[kept], risen[kept], lines[kept], poses[kept], prior)
+        motion, covariance = _fitted(rows[kept], risen[kept], lines[kept], poses[kept], free)
         left = risen - rows @ motion
         kept = np.abs(left) <= OUTLIER * float(np.median(np.abs(left))) + 1e-9
     return SurfaceMotion(motion, covariance, matched)
 
 
-def _fitted(rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, prior: Array) -> tuple[Array, Array]:
+def _fitted(rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, free: Array) -> tuple[Array, Array]:
     """The motion (6,) and its covariance (6, 6) from how far points (n,) have `risen`, by their derivatives (n, 6).
 
-    What is left is of single points and of whole `lines` (n,); the `poses` (n, m) of the arm move all of a scan.
+    `free` (6,) is one standard deviation of a motion that the points tell nothing of. What is left is of single points
+    and of whole `lines` (n,); the `poses` (n, m) of the arm move all of a scan.
     """
-    left = risen - rows @ np.linalg.lstsq(rows, risen)[0]
+    # In units of `free`: what is told and what is not lie too far apart otherwise to be solved for together.
+    scaled = rows * free
+    left = risen - scaled @ np.linalg.lstsq(scaled, risen)[0]
     number = np.bincount(lines)
     means = np.bincount(lines, left) / np.maximum(number, 1)
     point = max(LEAST_M, float(np.std(left - means[lines])))
     line = float(np.sqrt(np.sum(means**2) / max(1, int(np.count_nonzero(number)) - 6)))
-    covariance = np.asarray(np.linalg.inv(rows.T @ rows / point**2 + np.linalg.inv(prior)))
-    motion = covariance @ rows.T @ risen / point**2
-    by_line = line * np.stack([np.bincount(lines, column) for column in rows.T])
-    spread = covariance @ np.hstack([by_line, rows.T @ poses]) / point**2
-    return motion, covariance + spread @ spread.T
+    covariance = np.asarray(np.linalg.inv(scaled.T @ scaled / point**2 + np.eye(6)))
+    motion = covariance @ scaled.T @ risen / point**2
+    by_line = line * np.stack([np.bincount(lines, column) for column in scaled.T])
+    spread = covariance @ np.hstack([by_line, scaled.T @ poses]) / point**2
+    return free * motion, np.outer(free, free) * (covariance + spread @ spread.T)
 
 
 @dataclass(frozen=True, eq=False)

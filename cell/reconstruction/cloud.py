@@ -88,6 +88,13 @@ class Cloud:
         ends = np.searchsorted(self.sweeps, np.arange(int(self.sweeps.max()) + 2))
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
+    def of_sweep(self, number: int) -> Cloud:
+        """The measured points of one of its sweeps, as a cloud of their own."""
+        lines = self.each_sweep()[number]
+        names = ("points", "stripe_spread", "rail_spread", "centres", "rail", "rejected", "flanges")
+        own = {name: getattr(self, name)[lines] for name in names}
+        return replace(self, **own, sweeps=np.empty(0, dtype=np.intp), filled=Filled())
+
     def subsample(self, most: int) -> tuple[Indices, Indices]:
         """Indices (line, row) of at most `most` measured points, spread evenly over the cloud."""
         lines, rows = np.nonzero(self.valid)

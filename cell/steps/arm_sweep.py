@@ -16,7 +16,7 @@ from cell.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.moves import Mover
-from cell.steps.swath import MAX_LOST_FRACTION, Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.clock_map import ClockMap
 from drivers.errors import CellError, DeviceFault
 
@@ -32,8 +32,8 @@ JITTER_S = 0.0003
 def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
     """Move the scan head over the placement area and pair every profile with the flange's pose.
 
-    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the planned stretch, the arm's
-    states have gaps or it moved unevenly between them, or the times of arm or camera are not known well enough;
+    Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the planned stretch, the
+    arm's states have gaps or it moved unevenly between them, or the times of arm or camera are not known well enough;
     whatever happens, the arm is stopped before the error goes on.
     """
     scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
@@ -80,18 +80,18 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     within = (done >= 0) & (done <= length)
     even = track.even(times[seen])
     uneven = int(np.count_nonzero(within & ~even))
-    if uneven > MAX_LOST_FRACTION * np.count_nonzero(within):
+    if uneven > errors.lost * np.count_nonzero(within):
         raise DeviceFault(
             arm.name,
             "arm.uneven_sweep",
             f"where the arm was is not known at {uneven} of {np.count_nonzero(within)} profiles, allowed are "
-            f"{100 * MAX_LOST_FRACTION:.0f} %: it did not move evenly between the states that came from it",
+            f"{100 * errors.lost:.0f} %: it did not move evenly between the states that came from it",
             recoverable=True,
             hint="Look at the arm's link and at what else this machine is busy with.",
         )
     within &= even
     lines, flanges, done = seen[within], flanges[within], done[within]
-    middle = collector.require_frames(camera.name, lines)
+    middle = collector.require_frames(camera.name, lines, errors.lost)
     if len(lines) < 3:
         raise DeviceFault(
             arm.name,

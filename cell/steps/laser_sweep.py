@@ -26,7 +26,7 @@ from cell.steps.photograph import BoardFix
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.step import JobStep
 from cell.steps.stored_sweep import FILE, save_sweep
-from cell.steps.swath import Collector, SweepErrors, rehearse
+from cell.steps.swath import MAX_LOST_FRACTION, Collector, SweepErrors, rehearse
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import Workplace
@@ -117,6 +117,7 @@ def swept(
     check: Callable[[], None],
     progress: Callable[[float, str], None],
     sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None,
+    most_lost: float = MAX_LOST_FRACTION,
 ) -> SweepRecord:
     """`laser_sweep` where a job is done, over the strips of `scan`; raises what it raises.
 
@@ -137,6 +138,7 @@ def swept(
             devices.clock.rate,
             math.hypot(here.config.scan_camera.late, here.config.rail.late),
             times_known(here.calibration.scan, here.config)[0],
+            most_lost,
         ),
         here.mover,
         devices,

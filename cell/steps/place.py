@@ -10,14 +10,13 @@ import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.inversion import PlacePose
-from cell.inversion.moved import SurfaceMotion
 from cell.job import Job
 from cell.motion.bodies import TOUCHES
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction
-from cell.steps.second_look import require_in_place
+from cell.steps.second_look import SecondLook, require_in_place
 from cell.steps.step import JobStep
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
@@ -35,21 +34,22 @@ FAST_FORCE = 3.0
 @dataclass(frozen=True, eq=False)
 class PlaceResult:
     """Where the flange was when the part was let go, how far that was from where it was expected, in m, pressed on as
-    it was, and where the part had touched first; None from an arm that tells too few states. `moved` is how far the
-    surface seemed to have gone between its sweep and the descent."""
+    it was, and where the part had touched first; None from an arm that tells too few states. `look` is what was seen of
+    the surface between its sweep and the descent; None where it was measured without a sweep."""
 
     base_from_flange: pin.SE3
     contact: bool
     depth_error: float
     touch: TouchCheck | None = None
-    moved: SurfaceMotion | None = None
+    look: SecondLook | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
+        seen = () if self.look is None else self.look.notes
         if self.touch is None:
-            return ("the first touch was not held against the scan: the arm told too few states on the way down",)
-        return self.touch.notes
+            return (*seen, "the first touch was not held against the scan: the arm told too few states on the way down")
+        return (*seen, *self.touch.notes)
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -57,7 +57,7 @@ class PlaceResult:
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
-            "surface_moved": None if self.moved is None else self.moved.as_dict(),
+            "surface_moved": None if self.look is None else self.look.moved.as_dict(),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
             "base_from_flange_units": {"translation": "m", "rotation_vector": "rad"},
         }
@@ -164,11 +164,15 @@ def require_held(part: PartProgress) -> None:
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
     pose = context.made(PlacePose)
     require_held(here.part)
-    moved = _looked_again(here, pose, context)
+    expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
+    look = _looked_again(here, pose, context)
+    # Whoever has the run held may be about to reach in.
+    while context.was_held():
+        look = _looked_again(here, pose, context)
     done = place(
         here.job,
         pose.base_from_surface,
-        expected_touch(here.job, here.nominal, pose, here.repeatability),
+        expected,
         here.mover,
         here.devices.arm,
         here.devices.claw,
@@ -177,12 +181,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         context.progress,
         lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )
+    done = replace(done, look=look)
     for note in done.notes:
         context.note(text=note)
-    return replace(done, moved=moved)
+    return done
 
 
-def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SurfaceMotion | None:
+def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:
     """`RefusedError` when the surface is not where it was measured; None where it was measured without a sweep."""
     fix = context.made(BoardFix)
     try:
@@ -191,11 +196,9 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sur
         # A kind of job that measures in another way.
         require_unmoved(here, fix, "before its place was measured", context.progress)
         return None
-    if pose.verdict.unseen:
-        # Where only the board decides, the surface tells nothing.
-        require_unmoved(here, fix, "before the sweep", context.progress)
     return require_in_place(here, fix, sweep, scan, pose, context)
 
 
-# A part that may have touched the surface is not placed a second time by itself.
-STEP = JobStep(Step("place", 180.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))
+# A part that may have touched the surface is not placed a second time by itself. The second look takes as long as a
+# sweep: the step has what the one of the sweep has, and 180 s.
+STEP = JobStep(Step("place", 300.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))

@@ -21,9 +21,9 @@ MAX_RESIDUAL = 5.0
 def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
     """Sweep the scan head over the placement area and pair every profile with the rail's position.
 
-    Raises `DeviceFault` when more than 5 % of the frames were lost, none came from the constant-velocity part, the
-    flange moved by more than 0.1 mm meanwhile, the replies of rail or camera came so late that the sweep may lie off
-    by more than `errors.shift`, or the rail did not run evenly.
+    Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the constant-velocity
+    part, the flange moved by more than 0.1 mm meanwhile, the replies of rail or camera came so late that the sweep may
+    lie off by more than `errors.shift`, or the rail did not run evenly.
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
     mover.to(plan.base_from_flange, "the scan pose")
@@ -48,7 +48,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     late = 0.0 if errors.timing is None else errors.timing.late
     times = np.array(collector.times) - late
     lines = np.flatnonzero((times >= begin) & (times <= end))
-    middle = collector.require_frames(devices.scan_camera.name, lines)
+    middle = collector.require_frames(devices.scan_camera.name, lines, errors.lost)
     moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
     if moved > MAX_FLANGE_MOTION:
         raise DeviceFault(

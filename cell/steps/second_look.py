@@ -6,6 +6,7 @@ on a sweep of an hour ago. Nothing that the arm feels tells a shift to the side.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,74 +14,142 @@ import numpy as np
 from cell.calibration.collect.witness import configure_fast
 from cell.inversion import PlacePose
 from cell.inversion.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
+from cell.inversion.observability import Tolerance
 from cell.job import ScanSection
-from cell.reconstruction import flange_motions
+from cell.reconstruction import Cloud, flange_motions
 from cell.steps.laser_sweep import swept
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction, build_cloud
+from cell.steps.swath import Swath
 from cell.steps.sweep_record import SweepRecord
+from cell.steps.unmoved import require_unmoved as require_board_unmoved
 from cell.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
+from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 
 LINES = 32
 """Enough for a vehicle that rocks to average out."""
+LEAST_POINTS = 500
+MOST_LOST = 0.5
+"""Share of its frames: a comparison misses none of them, and says what is left of it."""
+NEXT_STEP = "See what pushed it, then run the job again from its sweep"
+
+
+@dataclass(frozen=True, eq=False)
+class SecondLook:
+    """By how much the surface seemed to have `moved`, and in words what is `hidden`: motions that could be larger than
+    the place's tolerance unseen."""
+
+    moved: SurfaceMotion
+    hidden: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not as usual, for people."""
+        if not self.hidden:
+            return ()
+        return (
+            "a motion of the surface alone since it was swept could be larger than place.tolerance unseen: "
+            f"{', '.join(self.hidden)}. Let nobody touch it meanwhile",
+        )
 
 
 def require_in_place(
     here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
-) -> SurfaceMotion:
-    """Sweep one strip of the surface again, in few lines, and compare: what little it seems to have moved.
+) -> SecondLook:
+    """Sweep the first strip again, in few lines, and compare; photograph the board if the lines leave much open.
 
-    Raises `RefusedError` when it has moved by more than lines and arm leave open, and what a sweep raises.
+    Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
+    place = here.job.place
+    found = _swept_again(here, fix, sweep, scan, pose, context)
+    require_unmoved(found)
+    tolerance = Tolerance(place.tolerance, place.tolerance_angle)
+    hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
+    if hidden or pose.verdict.unseen:
+        require_board_unmoved(here, fix, "before the sweep", lambda _, text: context.progress(0.04, text))
+    return SecondLook(found, hidden)
+
+
+def _swept_again(
+    here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
+) -> SurfaceMotion:
     # The arm is not moved from where it stands already.
     stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
     head = here.calibration.scan
     if sweep.pointing is not None:
         head = head.pointed(sweep.pointing, here.config.laser.exit_point)
-    few = sparse(here.job.scan)
+    few = sparse(here.job.scan, sweep.swaths[0])
     # A camera of a few frame rates takes all the lines.
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = swept(
         here, fix, head, few.model_copy(update={"frame_rate": rate}),
         lambda frame: here.frames.keep("second-look", frame), context.check,
-        lambda share, text: context.progress(0.1 * share, f"whether the surface lies where it did: {text}"),
+        lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
+        most_lost=MOST_LOST,
     )  # fmt: skip
-    cloud, surface = build_cloud(again), here.job.surface
-    before = [np.zeros((6, 6))] if stood else [swath.covariance for swath in sweep.swaths]
-    now = [here.settling] if stood else [swath.covariance for swath in again.swaths]
-    found = surface_motion(
-        scan.cloud,
-        cloud,
+    # What lens and light plane are off by cancels in the same strip only.
+    before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
+    spread, spread_now = sweep.swaths[0].covariance, again.swaths[0].covariance
+    if stood:
+        spread, spread_now = by_times(sweep.swaths[0]), here.settling + by_times(again.swaths[0])
+    return surface_motion(
+        before,
+        now,
         here.nominal,
         pose.base_from_surface,
-        np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3),
-        (partial(flange_motions, scan.cloud, covariances=before), partial(flange_motions, cloud, covariances=now)),
+        (partial(flange_motions, before, covariances=[spread]), partial(flange_motions, now, covariances=[spread_now])),
     )
-    require_unmoved(found)
-    return found
 
 
-def sparse(scan: ScanSection) -> ScanSection:
-    """One strip of a scan with the same speed and about `LINES` lines."""
-    rate = min(scan.frame_rate, max(1.0, LINES * scan.speed / scan.length))
-    return scan.model_copy(update={"frame_rate": rate, "swath": scan.swath[:1]})
+def by_times(swath: Swath) -> Vector:
+    """Covariance (6, 6) of base_from_flange by what replies leave open of this sweep's times.
+
+    How late stamps come all the time is the same in two sweeps by one device.
+    """
+    along = swath.shift * swath.builder.sweep_direction(swath.base_from_flange)
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = np.outer(along, along) / 3.0
+    return shared
 
 
-def require_unmoved(found: SurfaceMotion) -> None:
-    """Raise `RefusedError` for a surface that lies elsewhere."""
-    if not found.moved:
-        return
-    next_step = "See what pushed it, then run the job again from its sweep"
-    if found.matched < LEAST_MATCHED:
-        raise RefusedError(
-            f"the surface does not lie any more where it was swept: of its second sweep {100 * found.matched:.0f} % as "
-            f"many points lie on it as of the first. {next_step}",
-            Measured("second sweep on the surface", 100 * found.matched, "%", least=100 * LEAST_MATCHED),
-        )
-    shift, turn = 1e3 * float(np.linalg.norm(found.motion[:3])), float(np.degrees(np.linalg.norm(found.motion[3:])))
+def sparse(scan: ScanSection, swept: Swath) -> ScanSection:
+    """One strip of a scan in about `LINES` lines, no faster than it was `swept`: a repetition is slower."""
+    ways = np.linalg.norm(swept.flanges[-1, :3, 3] - swept.flanges[0, :3, 3]) + abs(swept.rail[-1] - swept.rail[0])
+    speed = min(scan.speed, float(ways / (swept.times[-1] - swept.times[0])))
+    rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
+    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": scan.swath[:1]})
+
+
+def require_points(cloud: Cloud) -> Cloud:
+    """The cloud of the second sweep; raises `RefusedError` when there is next to nothing in it."""
+    if cloud.size >= LEAST_POINTS:
+        return cloud
     raise RefusedError(
-        f"the surface has moved by {shift:.2f} mm and {turn:.3f} deg since it was swept. {next_step}",
-        Measured("surface moved, against what chance brings", found.times, "times", most=1.0),
+        f"the surface was swept once more before the part is put down, and {cloud.size} points were seen in "
+        f"{cloud.shape[0]} profiles (at least {LEAST_POINTS}): it is gone, or the laser does not light it any more. "
+        "Look at both, then run the job again from its sweep",
+        Measured("points of the second sweep", cloud.size, least=LEAST_POINTS),
+    )
+
+
+def require_unmoved(moved: SurfaceMotion) -> None:
+    """Raise `RefusedError` for a surface that lies elsewhere."""
+    if not moved.moved:
+        return
+    if moved.matched < LEAST_MATCHED:
+        raise RefusedError(
+            f"the surface does not lie any more where it was swept: of its second sweep {100 * moved.matched:.0f} % as "
+            f"many points lie on it as of the first, allowed are {100 * LEAST_MATCHED:.0f} %. {NEXT_STEP}",
+            Measured("second sweep on the surface", 100 * moved.matched, "%", least=100 * LEAST_MATCHED),
+        )
+    if moved.found is None:
+        far = "by some millimetres or degrees, too far to tell how much,"
+    else:
+        shift, turn = np.linalg.norm(moved.found[:3]), np.linalg.norm(moved.found[3:])
+        far = f"by {1e3 * shift:.2f} mm and {np.degrees(turn):.3f} deg"
+    raise RefusedError(
+        f"the surface has moved {far} since it was swept, {moved.times:.1f} times as far as chance brings. {NEXT_STEP}",
+        Measured("surface moved, against what chance brings", moved.times, "times", most=1.0),
     )

@@ -30,7 +30,8 @@ class SweepErrors:
     and rad²; `rail` one standard deviation of a rail position in m; `shift` the farthest, in m, that a sweep may lie
     off as a whole because its times are not known better; `rate` seconds of the clock per wall second; `late` the most,
     in s, that a device may hold a reading back before it puts its time on it; `timing` how late the camera's stamps
-    come against the rail's readings, where that was measured: then it stands for `late` in a sweep by the rail."""
+    come against the rail's readings, where that was measured: then it stands for `late` in a sweep by the rail; `lost`
+    the share of its frames that may be lost."""
 
     repeatability: Vector
     rail: float
@@ -38,6 +39,7 @@ class SweepErrors:
     rate: float = 1.0
     late: float = 0.0
     timing: Timing | None = None
+    lost: float = MAX_LOST_FRACTION
 
     @property
     def by_rail(self) -> SweepErrors:
@@ -180,9 +182,11 @@ class Collector:
         if self.middle is None and len(self.times) >= self.expected / 2:
             self.middle = frame, profile
 
-    def require_frames(self, camera: str, lines: NDArray[np.intp]) -> tuple[Frame, StripeProfile]:
-        """The middle frame and profile; raises `DeviceFault` without a line or with over 5 % of the frames lost."""
-        if not len(lines) or self.middle is None or self.lost > MAX_LOST_FRACTION * self.expected:
+    def require_frames(
+        self, camera: str, lines: NDArray[np.intp], most_lost: float = MAX_LOST_FRACTION
+    ) -> tuple[Frame, StripeProfile]:
+        """The middle frame and profile; raises `DeviceFault` without a line or with a larger share of frames lost."""
+        if not len(lines) or self.middle is None or self.lost > most_lost * self.expected:
             raise DeviceFault(
                 camera,
                 "camera.frames_lost",

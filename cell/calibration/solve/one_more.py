@@ -11,6 +11,7 @@ from cell.calibration.solve.adjustment import Adjustment
 from cell.calibration.solve.blocks import SHARED, State
 from cell.geometry.camera import Array
 
+DAMPING = 1e-9
 LEAST_LEFT = 1e-9
 """Share of its information below which the other parameters can take all of it."""
 
@@ -52,8 +53,11 @@ def one_more(problem: Adjustment, state: State, group: str, column: Callable[[in
             right += mixed[:SHARED]
             right_own[k] += mixed[SHARED:]
     normal.right, normal.right_own = right, right_own
-    follow = -normal.step(1e-9)
-    left = information + float(np.concatenate([right, right_own.ravel()]) @ follow)
-    if not left > LEAST_LEFT * information:
+    whole = np.concatenate([right, right_own.ravel()])
+    follow = -normal.step(DAMPING)
+    left = information + float(whole @ follow)
+    # What is left by the damping alone grows with it.
+    damped = information - float(whole @ normal.step(10.0 * DAMPING))
+    if not left > LEAST_LEFT * information or damped > 2.0 * left:
         return OneMore(0.0, 0.0, np.zeros(SHARED))
     return OneMore(slope / left, left, follow[:SHARED])
