@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from cell.steps.approach import Planar, line_command, wrap
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from cell.steps.approach import Planar, RelativeOdometry, drive_line, line_command, turn_to, wrap
+from drivers.errors import DeviceFault
 
 
 def test_planar_poses_are_a_group() -> None:
@@ -49,3 +52,70 @@ def test_backwards_the_law_steers_the_other_way() -> None:
     behind = line_command(Planar(0.5, 0.02, 0.0), Planar(0, 0, 0), 0.3)
     assert ahead[0] > 0 > behind[0]
     assert ahead[1] < 0 < behind[1]
+
+
+# --- driving on odometry, with the simulated vehicle ---
+
+
+@pytest.fixture
+def cell() -> VirtualCell:
+    made = VirtualCell(load_config(None), 2)
+    made.vehicle.enable()
+    return made
+
+
+class Blocked:
+    """Odometry of wheels that do not come along."""
+
+    def pose(self) -> Planar:
+        return Planar(0.0, 0.0, 0.0)
+
+
+def speed(cell: VirtualCell) -> float:
+    """True, the larger of m/s and rad/s."""
+    told = cell.world.vehicle.feedback(cell.clock.now())
+    return max(abs(told.speed), abs(told.yaw_rate))
+
+
+def ahead(cell: VirtualCell, odometry: object, check: object) -> None:
+    drive_line(cell.vehicle, odometry, Planar(0.3, 0.0, 0.0), 0.3, cell.clock, check)  # type: ignore[arg-type]
+
+
+def back(cell: VirtualCell, odometry: object, check: object) -> None:
+    drive_line(cell.vehicle, odometry, Planar(-0.1, 0.0, 0.0), 0.3, cell.clock, check)  # type: ignore[arg-type]
+
+
+def round_about(cell: VirtualCell, odometry: object, check: object) -> None:
+    turn_to(cell.vehicle, odometry, 0.2, cell.clock, check)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("way", [ahead, back, round_about])
+def test_at_the_end_of_a_way_it_stands(cell: VirtualCell, way) -> None:
+    way(cell, RelativeOdometry(cell.vehicle), lambda: None)
+    assert speed(cell) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_does_not_come_along_is_given_up_and_left_for_a_person(cell: VirtualCell) -> None:
+    begun = cell.clock.now()
+    with pytest.raises(DeviceFault, match="in time") as caught:
+        round_about(cell, Blocked(), lambda: None)
+    assert (caught.value.code, caught.value.recoverable) == ("vehicle.blocked", False)
+    assert speed(cell) == pytest.approx(0.0, abs=1e-3)
+    assert cell.clock.now() - begun < 45.0
+
+
+class Enough(Exception):
+    pass
+
+
+@pytest.mark.parametrize("way", [ahead, back, round_about])
+def test_who_wants_the_end_of_a_way_is_asked_all_along(cell: VirtualCell, way) -> None:
+    wanted = cell.clock.now() + 0.4
+
+    def check() -> None:
+        if cell.clock.now() > wanted:
+            raise Enough
+
+    with pytest.raises(Enough):
+        way(cell, RelativeOdometry(cell.vehicle), check)
+    assert cell.clock.now() - wanted < 0.1

@@ -6,6 +6,7 @@ import itertools
 import socket
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.trajectory import Trajectory, pose_difference
+from drivers.arm.wrong_arm import flange_agrees, require_same_flange, same_payload
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import LinkStatistics
@@ -38,9 +40,12 @@ def test_anything_but_six_finite_angles_is_refused(joints):
         LIMITS.check_joints("arm", joints)
 
 
-def test_a_pose_out_of_reach_is_refused():
+@pytest.mark.parametrize("axis", range(3))
+def test_a_pose_out_of_reach_is_refused(axis):
+    flange = np.zeros(6)
+    flange[axis] = -2.0
     with pytest.raises(LimitError, match=r"distance of the flange from the base 2000 mm is outside 0 mm to 1450 mm"):
-        LIMITS.check_pose("arm", np.array([2.0, 0, 0, 0, 0, 0]))
+        LIMITS.check_pose("arm", flange)
 
 
 @pytest.mark.parametrize(
@@ -57,9 +62,30 @@ def test_speeds_and_accelerations_have_limits(speed, acceleration, message):
         LIMITS.check_joint_move("arm", speed, acceleration)
 
 
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "message"),
+    [
+        (0.0, 1.0, "flange speed 0 mm/s"),
+        (1.1, 1.0, "to 1000 mm/s"),
+        (0.1, 5.1, "flange acceleration 5100 mm"),
+        (0.1, -1.0, "flange acc"),
+    ],
+)
+def test_straight_moves_have_limits_of_their_own(speed, acceleration, message):
+    LIMITS.check_linear_move("arm", 1.0, 5.0)
+    with pytest.raises(LimitError, match=message):
+        LIMITS.check_linear_move("arm", speed, acceleration)
+
+
 def test_a_payload_too_heavy_is_refused():
     with pytest.raises(LimitError, match=r"payload 13 kg is outside 0 kg to 12\.5 kg"):
         LIMITS.check_payload("arm", 13.0, np.zeros(3))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_centre_of_gravity_in_millimetres_is_refused(axis):
+    with pytest.raises(LimitError, match="payload offset"):
+        LIMITS.check_payload("arm", 1.0, np.eye(3)[axis] * -60.0)
 
 
 @pytest.mark.parametrize(
@@ -70,12 +96,17 @@ def test_a_payload_too_heavy_is_refused():
         ([0.1, 1.0], [REST, REST], "begin at 0 s"),
         ([0.0, 1.0, 1.0], [REST, REST, REST], "increase"),
         ([0.0, np.inf], [REST, REST], "not finite"),
+        ([0.0, 1.0], [REST, np.where(np.arange(6) == 2, np.nan, REST)], "not finite"),
+        ([0.0, 9.0, 8.0], [REST, REST, REST], "increase"),
         ([0.0, 1.0], [REST, REST + 8], "angle of joint 1 on the trajectory"),
+        ([0.0, 9.0], [REST, REST - 6.5], "angle of joint 1 on the trajectory"),
         (
             [0.0, 0.01],
             [REST, REST + np.array([0, 0.1, 0, 0, 0, 0])],
             r"joint 2 would turn at 572\.958 deg/s at 0\.000 s",
         ),
+        # Joint 6 turns faster, and may.
+        ([0.0, 1.0], [REST, REST + np.array([0, -2.2, 0, 0, 0, 3.0])], r"joint 2 would turn at 126\.051 deg/s"),
     ],
 )
 def test_a_trajectory_that_cannot_be_driven_is_refused(times, joints, message):
@@ -258,6 +289,56 @@ def test_a_program_that_is_paused_does_not_run():
     ] * 3
 
 
+def test_an_arm_that_turns_any_joint_either_way_is_not_at_rest():
+    assert replace(snapshot(0.0), speeds=(0.002, -0.002) * 3).at_rest
+    for joint in range(6):
+        for speed in (0.01, -0.01):
+            assert not replace(snapshot(0.0), speeds=tuple(speed * (k == joint) for k in range(6))).at_rest
+
+
+def test_what_was_seen_before_a_new_link_is_forgotten():
+    states = feed(Clock())
+    states.take(snapshot(time.monotonic()))
+    states.forget()
+    assert not states.wait_for(lambda seen: True, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("off", "agrees"),
+    [
+        ((0.04e-3, 0, 0, 0, 0, 0), True),
+        ((0, -0.06e-3, 0, 0, 0, 0), False),
+        ((0, 0, 0, 0.09e-3, 0, 0), True),
+        ((0, 0, 0, 0, 0, -0.11e-3), False),
+    ],
+)
+def test_another_arm_is_told_by_its_flange_in_place_and_in_turn(off, agrees):
+    seen = replace(snapshot(0.0), flange=off)
+    assert flange_agrees(lambda joints: np.zeros(6), seen) is agrees
+    if agrees:
+        require_same_flange("arm", lambda joints: np.zeros(6), seen)
+        return
+    with pytest.raises(DeviceFault, match="nothing was moved") as caught:
+        require_same_flange("arm", lambda joints: np.zeros(6), seen)
+    assert not caught.value.recoverable
+
+
+@pytest.mark.parametrize(
+    ("mass", "centre", "same"),
+    [
+        (2.0, (0.0, 0.0, 0.05), True),
+        (2.01, (0.0, 0.0, 0.05), False),
+        (1.99, (0.0, 0.0, 0.05), False),
+        (2.0, (0.0, 0.001, 0.05), False),
+        (2.0, (0.0, 0.0, -0.05), False),
+    ],
+)
+def test_another_payload_is_told_by_its_mass_and_by_its_centre(mass, centre, same):
+    seen = replace(snapshot(0.0), payload=(mass, centre))
+    assert same_payload(seen, (2.0, (0.0, 0.0, 0.05))) is same
+    assert same_payload(seen, (mass, (0.0, 0.0, 0.0)))  # a centre of zeros is none
+
+
 def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
     trajectory = Trajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0, *(1.0,) * 5)])
     assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
@@ -296,6 +377,33 @@ def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, s
             unlock("arm", dashboard, Clock(), False, lambda: None)
     assert asked == ["safetystatus", "safetymode"][: 1 if known == "safetystatus" else 2]
     dashboard.close()
+
+
+def test_a_stop_that_comes_before_a_protective_stop_is_unlocked_leaves_it_locked(server):
+    asked = []
+
+    def serve():
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Connected\n")
+            for question in client.makefile("rb"):
+                asked.append(question.decode().strip())
+                client.sendall(b"Safetystatus: PROTECTIVE_STOP\n")
+
+    def stopped():
+        raise Aborted("stopped meanwhile")
+
+    threading.Thread(target=serve, daemon=True).start()
+    dashboard = Dashboard("arm", server.getsockname()[0])
+    with pytest.raises(Aborted, match="meanwhile"):
+        unlock("arm", dashboard, Clock(), True, stopped)
+    dashboard.close()
+    assert asked == ["safetystatus"]
+
+
+def test_the_age_of_a_state_is_in_seconds_of_the_clock():
+    assert feed(Clock(20.0)).age(snapshot(time.monotonic() - 0.1)) == pytest.approx(2.0, abs=1.0)
+    assert feed(Clock()).age(snapshot(time.monotonic() - 0.1)) == pytest.approx(0.1, abs=0.05)
 
 
 def test_a_clock_that_runs_faster_leaves_the_wire_its_time():

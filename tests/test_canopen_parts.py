@@ -14,12 +14,12 @@ from cell.config import default_toml, load_config
 from cell.devices.makes import make_of
 from cell.devices.vehicle_makes import CanopenVehicleConfig
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.emergencies import meaning
 from drivers.vehicle.cia402.feedback import Feedback
 from drivers.vehicle.cia402.geometry import WheelDrives
-from drivers.vehicle.cia402.objects import MOTION, STATUS
+from drivers.vehicle.cia402.objects import HEARTBEAT, MOTION, STATUS
 from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
 from drivers.vehicle.cia402.units import UnitCheck
 
@@ -105,6 +105,104 @@ def test_readings_of_two_different_moments_are_not_one_pose() -> None:
         state = feedback.state(10.0, None, True)
         assert state.yaw == 0.0
     assert state.x == pytest.approx(19 * 600 * WHEELS.count_length)
+
+
+class Told:
+    """Both drives as this program has heard of them; each `tell` is one round of one drive."""
+
+    def __init__(self, wheels: WheelDrives = WHEELS) -> None:
+        self.clock = Hand()
+        self.feedback = Feedback(
+            "vehicle", self.clock, wheels, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics()
+        )
+        for drive in self.feedback.drives:
+            drive.configured = True
+        for node in (1, 2):
+            self.tell(node)
+
+    def tell(self, node: int, velocity: int = 0, word: int = 0x0237, mode: int = 3, inputs: int = 0) -> None:
+        self.clock.time += 0.001
+        self.feedback.take(node, MOTION, struct.pack("<iI", velocity, inputs))
+        self.feedback.take(node, STATUS, struct.pack("<Hib", word, 0, mode))
+
+    def refusal(self, *, in_command: bool = True, driving: bool = False) -> DeviceFault:
+        with pytest.raises(DeviceFault) as caught:
+            self.feedback.check(in_command=in_command, driving=driving)
+        return caught.value
+
+
+@pytest.mark.parametrize("node", [1, 2])
+@pytest.mark.parametrize("velocity", [300, -300])
+def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: int) -> None:
+    told = Told()
+    asked = told.clock.time
+    told.tell(node)
+    assert not told.feedback.stands(asked), "the other one has told nothing since"
+    told.tell(3 - node)
+    assert told.feedback.stands(asked)
+    told.tell(node, velocity)
+    assert not told.feedback.stands(asked)
+
+
+@pytest.mark.parametrize("node", [1, 2])
+def test_one_drive_that_falls_silent_is_noticed_though_the_other_tells_on(node: int) -> None:
+    told = Told()
+    side = told.feedback.drives[node - 1].side
+    last = told.feedback.drives[node - 1].moved
+    told.clock.time += 0.6
+    told.tell(3 - node)
+    fault = told.refusal(driving=True)
+    assert (fault.code, side in fault.message) == ("vehicle.silent", True)
+    with pytest.raises(DeadlineError, match=r"0\.60 s old"):
+        told.feedback.state(0.2, True, True)
+    assert told.feedback.state(1.0, True, True).stamp == pytest.approx(last)
+
+
+@pytest.mark.parametrize("node", [1, 2])
+@pytest.mark.parametrize("active", [True, False])
+def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool) -> None:
+    told = Told(replace(WHEELS, stop_input=3, stop_active=active))
+    free, pressed = (0, 1 << 3) if active else (1 << 3, 0)
+    for each in (1, 2):
+        told.tell(each, inputs=free)
+    told.feedback.check(in_command=True, driving=True)
+    told.tell(node, inputs=pressed)
+    for in_command in (True, False):
+        fault = told.refusal(in_command=in_command)
+        assert (fault.code, fault.recoverable) == ("vehicle.emergency_stop", False)
+    assert told.feedback.state(1.0, True, True).emergency_stop
+
+
+@pytest.mark.parametrize("node", [1, 2])
+@pytest.mark.parametrize(
+    ("word", "mode", "why"),
+    [
+        (0x0037, 3, "commanded locally"),
+        (0x0237, 1, "mode 1 instead of 3"),
+        (0x0233, 3, "left operation"),
+        (0x0217, 3, "left operation"),
+    ],
+)
+def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: int, why: str) -> None:
+    told = Told()
+    assert told.feedback.gave_up() is None
+    assert told.feedback.state(1.0, False, True).command_mode
+    told.tell(node, word=word, mode=mode)
+    fault = told.feedback.gave_up()
+    assert fault is not None
+    assert why in fault.message
+    assert told.feedback.drives[node - 1].side in fault.message
+    assert not told.feedback.state(1.0, False, True).command_mode
+
+
+def test_a_drive_that_was_restarted_does_not_obey() -> None:
+    told = Told()
+    told.feedback.take(2, HEARTBEAT, b"\0")
+    told.tell(2)
+    fault = told.feedback.gave_up()
+    assert fault is not None
+    assert "was restarted" in fault.message
+    assert told.feedback.interruptions == 1
 
 
 def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:

@@ -28,7 +28,7 @@ from cell.steps.drive_to_target import stand_at_target
 from cell.steps.photograph import BoardFix
 from cell.steps.whereabouts import Whereabouts
 from drivers.clock import Clock
-from drivers.errors import ConfigError, InterlockError, RefusedError
+from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
 
@@ -51,8 +51,14 @@ def test_it_stands_braked_and_is_not_driven() -> None:
     state = vehicle.state()
     assert (state.braked, state.speed, state.emergency_stop, state.trouble) == (True, 0.0, False, ())
     vehicle.drive(0.0, 0.0)
-    with pytest.raises(InterlockError, match=r'vehicle\.driver = "fixed".*Bring the station'):
-        vehicle.drive(0.1, 0.0)
+    for velocity in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)):
+        with pytest.raises(InterlockError, match=r'vehicle\.driver = "fixed".*Bring the station'):
+            vehicle.drive(*velocity)
+    vehicle.close()
+    vehicle.stop()
+    for asked in (vehicle.state, vehicle.check, vehicle.enable, vehicle.brake, lambda: vehicle.drive(0.0, 0.0)):
+        with pytest.raises(NotConnectedError):
+            asked()
 
 
 def fixed_cell(folder: Path) -> Path:
@@ -122,13 +128,13 @@ def test_a_configuration_names_it_with_nothing_else(tmp_path: Path) -> None:
     assert connect_one(config, "vehicle", Clock()).identity().model == "no vehicle, a fixed frame"
 
 
-@pytest.mark.parametrize(("off", "refused"), [(0.0, False), (0.6, False), (1.5, True)])
+@pytest.mark.parametrize(("off", "refused"), [(0.0, False), (0.6, False), (1.5, True), (-1.5, True)])
 def test_the_station_has_to_stand_where_the_job_has_it(off: float, refused: bool) -> None:
     """Moved along and across by `off` times the tolerance."""
     stand = load_config(None).arm.vehicle_from_base.se3()
     place_from_vehicle = JOB.approach.target.se3()
     shift = off * JOB.approach.tolerance
-    place_from_vehicle.translation = place_from_vehicle.translation + np.array([shift, -shift, 0.0])
+    place_from_vehicle.translation = place_from_vehicle.translation + np.array([shift, shift, 0.0])
     base_from_board = (place_from_vehicle * stand).inverse() * JOB.place_from_board
     fix = BoardFix(base_from_board, 1e-8 * np.eye(6), 0.1, 0.0, ())
     vehicle = FixedVehicle("vehicle", Clock())
@@ -137,7 +143,7 @@ def test_the_station_has_to_stand_where_the_job_has_it(off: float, refused: bool
     if refused:
         with pytest.raises(RefusedError, match=r"fixed frame.*move the station") as met:
             stand_at_target(JOB, stand, vehicle, whereabouts, lambda: fix)
-        assert met.value.numbers[0].value == pytest.approx(1.5e3 * JOB.approach.tolerance)
+        assert [number.value for number in met.value.numbers[:2]] == pytest.approx([1e3 * shift] * 2)
         return
     arrival = stand_at_target(JOB, stand, vehicle, whereabouts, lambda: fix)
     assert math.hypot(arrival.error_along, arrival.error_across) == pytest.approx(

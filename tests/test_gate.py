@@ -91,6 +91,22 @@ def test_a_thread_that_never_entered_is_barred_by_a_stop_until_a_person_clears_i
     ]  # fmt: skip
 
 
+def test_a_stop_that_comes_after_those_that_are_cleared_still_bars() -> None:
+    """A run clears the stop at its own end; one that a person asks for at that moment is not cleared with it."""
+    gate = open_gate()
+    gate.shut()
+    stops = gate.stops
+    gate.shut()
+    gate.clear(stops)
+    assert not gate.is_open
+    with pytest.raises(InterlockError, match="after_a_stop"):
+        gate.require(MOVE)
+    gate.clear(stops + 1)
+    gate.require(MOVE)
+    gate.clear(stops)  # what was cleared once stays so
+    gate.require(MOVE)
+
+
 def test_work_whose_run_is_to_end_begins_nothing_even_before_anything_was_stopped() -> None:
     gate, begun = open_gate(), []
     run = CancelToken()

@@ -8,8 +8,9 @@ import pytest
 from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
+from cell.devices.interlocks import Command, Rule, Situation
 from cell.steps.moves import HOME
-from drivers.errors import Aborted
+from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken
 
 CONFIG = load_config(None)
@@ -43,7 +44,11 @@ def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: 
         arm.recover,
         rail.home,
         lambda: rail.move_to(0.01),
+        lambda: rail.nudge(0.001, 0.01),
         lambda: rail.sweep(0.02, 0.03, 0.015),
+        arm.zero_force,
+        lambda: arm.set_payload(1.0, np.zeros(3)),
+        lambda: arm.set_digital_output(7, True),
         vehicle.enable,
         vehicle.recover,
         lambda: vehicle.drive(0.1, 0.0),
@@ -59,3 +64,17 @@ def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: 
     assert not devices.laser.is_on
     assert [device.identity().model for device in devices]
     assert devices.stop() == devices.close() == []
+
+
+def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held() -> None:
+    """What a claw does cannot be undone without dropping the part, so it is looked again before it is told."""
+
+    def waits(now: Situation, command: Command) -> None:
+        devices.gate.shut()
+
+    devices = VirtualCell(CONFIG, seed=4, level="ideal").devices
+    interlocks = devices.interlocks
+    interlocks._rules = (*interlocks._rules, Rule("waits", ("claw.release",), "", waits))
+    with interlocks.lifted(["claw_at_contact"]), pytest.raises(InterlockError, match="after_a_stop"):
+        devices.claw.release()
+    assert devices.claw.holding

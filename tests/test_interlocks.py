@@ -589,6 +589,7 @@ def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell:
         return jog(cell, parse_jog(device, list(words)))
 
     assert "moved" in jogged("vehicle", "+0.1m")["vehicle"]
+    assert cell.devices.vehicle.state().braked
     assert "→" in jogged("arm", "j1", "+20deg")["j1"]
     with pytest.raises(InterlockError, match=r"20\.0 deg from HOME.*cell home arm.*arm_stowed"):
         jogged("vehicle", "+0.1m")

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from cell.devices.jogging import Jog, parse_jog
+from cell.devices.jogging import Jog, needed_for, parse_jog
 from drivers.errors import ConfigError
 
 
@@ -30,8 +30,19 @@ def test_a_jog_is_read_with_its_unit(words: list[str], expected: Jog) -> None:
 @pytest.mark.parametrize(
     "words",
     [["rail", "5"], ["rail"], ["arm", "+5mm"], ["arm", "j7", "5deg"], ["arm", "z", "5deg"], ["laser", "1mm"],
-     ["rail", "+2m"], ["vehicle", "+5"], ["arm", "j3", "+5mm"]],
+     ["rail", "+2m"], ["vehicle", "+5"], ["arm", "j3", "+5mm"], ["rail", "-501mm"], ["vehicle", "+0.51m"],
+     ["vehicle", "-0.51m"], ["arm", "x", "501mm"], ["arm", "j1", "-91deg"], ["vehicle", "91deg"]],
 )  # fmt: skip
 def test_anything_else_is_refused_with_examples(words: list[str]) -> None:
     with pytest.raises(ConfigError, match="write it like"):
         parse_jog(words[0], words[1:])
+
+
+def test_arm_and_vehicle_are_jogged_beside_each_other_unless_a_person_lifts_that() -> None:
+    arm, vehicle, rail = Jog("arm", "z", 0.01), Jog("vehicle", "x", 0.1), Jog("rail", "", 0.01)
+    assert (needed_for(arm), needed_for(vehicle), needed_for(rail)) == (
+        ("arm", "vehicle"), ("vehicle", "arm"), ("rail",),
+    )  # fmt: skip
+    assert needed_for(arm, ["vehicle_parked"]) == ("arm",)
+    assert needed_for(arm, ["arm_stowed"]) == ("arm", "vehicle")
+    assert needed_for(vehicle, ["arm_stowed"]) == ("vehicle",)

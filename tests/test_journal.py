@@ -94,6 +94,18 @@ def test_requests_of_other_processes_are_taken_once_and_in_order(tmp_path):
     journal.close()
 
 
+def test_what_was_asked_of_an_earlier_run_does_not_concern_the_next(tmp_path):
+    Journal(tmp_path, "first").close()
+    request(tmp_path, "abort", "the first one")
+    second = Journal(tmp_path, "second")
+    assert second.take_requests() == []
+    request(tmp_path, "pause", "this one")
+    assert [asked.kind for asked in second.take_requests()] == ["pause"]
+    second.close()
+    record = read(tmp_path)
+    assert (record.run.id, [run.id for run in record.runs]) == ("second", ["first", "second"])
+
+
 def test_several_threads_can_write(tmp_path):
     journal = Journal(tmp_path, "r1")
     threads = [

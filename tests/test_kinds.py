@@ -126,10 +126,13 @@ def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(
 
 
 class Bench:
-    """Three steps, the second refuses as often as it is told to."""
+    """Three steps, the second, or another, refuses as often as it is told to."""
 
-    def __init__(self, folder: Path, refusals: int, script: Script = NO_SCRIPT) -> None:
+    def __init__(self, folder: Path, refusals: int, script: Script = NO_SCRIPT, refuses: str = "sweep") -> None:
         self.log: list[str] = []
+        self.seen: list[tuple[str, ...]] = []
+        """Whose results each try was given."""
+        self.refuses = refuses
         self.folder = folder
         names = ("photo", "sweep", "place")
         self.runner = Runner(
@@ -147,7 +150,8 @@ class Bench:
     def _step(self, name: str):  # type: ignore[no-untyped-def]
         def work(context: StepContext) -> str:
             self.log.append(name)
-            if name == "sweep" and self.left > 0:
+            self.seen.append(tuple(context.results))
+            if name == self.refuses and self.left > 0:
                 self.left -= 1
                 raise ValueError("too few points")
             return f"made by {name}"
@@ -173,6 +177,27 @@ def test_a_script_lets_a_refused_run_go_on_from_an_earlier_step_and_the_reason_i
     assert [(fault.step, fault.remedy) for fault in result.faults] == [("sweep", "again from photo")]
     (decided,) = (event for event in read(tmp_path).events if event.kind == "decided")
     assert decided.data == {"reason": "too few points", "again": "photo", "why": "wiped the lens"}
+
+
+def test_what_is_to_be_done_again_is_given_nothing_of_what_came_after_it(tmp_path: Path) -> None:
+    script = Script(on_refusal=lambda step, failure: Again("photo", "the table was bumped"))
+    bench = Bench(tmp_path, 1, script, refuses="place")
+    assert bench.run().outcome is Outcome.PLACED
+    once = [(), ("photo",), ("photo", "sweep")]
+    assert bench.seen == [*once, *once]
+
+
+def test_a_script_is_asked_about_refusals_alone(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def decide(step: str, failure: Failure) -> Again:
+        asked.append(step)
+        return Again("photo", "whatever it was")
+
+    bench = Bench(tmp_path, 1, Script(on_refusal=decide))
+    bench.runner.classify = lambda error: Failure(Outcome.FAULTED, str(error), "fault")
+    assert bench.run().outcome is Outcome.FAULTED
+    assert asked == []
 
 
 def test_without_a_decision_a_refusal_ends_the_run(tmp_path: Path) -> None:

@@ -66,6 +66,8 @@ class Site:
         self.noted: list[PartState] = []
         self.forces: list[float] = []
         self.heights: list[float] = []
+        self.way: list[tuple[float, np.ndarray]] = []
+        """Times, and where the flange was."""
         touch = world.arm.contact
         assert touch is not None
 
@@ -73,6 +75,7 @@ class Site:
             wrench = touch(base_from_flange)
             self.forces.append(float(np.linalg.norm(wrench[:3])))
             self.heights.append(float(base_from_flange[2, 3]))
+            self.way.append((self.cell.clock.now(), np.array(base_from_flange[:3, 3])))
             return wrench
 
         world.arm.contact = watched
@@ -129,9 +132,30 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
         site.mover.plan_to(where * JOB.grasp.flange_from_part.se3().inverse(), "where the part stands now")
     true = pin.SE3(site.base_from_surface * JOB.place.surface_from_part.se3())
     assert np.linalg.norm(where.translation - true.translation) < 1e-3
+    at = true * JOB.grasp.flange_from_part.se3().inverse()
+    times, way = np.array([now for now, _ in site.way]), np.array([at.actInv(place) for _, place in site.way])
+    up = way @ normal()
+    low = np.flatnonzero(up < 0.9 * JOB.place.contact_travel)
+    down, rise = slice(low[0], int(np.argmin(up))), slice(int(np.argmin(up)), len(up))
+    seconds = times[down][-1] - times[down][0]
+    assert up[down][0] - up[down][-1] == pytest.approx(JOB.place.contact_speed * seconds, rel=0.3), "felt for slowly"
+    clear = int(np.argmax(up[rise] > 0.8 * JOB.place.approach))
+    beside = way[rise][:clear] - np.outer(up[rise][:clear], normal())
+    assert np.linalg.norm(beside, axis=1).max() < 1e-3, "straight up from the part before the arm folds"
 
 
-@pytest.mark.parametrize("early", [0.002, 0.004])
+def test_what_the_force_sensor_showed_before_the_descent_is_no_touch() -> None:
+    site = Site()
+    touch = site.cell.world.arm.contact
+    assert touch is not None
+    drift = np.array([0.0, 0.0, 1.5 * JOB.place.contact_force, 0.0, 0.0, 0.0])
+    site.cell.world.arm.contact = lambda base_from_flange: np.asarray(touch(base_from_flange)) + drift
+    result = site.place()
+    assert result.contact
+    assert abs(result.depth_error) < JOB.place.contact_travel
+
+
+@pytest.mark.parametrize("early", [0.002, 0.004, 0.02])
 def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not_crushed(early: float) -> None:
     """Also one that is met just before the slow part of the descent, where the fast one does not feel it yet."""
     site = Site()
@@ -256,6 +280,7 @@ def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
 def test_a_run_that_has_put_its_part_down_is_not_resumed(tmp_path: Path) -> None:
     """Whether it was killed or faulted afterwards: the journal had it before the retreat began."""
     journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
+    journal.event("note", "place", {"part": "unknown", "base_from_part": [0.0] * 6})
     journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
     journal.close()
     with pytest.raises(ConfigError, match="had put its part down already, only the retreat failed"):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -13,17 +15,22 @@ import pytest
 from cell.calibration.store import nominal_camera
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
+from cell.devices.gated_laser import UNATTENDED_S
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_ur
-from cell.job import load_job
+from cell.job import ScanSection, load_job
+from cell.lab.bench.whole_job import NoFrames
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.frame_times import step_of_clock
+from cell.steps.laser_sweep import _home
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
 from drivers.errors import DeviceFault
-from drivers.interfaces import Frame
+from drivers.interfaces import Frame, Motion, Rail, RailState
 
 CONFIG = load_config(None)
 SCAN = load_job("pot")[0].scan.model_copy(update={"length": 0.02, "speed": 0.02, "frame_rate": 20.0})
@@ -47,8 +54,12 @@ def sweep(
     camera_late: float = 0.0,
     errors: SweepErrors = ERRORS,
     made: VirtualCell | None = None,
+    scan: ScanSection = SCAN,
 ) -> Swath:
-    """Sweep 20 mm at 20 mm/s; half-way `meddle` is called once. Replies of rail and camera come so many s late."""
+    """Sweep 20 mm, at 20 mm/s if not told otherwise; half-way `meddle` is called once.
+
+    Replies of rail and camera come so many s late.
+    """
     cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
     devices = cell.devices
     devices.vehicle.brake()
@@ -66,7 +77,7 @@ def sweep(
         if len(taken) == 10:
             meddle(cell)
 
-    collector = Collector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
+    collector = Collector(GEOMETRY, scan, keep, lambda fraction, text: None)
     return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
 
 
@@ -106,6 +117,44 @@ def test_a_sweep_that_nothing_disturbed_knows_its_place_to_micrometres() -> None
     # Half a round trip of 0.5 ms of the camera's, at 20 mm/s, and next to nothing of the rail's many readings.
     assert 0.0 < swath.shift < 10e-6
     assert np.sqrt(np.linalg.eigvalsh(swath.covariance)[-1]) == pytest.approx(swath.shift / np.sqrt(3), rel=0.3)
+
+
+def test_a_sweep_that_lasts_longer_than_the_laser_may_burn_unattended_keeps_it_lit() -> None:
+    slow = SCAN.model_copy(update={"speed": 0.0008, "frame_rate": 1.0})
+    assert SCAN.length / slow.speed > UNATTENDED_S
+    assert len(sweep(scan=slow).lines) == pytest.approx(25, abs=2)
+
+
+class HomedEarlier:
+    """A rail that another program has homed."""
+
+    def __init__(self, bare: Rail) -> None:
+        self.bare, self.searched = bare, False
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.bare, name)
+
+    def state(self) -> RailState:
+        return dataclasses.replace(self.bare.state(), homed_here=self.searched)
+
+    def home(self) -> Motion:
+        self.searched = True
+        return self.bare.home()
+
+
+def test_a_zero_that_another_program_found_is_searched_again_before_a_sweep() -> None:
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.rail.home().wait(60.0)
+    rail = HomedEarlier(cell.rail)
+    cell.devices.rail.bare = rail  # type: ignore[assignment]
+    assert cell.devices.rail.state().homed
+    nothing_known = cast(Any, None)
+    job = load_job("pot")[0]
+    here = Workplace(
+        CONFIG, job, nothing_known, nothing_known, cell.devices, NoFrames(), Path(), Whereabouts(cell.devices.vehicle)
+    )
+    _home(here, lambda share, text: None)
+    assert rail.searched
 
 
 def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream() -> None:

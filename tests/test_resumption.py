@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -13,14 +14,21 @@ import pytest
 from test_rail_sweep import CONFIG, sweep
 from test_stored_calibration import made
 
+from cell.calibration.slip import Slip
+from cell.calibration.witness import Pointing
+from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts
 from cell.job import load_job
+from cell.lab.bench.whole_job import NoFrames
 from cell.run.resumption import UnfinishedRun, job_hash
-from cell.steps.laser_sweep import SweepRecord
+from cell.steps.laser_sweep import STEP, SweepRecord
 from cell.steps.photograph import BoardFix
-from cell.steps.stored_sweep import FILE, StoredSweep
-from drivers.errors import CalibrationStale, ConfigError
+from cell.steps.stored_sweep import FILE, StoredSweep, save_sweep
+from cell.steps.whereabouts import Whereabouts
+from cell.steps.workplace import Workplace
+from drivers.errors import CalibrationStale, ConfigError, InterlockError, RefusedError
 from statemachine.journal import Journal
+from statemachine.step import Event, StepContext
 
 CALIBRATION = made()
 SIGMA_M, SIGMA_RAD = 1e-4, 2e-4
@@ -52,6 +60,63 @@ def test_a_sweep_says_nothing_once_the_board_has_moved(stored: StoredSweep, way:
     moved = pin.SE3(pin.exp3(step[3:]), step[:3])
     with pytest.raises(CalibrationStale, match="the board has moved by"):
         stored.confirmed_by(fix(BOARD * moved))
+
+
+def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: StoredSweep) -> None:
+    """A turn of the station about the board's origin shifts a point elsewhere by turn × way: also with what sign."""
+    (before,), (after,) = stored.sweep.swaths, stored.confirmed_by(fix(BOARD)).swaths
+    way = before.base_from_flange.translation - BOARD.translation
+    moves = np.eye(6)
+    for axis in range(3):
+        moves[:3, 3 + axis] = np.cross(np.eye(3)[axis], way)
+    expected = moves @ (2.0 * SEEN) @ moves.T
+    assert after.covariance - before.covariance == pytest.approx(expected, rel=1e-9, abs=1e-18)
+
+
+def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: StoredSweep, tmp_path: Path) -> None:
+    pointing, slip = Pointing(1e-4, 2e-5, 3e-5, 4e-5, 5e-5), Slip(1e-5, -2e-5, 3e-3, True, 0.08)
+    save_sweep(tmp_path, replace(stored.sweep, pointing=pointing, slip=slip), fix(BOARD))
+    with np.load(tmp_path / FILE) as kept:
+        data = dict(kept)
+    assert data["pointing"].tolist() == [1e-4, 2e-5, 3e-5, 4e-5, 5e-5]
+    assert data["slip"].tolist() == [1e-5, -2e-5, 3e-3, 0.08, 1.0]
+    assert data["base_from_board"].tolist() == BOARD.homogeneous.tolist()
+    assert data["board_covariance"].tolist() == SEEN.tolist()
+    np.savez(tmp_path / FILE, **{**data, "format": np.array(3)})
+    with pytest.raises(RefusedError, match="format 3, this program reads"):
+        StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point)
+
+
+def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> list[str]:
+    """What the step of the sweep tells before anything moves, in a cell that is stopped."""
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.devices.gate.shut()
+    (folder / FILE).write_bytes(b"of the attempt before")
+    nothing_known = cast(Any, None)
+    job = load_job("pot")[0]
+    whereabouts = Whereabouts(cell.devices.vehicle)
+    here = Workplace(
+        CONFIG, job, nothing_known, nothing_known, cell.devices, NoFrames(), folder, whereabouts, earlier=stored
+    )
+    events: list[Event] = []
+    context = StepContext(STEP.policy, attempt, 1e9, {"board_photo": fix(seen)}, cell.clock, events.append)
+    with pytest.raises((InterlockError, AttributeError)):
+        STEP.work(here, context)
+    assert not (folder / FILE).exists(), "should this run be cut short now, it is not resumed with that"
+    return [str(event.data.get("text")) for event in events]
+
+
+def test_an_earlier_sweep_is_not_taken_where_the_board_has_moved_but_swept_anew(
+    stored: StoredSweep, tmp_path: Path
+) -> None:
+    said = begun(stored, tmp_path, BOARD * from_parts((0.01, 0.0, 0.0)), 1)
+    assert "the board has moved by 10.00 mm" in said[-1] and "sweeping again" in said[-1]
+
+
+def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_board(
+    stored: StoredSweep, tmp_path: Path
+) -> None:
+    assert begun(stored, tmp_path, BOARD, 2)[0] == "looking whether the board still stands where it did"
 
 
 def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
@@ -106,6 +171,17 @@ def test_a_sweep_that_a_script_rejected_is_not_used(tmp_path: Path) -> None:
     journal = Journal(run.folder, "later", run.info)
     journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
     journal.event("decided", "invert_pose", {"reason": "too few points", "again": "board_photo", "why": "wiped"})
+    journal.close()
+    sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
+    assert sweep is None
+    assert "had not finished its sweep" in why
+
+
+def test_a_sweep_that_failed_when_it_was_done_again_is_not_used(tmp_path: Path) -> None:
+    run, job = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    journal.step_ended(journal.step_started("laser_sweep", 2), 1.0, error="the arm was pushed")
     journal.close()
     sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None

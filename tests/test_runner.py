@@ -13,7 +13,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from statemachine.cancel import CancelToken
+from statemachine.cancel import Cancelled, CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
@@ -191,18 +191,27 @@ def test_an_exception_that_is_not_named_is_not_retried(tmp_path):
 def test_a_recoverable_fault_goes_through_recovery_and_back_to_the_step(tmp_path):
     bench = Bench(tmp_path, laser_sweep=failing(ConnectionError("protective stop")))
     bench.policy("laser_sweep", 10.0, 1)
-    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover: {error}")
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append(f"recover: {error}, {confirmed}")
     result = bench.run()
     assert result.outcome is Outcome.PLACED
     start = bench.log.index("laser_sweep")
     again = "stop: recovered, before laser_sweep is tried again"
     assert bench.log[start : start + 5] == [
-        "laser_sweep", "stop: laser_sweep failed", "recover: protective stop", again, "laser_sweep",
+        "laser_sweep", "stop: laser_sweep failed", "recover: protective stop, False", again, "laser_sweep",
     ]  # fmt: skip
     changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
     assert changes[3:6] == [
         ("laser_sweep", "faulted"), ("faulted", "recovering"), ("recovering", "laser_sweep"),
     ]  # fmt: skip
+
+
+def test_what_no_recovery_can_clear_is_not_recovered(tmp_path):
+    bench = Bench(tmp_path, laser_sweep=failing(OSError("the emergency stop is pressed")))
+    bench.policy("laser_sweep", 10.0, 1)
+    bench.runner.recover = lambda error, token, confirmed: bench.log.append("recover")
+    result = bench.run()
+    assert (result.outcome, result.reason) == (Outcome.FAULTED, "the emergency stop is pressed")
+    assert "recover" not in bench.log
 
 
 def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
@@ -663,6 +672,53 @@ def test_what_a_step_leaves_behind_is_ended_with_it(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: tokens.update({context.attempt: context.token}))
     bench.run()
     assert tokens[1].reason == "board_photo has ended"
+
+
+def test_a_recovery_that_does_not_end_is_cut_short(tmp_path):
+    bench = Bench(tmp_path, board_photo=failing(ConnectionError("link lost"))).policy("board_photo", 5.0, 1)
+    bench.runner.policy = replace(bench.runner.policy, recovery_deadline_s=0.2)
+
+    def recover(error, token, confirmed):
+        assert token.event.wait(3.0)
+        token.check()
+
+    bench.runner.recover = recover
+    begun = time.monotonic()
+    result = bench.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "the recovery did not end within its deadline" in result.reason
+    assert time.monotonic() - begun < 2.0
+
+
+def test_a_retry_is_for_the_named_errors_and_those_that_derive_from_them():
+    step = Step("any", 1.0, 1, ("OSError",))
+    assert step.retries(OSError())
+    assert step.retries(ConnectionResetError())
+    assert not step.retries(ValueError())
+    assert not step.retries(Exception())
+
+
+def test_held_work_ends_with_its_own_token_though_the_run_stays_paused():
+    """Its deadline, or another fault, ends it where it is held."""
+    control, token = RunControl(), CancelToken()
+    control.pause()
+    threading.Timer(0.05, lambda: token.cancel("overrun")).start()
+    threading.Timer(2.0, control.go_on).start()
+    begun = time.monotonic()
+    with pytest.raises(Cancelled, match="overrun"):
+        control.safe_point(token, lambda held: None)
+    assert time.monotonic() - begun < 1.0
+    assert 0.0 < control.held_s < 1.0
+
+
+def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
+    run, told = CancelToken(), []
+    run.cancel("enough")
+    late = CancelToken(run)
+    late.on_cancel(told.append)
+    assert (late.reason, told, late.event.is_set()) == ("enough", ["enough"], True)
+    assert not late.cancel("later")
+    assert late.reason == "enough"
 
 
 def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(tmp_path):

@@ -171,8 +171,12 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
     small.require(), some.require()
     with pytest.raises(RefusedError, match=r"scan head has slipped by \+0\.165 mm along"):
         far.require()
-    with pytest.raises(RefusedError, match="later"):
-        Slip(0.0, 0.0, -1.1 * LARGEST_LAG_S).require()
+    for along, across in ((-1.1, 0.0), (0.0, 1.1), (0.0, -1.1), (-0.8, 0.8)):
+        with pytest.raises(RefusedError, match="scan head has slipped"):
+            Slip(along * LARGEST_M, across * LARGEST_M, 0.0).require()
+    for lag in (-1.1 * LARGEST_LAG_S, 1.1 * LARGEST_LAG_S):
+        with pytest.raises(RefusedError, match="later"):
+            Slip(0.0, 0.0, lag).require()
 
 
 def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:

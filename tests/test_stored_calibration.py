@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration import ScanCalibration, TargetCalibration
+from cell.calibration.archive import _pose
 from cell.calibration.finding import find_calibration
-from cell.calibration.sessions import marked
+from cell.calibration.sessions import marked, serial_numbers
 from cell.calibration.solve.results import KEPT, Quality
 from cell.calibration.store import CellCalibration, nominal_camera, save_calibration
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.geometry.light_plane import LightPlane
 from drivers.errors import CalibrationStale, NotConnectedError
 
@@ -155,3 +158,25 @@ def test_one_with_simulated_devices_is_none_of_the_real_ones_nor_the_other_way_r
     with pytest.raises(CalibrationStale, match="no calibration of these devices"):
         find_calibration(tmp_path, marked(DEVICES, now), CONFIGURATION, MAX_AGE)
     assert find_calibration(tmp_path, marked(DEVICES, stored), CONFIGURATION, MAX_AGE).identities["arm"] == "A1"
+
+
+def test_a_calibration_belongs_to_the_arm_the_rail_and_both_cameras() -> None:
+    """An exchanged one of these is another cell: each is asked itself."""
+    devices = VirtualCell(load_config(None), 1).devices
+    assert serial_numbers(devices) == {name: getattr(devices, name).identity().serial for name in DEVICES}
+
+
+def test_a_file_of_another_format_or_with_a_number_missing_is_none(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    data = json.loads((tmp_path / "own.json").read_text(encoding="utf-8"))
+    for spoilt in ({**data, "format": data["format"] + 1}, {key: data[key] for key in data if key != "made"}):
+        (tmp_path / "own.json").write_text(json.dumps(spoilt), encoding="utf-8")
+        with pytest.raises(CalibrationStale, match=r"unreadable \(own\.json\)"):
+            found(tmp_path)
+
+
+def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
+    assert _pose(pin.SE3.Random().homogeneous, "view 1")
+    for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.001, 1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=1) * 1e-3):
+        with pytest.raises(ValueError, match="view 1 is no rotation and translation"):
+            _pose(wrong, "view 1")

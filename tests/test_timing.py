@@ -267,6 +267,8 @@ def test_times_hold_for_the_settings_they_were_measured_with() -> None:
     assert "rolling shutter is not known" in shutter
     less = CONFIG.model_copy(update={"scan_camera": CONFIG.scan_camera.model_copy(update={"late": 1e-3})})
     assert "it is 1.4 ms, scan_camera.late and rail.late allow 1 ms" in times_known(head, less)[1][0]
+    early = replace(calibration(), timing=replace(FOUND, late=-FOUND.late))
+    assert "it is -1.4 ms, scan_camera.late and rail.late allow 1 ms" in times_known(early, less)[1][0]
     assert times_known(calibration(), CONFIG)[1] == (shutter,)
 
 

@@ -14,7 +14,7 @@ import pytest
 from cell.devices.interlocks import Command, Interlocks, Situation
 from cell.devices.rules import RULES
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceFault, InterlockError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
 from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
@@ -88,6 +88,10 @@ class Bench:
         """True wheel speed, m/s."""
         return self.peer.model.feedback(self.world.now()).speed
 
+    def velocities(self) -> list[bytes]:
+        """The commanded velocities that came, as their bytes; zeros are standstill."""
+        return [data for number, data in self.bus.frames if number == 0x111]
+
     def braked(self) -> bool:
         """Whether the vehicle's brake is locked in truth."""
         return self.peer.model.feedback(self.world.now()).braked
@@ -147,6 +151,65 @@ def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
     time.sleep(0.1)
     assert {data for number, data in bench.bus.frames if number == 0x111} == {bytes(8)}
     bench.until(lambda: bench.speed() == 0.0)
+
+
+@pytest.mark.parametrize(("speed", "yaw_rate"), [(0.51, 0.0), (-0.51, 0.0), (0.0, 0.81), (0.0, -0.81)])
+def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, speed: float, yaw_rate: float) -> None:
+    with pytest.raises(LimitError, match="nothing was sent"):
+        bench.vehicle.drive(speed, yaw_rate)
+    bench.bus.frames.clear()
+    time.sleep(0.05)
+    assert set(bench.velocities()) <= {bytes(8)}
+
+
+@pytest.mark.parametrize("end", ["stop", "brake", "enable", "close"])
+def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, end: str) -> None:
+    """At once: neither the vehicle's own time limit nor the driver's for a velocity that is not renewed is awaited."""
+    bench.drive_until_fast()
+    bench.bus.frames.clear()
+    getattr(bench.vehicle, end)()
+    bench.until(lambda: bytes(8) in bench.velocities())
+    sent = bench.velocities()
+    still = sent.index(bytes(8))
+    assert set(sent[still:]) == {bytes(8)}
+    assert still <= 10, "what was on its way already; the driver's limit takes some 25"
+    if end != "enable":
+        assert abs(bench.speed()) < 0.02
+
+
+def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(
+    bench: Bench,
+) -> None:
+    bench.until(lambda: bench.vehicle.state(1.0).speed == 0.0)
+    bench.bus.talking = False  # its newest word, that it stands, is from before the stop
+    problems: list[Exception] = []
+
+    def brake() -> None:
+        try:
+            bench.vehicle.brake()
+        except DeadlineError as error:
+            problems.append(error)
+
+    braking = threading.Thread(target=brake)
+    braking.start()
+    bench.until(lambda: bool(bench.vehicle._stopping))
+    with pytest.raises(Aborted, match="a stop is under way"):
+        bench.vehicle.drive(0.1, 0.0)
+    assert not bench.braked()
+    braking.join(5.0)
+    assert "did not report standstill" in str(problems[0])
+    bench.until(bench.braked)
+
+
+def test_silence_is_told_to_one_who_drives_within_half_a_second(bench: Bench) -> None:
+    bench.drive_until_fast()
+    bench.bus.talking = False
+    begun = time.monotonic()
+    with pytest.raises(DeviceFault, match="no feedback"):
+        while time.monotonic() - begun < 3.0:
+            bench.vehicle.drive(0.3, 0.0)
+            time.sleep(0.01)
+    assert time.monotonic() - begun < 1.2
 
 
 def test_silence_ends_driving_and_an_old_reading_is_none(bench: Bench) -> None:

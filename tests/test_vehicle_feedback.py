@@ -90,6 +90,23 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
         bench.feedback.check(in_command=False, driving=False)
 
 
+def test_each_bit_of_a_motors_driver_is_a_fault_but_the_two_that_say_it_works() -> None:
+    told = {bit: driver_trouble(1, 1 << bit) for bit in range(8)}
+    assert [bit for bit, words in told.items() if not words] == [6, 7]
+    assert len({words for words in told.values() if words}) == 6
+    assert told[5] == ("motor 1: driver fails",)
+
+
+def test_whoever_took_command_away_is_for_a_person_to_find_out() -> None:
+    bench = Bench()
+    bench.tell(0, 0, mode=0)
+    bench.feedback.check(in_command=False, driving=False)
+    with pytest.raises(DeviceFault, match="left CAN command") as caught:
+        bench.feedback.check(in_command=True, driving=False)
+    assert (caught.value.code, caught.value.recoverable) == ("vehicle.command_lost", False)
+    assert bench.interruption()[0] == 1
+
+
 def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands() -> None:
     bench = Bench()
     bench.clock.time += 0.6
@@ -103,6 +120,80 @@ def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_o
         bench.feedback.idle(0.1)
     with pytest.raises(DeviceFault, match="no feedback"):
         bench.feedback.check(in_command=True, driving=False)
+
+
+@pytest.mark.parametrize("late", ["Odometry", "MotionState", "SystemState"])
+def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(late: str) -> None:
+    bench = Bench()
+    kept = bench.feedback.get(late)
+    bench.clock.time += 0.5
+    bench.tell(0, 0)
+    bench.feedback._newest[late] = kept
+    with pytest.raises(DeadlineError, match=r"s old, allowed 0\.20 s"):
+        bench.feedback.state(0.2, None)
+    stamp = bench.feedback.state(1.0, None).stamp
+    assert stamp == pytest.approx(bench.clock.time if late == "SystemState" else kept[0])
+
+
+@pytest.mark.parametrize(("speed", "yaw_rate"), [(0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)])
+def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(speed: float, yaw_rate: float) -> None:
+    bench = Bench()
+    asked = bench.clock.time
+    assert not bench.feedback.stands(asked)  # what was told before says nothing
+    bench.tell(0, 0)
+    assert bench.feedback.stands(asked)
+    bench.clock.time += 0.02
+    bench.feedback.take("MotionState", {"Speed": speed, "YawRate": yaw_rate})
+    assert not bench.feedback.stands(asked)
+
+
+def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault() -> None:
+    bench = Bench()
+    asked = bench.clock.time
+    assert not bench.feedback.commanded(asked)
+    for wrong in ({"mode": 0}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
+        bench.tell(0, 0, **wrong)
+        assert not bench.feedback.commanded(asked), wrong
+    bench.tell(0, 0)
+    assert bench.feedback.commanded(asked)
+
+
+def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_it() -> None:
+    for in_command in (True, False):
+        bench = Bench()
+        bench.tell(0, 0, state=1)
+        with pytest.raises(DeviceFault, match="emergency stop") as caught:
+            bench.feedback.check(in_command=in_command, driving=False)
+        assert caught.value.code == "vehicle.emergency_stop"
+        assert not caught.value.recoverable
+
+
+@pytest.mark.parametrize(
+    ("message", "signals"),
+    [
+        ("MotionCommand", {"Speed": 0.1, "YawRate": 0.0}),
+        ("MotionCommand", {"Speed": 0.0, "YawRate": -0.1}),
+        ("BrakeCommand", {"Locked": 0}),
+    ],
+)
+def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(message: str, signals: dict[str, float]) -> None:
+    bench = Bench()
+    bench.feedback.take("MotionCommand", {"Speed": 0.0, "YawRate": 0.0})
+    bench.feedback.take("BrakeCommand", {"Locked": 1})
+    bench.feedback.check(in_command=True, driving=False)
+    bench.feedback.take(message, signals)
+    with pytest.raises(DeviceFault, match="somebody else") as caught:
+        bench.feedback.check(in_command=True, driving=False)
+    assert not caught.value.recoverable
+    assert bench.interruption()[0] == 1
+
+
+@pytest.mark.parametrize("pushed", [(-6, 0), (0, 6), (0, -6)])
+def test_each_wheel_tells_of_a_push_either_way(pushed: tuple[int, int]) -> None:
+    bench = Bench()
+    bench.tell(0, 0)
+    bench.tell(*pushed)
+    assert bench.interruption() == (1, "it moved by 6 mm without a command")
 
 
 def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from cell.devices.direct import VirtualCell
 from cell.devices.stopping import stop_cell
 from cell.run.job_run import classify
 from cell.steps.moves import HOME
+from drivers.clock import Clock
 from drivers.errors import Aborted
 from statemachine.cancel import Cancelled
 from statemachine.control import RunControl
@@ -170,7 +172,24 @@ def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -
     assert cell.clock.now() < 10.0
 
 
-def test_a_clock_that_runs_by_itself_gets_threads() -> None:
-    from drivers.clock import Clock
+def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_told() -> None:
+    done, go_on = [], threading.Event()
 
+    def fails() -> None:
+        raise RuntimeError("its link is lost")
+
+    begun = time.monotonic()
+    actions = {"laser off": lambda: go_on.wait(5), "rail stopped": lambda: go_on.wait(5), "vehicle": fails}
+    problems = Threads(Clock()).each({**actions, "arm stopped": lambda: done.append("arm")}, 0.5)  # type: ignore[dict-item]
+    took = time.monotonic() - begun
+    go_on.set()
+    assert problems == [
+        "laser off: not confirmed within 0 s", "rail stopped: not confirmed within 0 s",
+        "vehicle: not confirmed, its link is lost",
+    ]  # fmt: skip
+    assert done == ["arm"]
+    assert 0.5 <= took < 0.95, "one time limit for all"
+
+
+def test_a_clock_that_runs_by_itself_gets_threads() -> None:
     assert isinstance(waiting_on(Clock()), Threads)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config import load_config
@@ -106,6 +107,44 @@ def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(se
     assert site.cell.world.collisions.found == ()
 
 
+@pytest.mark.parametrize("off", [Planar(0.0, 0.04, 0.0), Planar(0.0, 0.0, math.radians(3)), Planar(-0.04, 0.0, 0.0)])
+def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_braked(off: Planar) -> None:
+    site = Site()
+    target = Planar.of(JOB.approach.target.se3())
+    stands, model = target * off, site.cell.world.vehicle
+    model._x, model._y, model._yaw = stands.x, stands.y, stands.yaw
+    site.cell.clock.sleep(0.1)
+    arrival = site.run()
+    left = target.inverse() * site.truth()
+    assert max(abs(left.x), abs(left.y)) < JOB.approach.tolerance
+    assert abs(left.yaw) < JOB.approach.tolerance_angle
+    assert (arrival.error_along, arrival.error_across) == pytest.approx((left.x, left.y), abs=1e-4)
+    assert arrival.error_yaw == pytest.approx(left.yaw, abs=1e-3)
+    assert model.feedback(site.cell.clock.now()).braked
+
+
+def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked() -> None:
+    """The board is seen turned about the vehicle by a degree more each time: however it turns, it is off."""
+    site, seen = Site(), 0.0
+    target = Planar.of(JOB.approach.target.se3())
+    model = site.cell.world.vehicle
+    model._x, model._y, model._yaw = target.x, target.y, target.yaw
+    site.cell.clock.sleep(0.1)
+    photograph = site.photograph
+
+    def turned() -> BoardFix:
+        nonlocal seen
+        seen += math.radians(1.0)
+        fix = photograph()
+        about = VEHICLE_FROM_BASE.inverse() * pin.SE3(pin.exp3(np.array([0.0, 0.0, seen])), np.zeros(3))
+        return replace(fix, base_from_board=about * VEHICLE_FROM_BASE * fix.base_from_board)
+
+    site.photograph = turned  # type: ignore[method-assign]
+    with pytest.raises(RefusedError, match=r"mm across and .* from its target after 9 photographs"):
+        site.run()
+    assert model.feedback(site.cell.clock.now()).braked
+
+
 class LateVehicle:
     """The simulated vehicle behind a bus that once, at the end of its way unseen, hands on nothing new for a while.
 
@@ -181,6 +220,18 @@ def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
     assert site.whereabouts.pose().yaw == pytest.approx(site.truth().yaw, abs=0.03)
     site.run()
     assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
+
+
+def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.whereabouts.forget_word()
+    site.whereabouts.enter(JOB)
+    with pytest.raises(RefusedError, match="start of another job, which did not begin to drive"):
+        site.whereabouts.pose()
+    site.whereabouts.see(Planar.of(JOB.approach.staging.se3()))
+    site.whereabouts.forget_word()
+    site.whereabouts.pose()
 
 
 def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:

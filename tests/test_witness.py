@@ -94,9 +94,10 @@ def test_a_shifted_picture_does_no_harm_to_depths_either() -> None:
     assert np.abs(after[:, 2] - 0.130).mean() < 0.2 * np.abs(before[:, 2] - 0.130).mean()
 
 
-def test_a_laser_that_was_knocked_is_refused_with_its_angle() -> None:
+@pytest.mark.parametrize("turn", [2 * LARGEST_RAD, -2 * LARGEST_RAD])
+def test_a_laser_that_was_knocked_is_refused_with_its_angle(turn: float) -> None:
     with pytest.raises(RefusedError, match="laser points") as caught:
-        pointing(seen(0.0, 5), seen(2 * LARGEST_RAD, 6), CAMERA, PLANE, EXIT)
+        pointing(seen(0.0, 5), seen(turn, 6), CAMERA, PLANE, EXIT)
     assert caught.value.numbers[0].unit == "mrad"
 
 
@@ -115,8 +116,9 @@ def test_a_plate_that_was_knocked_far_off_is_refused_with_the_next_step() -> Non
 def test_looks_from_two_places_of_the_rail_are_not_compared() -> None:
     before, now = seen(0.0, 1), seen(0.0, 2)
     pointing(before, replace(now, rail=0.04e-3), CAMERA, PLANE, EXIT)
-    with pytest.raises(RefusedError, match=r"rail at 2\.00 mm, at the calibration at 0\.00 mm"):
-        pointing(before, replace(now, rail=2e-3), CAMERA, PLANE, EXIT)
+    for rail in (2e-3, -2e-3):
+        with pytest.raises(RefusedError, match=rf"rail at {1e3 * rail:.2f} mm, at the calibration at 0\.00 mm"):
+            pointing(before, replace(now, rail=rail), CAMERA, PLANE, EXIT)
 
 
 def test_a_witness_that_is_covered_is_refused() -> None:
@@ -158,6 +160,7 @@ def test_a_line_that_has_not_turned_is_silent_and_its_noise_is_stated() -> None:
     assert all(0.01e-3 < one.roll_sigma < 0.1e-3 for one in found)
 
 
-def test_a_line_that_has_turned_far_is_refused() -> None:
+@pytest.mark.parametrize("roll", [1e-3, -1e-3])
+def test_a_line_that_has_turned_far_is_refused(roll: float) -> None:
     with pytest.raises(RefusedError, match=r"line .* is turned by .* mrad.*about its own beam.*cell calibrate"):
-        pointing(seen(0.0, 1), seen(0.0, 2, laser=rolled_laser(1e-3)), CAMERA, PLANE, EXIT)
+        pointing(seen(0.0, 1), seen(0.0, 2, laser=rolled_laser(roll)), CAMERA, PLANE, EXIT)

@@ -99,7 +99,8 @@ class FrameQueue:
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames until the stream is closed; raises like `next` when none comes for 2 s and two frame periods."""
-        while not self._closed:
+        # Whoever was busy with a frame while it was closed hears of it as well.
+        while True:
             try:
                 yield self.next(self._longest_gap)
             except Aborted:

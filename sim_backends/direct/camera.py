@@ -203,8 +203,8 @@ class DirectStream:
         raise Aborted(f"{self._camera.name}: the acquisition was stopped")
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames until the stream is closed, with `Aborted` if it was stopped."""
-        while not self._closed.is_set():
+        """Frames until the stream is closed, with `Aborted` if it was stopped, also while a frame was looked at."""
+        while True:
             try:
                 yield self.next(LONGEST_GAP_S + 2.0 * self._period)
             except Aborted:

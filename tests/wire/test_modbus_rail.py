@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -211,6 +211,39 @@ def test_late_answers_never_become_those_to_later_questions(late: float) -> None
     listener.close()
 
 
+@pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
+def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
+    listener, ready = socket.create_server(("127.0.0.1", 0)), threading.Event()
+    spoiling = itertools.count()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(8):
+                address, count = struct.unpack(">HH", request[2:6])
+                spoil = ready.is_set() and next(spoiling) == 0
+                unit = UNIT + (spoil and spoilt == "another drive's")
+                function = 3 + (spoil and spoilt == "another function's")
+                body = bytes([unit, function, 2 * count]) + struct.pack(">H", address + spoil) * count
+                reply = bytearray(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+                if spoil and spoilt == "a bit":
+                    reply[4] ^= 0x10
+                connection.sendall(reply)
+
+    threading.Thread(target=serve, daemon=True).start()
+    statistics = LinkStatistics()
+    link = ModbusLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
+        stop_action=Action(1, 1), clock=Clock(), statistics=statistics,
+    )  # fmt: skip
+    assert link.read(7, 2) == [7, 7]
+    ready.set()
+    assert link.read(16, 2) == [16, 16]
+    assert next(spoiling) >= 2, "it was asked for again"
+    link.close()
+    listener.close()
+
+
 def test_a_register_that_the_drive_does_not_have_is_named() -> None:
     wrong = {**PATHS, "homed": {"address": 0x1004, "bit": 6}}
     drive = Drive.of(config(PATHS))
@@ -263,6 +296,58 @@ def test_a_drive_that_does_not_begin_to_search_is_not_homed(drive: Drive) -> Non
     with pytest.raises(DeviceFault, match=r"rail\.not_begun"):
         rail.home().wait(60.0)
     assert not rail.state().homed_here
+    rail.close()
+
+
+@contextmanager
+def shown(model: RailModel, name: str, told: Callable[[float], Any]) -> Iterator[None]:
+    """The drive shows this instead of what is so."""
+    setattr(model, name, told)
+    try:
+        yield
+    finally:
+        delattr(model, name)
+
+
+@pytest.fixture
+def edges() -> Iterator[Drive]:
+    """The drive whose map has the switches."""
+    made = Drive.of(config(EDGES))
+    yield made
+    made.peer.stop()
+
+
+def test_what_speaks_against_a_zero_when_nobody_watched_ends_the_trust_in_it(edges: Drive) -> None:
+    drive = edges
+    drive.homed().close()
+    for name in ("stalled", "left_switch", "right_switch"):
+        with shown(drive.model, name, lambda t: True):
+            rail = drive.rail()
+        assert drive.peer.drive._homed
+        assert not rail.state().homed, name
+        with pytest.raises(InterlockError, match="not homed"):
+            rail.move_to(0.01)
+        rail.close()
+    rail = drive.rail()
+    assert rail.state().homed
+    rail.close()
+
+
+def test_a_search_that_ends_elsewhere_in_an_alarm_or_by_a_stop_finds_no_zero(edges: Drive) -> None:
+    drive, rail = edges, edges.rail()
+    true, off = drive.model.position, round(0.002 / drive.record.lead * drive.record.counts_per_turn)
+    with shown(drive.model, "position", lambda t: true(t) + off):
+        with pytest.raises(DeviceFault, match=r"counts 2 mm there .*rail\.setting"):
+            rail.home().wait(60.0)
+        assert not rail.state().homed_here
+    search = rail.home()
+    with shown(drive.model, "stalled", lambda t: True), pytest.raises(DeviceFault, match=r"while it searched"):
+        search.wait(60.0)
+    search = rail.home()
+    rail.stop()
+    with pytest.raises(Aborted):
+        search.wait(60.0)
+    assert not rail.state().homed
     rail.close()
 
 

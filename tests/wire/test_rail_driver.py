@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from drivers.errors import (
     Aborted,
     ConfigError,
     DeadlineError,
+    DeviceError,
     DeviceFault,
     InterlockError,
     LimitError,
@@ -635,6 +637,29 @@ def test_answers_to_another_command_are_refused_twice_then_reported(module: Call
         rail.state()
     assert rail.statistics.errors["bad_replies"] == 2
     rail.close()
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("answers", ["refuses", "nothing"])
+def test_the_motor_is_told_to_stop_whatever_becomes_of_the_search_and_of_the_replies(
+    module: Callable[..., str], answers: str
+) -> None:
+    """A search that cannot be ended, and a module that cannot be heard, which may hear."""
+    heard: list[int] = []
+
+    def answer(request: bytes) -> bytes:
+        if not heard:
+            return reply(request)
+        heard.append(request[1])
+        return b"" if answers == "nothing" else reply(request, status=6 if request[1] == 13 else 100)
+
+    rail = connect(module(answer), Clock())
+    heard.append(0)
+    with pytest.raises(DeadlineError if answers == "nothing" else DeviceFault):
+        rail.stop()
+    assert 3 in heard
+    with suppress(DeviceError, DeadlineError):
+        rail.close()
 
 
 @pytest.mark.wire

@@ -1,0 +1,113 @@
+"""Frames between the thread that receives them and the one that uses them: which are lost, stale, or too many."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from cell.config import load_config
+from cell.devices.direct import VirtualCell
+from drivers.camera.frame_queue import FrameQueue
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, DeviceFault
+from drivers.interfaces import Frame, LinkStatistics
+
+
+def frame(number: int) -> Frame:
+    return Frame(np.zeros((1, 1), np.uint8), number, 0.01, 0.0, 0.0, 0.0)
+
+
+def queue(capacity: int = 8, check: Callable[[], None] = lambda: None) -> FrameQueue:
+    return FrameQueue("camera", Clock(), capacity=capacity, longest_gap=0.1, check=check, statistics=LinkStatistics())
+
+
+def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too() -> None:
+    frames = queue()
+    frames.expect(10)
+    for number in (12, 13, 17):
+        frames.put(frame(number))
+    taken = [frames.next(0.1) for _ in range(3)]
+    assert [one.frame_id for one in taken] == [12, 13, 17]
+    assert [one.lost_before for one in taken] == [2, 0, 3]
+    assert frames.lost == 5
+
+
+def test_where_the_first_number_is_not_told_the_first_frame_is_no_loss() -> None:
+    frames = queue()
+    frames.expect(None)
+    frames.put(frame(12))
+    assert (frames.next(0.1).lost_before, frames.lost) == (0, 0)
+
+
+def test_a_frame_of_before_is_never_handed_out() -> None:
+    """Nor one that comes a second time, or out of its turn."""
+    frames = queue()
+    frames.expect(10)
+    for number in (9, 10, 10, 9, 11):
+        frames.put(frame(number))
+    assert [frames.next(0.1).frame_id for _ in range(2)] == [10, 11]
+    with pytest.raises(DeadlineError, match="no frame within"):
+        frames.next(0.01)
+    assert frames.lost == 0
+
+
+def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept() -> None:
+    frames = queue(capacity=2)
+    frames.expect(1)
+    for number in (1, 2, 3, 4):
+        frames.put(frame(number))
+    assert [frames.next(0.1).frame_id for _ in range(2)] == [1, 2]
+    frames.put(frame(5))
+    assert frames.next(0.1).lost_before == 2
+    assert frames.lost == 2
+
+
+@pytest.mark.parametrize("aborted", [True, False])
+def test_an_end_that_was_asked_for_ends_who_iterates_and_a_stop_is_told(aborted: bool) -> None:
+    frames = queue()
+    frames.put(frame(1))
+    taken: list[int] = []
+
+    def take() -> None:
+        for one in frames:
+            taken.append(one.frame_id)
+            frames.put(frame(2))
+            frames.close(aborted=aborted)
+
+    if aborted:
+        with pytest.raises(Aborted):
+            take()
+    else:
+        take()
+    assert taken == [1], "what was waiting is not handed out any more"
+    with pytest.raises(Aborted):
+        frames.next(0.1)
+
+
+def test_a_simulated_camera_that_is_stopped_while_a_frame_is_looked_at_says_so_as_well() -> None:
+    camera = VirtualCell(load_config(None), seed=4, level="ideal").scan_camera
+    camera.configure(0.005, 10.0)
+    with camera.stream() as frames, pytest.raises(Aborted):
+        for _ in frames:
+            camera.stop()
+
+
+def test_who_waits_is_told_at_once_that_none_can_come() -> None:
+    broken = threading.Event()
+
+    def check() -> None:
+        if broken.is_set():
+            raise DeviceFault("camera", "camera.lost", "gone", recoverable=True, hint="")
+
+    frames = queue(check=check)
+
+    def end() -> None:
+        broken.set()
+        frames.wake()
+
+    threading.Timer(0.02, end).start()
+    with pytest.raises(DeviceFault, match="gone"):
+        frames.next(5.0)

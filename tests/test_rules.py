@@ -1,0 +1,179 @@
+"""The interlocks' rules by readings that are written down here: each direction, each part of a reading, each limit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.devices.interlocks import Command, Interlocks, Situation
+from cell.devices.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
+from cell.geometry.poses import to_ur
+from drivers.clock import Clock
+from drivers.errors import DeadlineError, InterlockError
+from drivers.interfaces import ArmSafety, ArmState, VehicleState
+
+MOVE = Command("arm", "move_joints", {"joints": np.zeros(6)})
+DRIVE = Command("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
+POSTURE = np.zeros(6)
+LOOK = pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.6]))
+STANDS = VehicleState(
+    stamp=0.0, x=0.0, y=0.0, yaw=0.0, speed=0.0, yaw_rate=0.0, command_mode=True, braked=True, emergency_stop=False,
+    error_bits=0, battery_volts=26.0,
+)  # fmt: skip
+
+
+class Told:
+    """A device that tells this, however old it may be."""
+
+    def __init__(self, name: str, state: Any) -> None:
+        self.name, self.newest = name, state
+
+    def state(self, max_age: float = 0.1) -> Any:
+        return self.newest
+
+
+class Ended:
+    """A motion of the arm that is over, or not."""
+
+    contact = False
+
+    def __init__(self, done: bool) -> None:
+        self.done = done
+
+
+def arm_state(**shown: Any) -> ArmState:
+    still = np.zeros(6)
+    known = ArmState(
+        stamp=Clock().now(), joints=POSTURE, joint_speeds=still, flange=to_ur(LOOK), wrench=still,
+        safety=ArmSafety.NORMAL, moving=False, digital_inputs=0, digital_outputs=0, device_time=0.0, controlled=True,
+    )  # fmt: skip
+    return replace(known, **shown)
+
+
+def rules(vehicle: VehicleState = STANDS, arm: ArmState | None = None, **known: Any) -> Interlocks:
+    """A cell whose devices tell this; the arm's model has the flange at `LOOK`, whatever its joints."""
+    situation = Situation(
+        Told("arm", arm or arm_state()), Told("vehicle", vehicle), None, None, {},  # type: ignore[arg-type]
+        lambda joints, command, others: (), lambda joints: LOOK, {"HOME": POSTURE}, "", clock=Clock(),
+    )  # fmt: skip
+    for name, value in known.items():
+        setattr(situation, name, value)
+    return Interlocks(situation, RULES)
+
+
+def test_what_is_written_down_here_lets_arm_and_vehicle_move() -> None:
+    rules().require(MOVE)
+    rules().require(DRIVE)
+
+
+@pytest.mark.parametrize(
+    "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006}], ids=str
+)
+def test_a_vehicle_that_rolls_or_turns_either_way_is_not_parked(moving: dict[str, float]) -> None:
+    with pytest.raises(InterlockError, match=r"vehicle drives at .*vehicle_parked"):
+        rules(replace(STANDS, **moving)).require(MOVE)
+
+
+@pytest.mark.parametrize("braked", [False, None])
+def test_a_brake_that_is_open_or_not_known_is_not_locked(braked: bool | None) -> None:
+    with pytest.raises(InterlockError, match="vehicle_parked"):
+        rules(replace(STANDS, braked=braked)).require(MOVE)
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("speed", [0.06, -0.06])
+def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed: float) -> None:
+    turning = arm_state(joint_speeds=speed * np.eye(6)[joint])
+    with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
+        rules(arm=turning).require(DRIVE)
+    with pytest.raises(InterlockError, match=r"the arm moves.*arm_still"):
+        rules(arm=turning).require(Command("vehicle", "enable"))
+
+
+def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands() -> None:
+    with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
+        rules(last=Ended(False)).require(DRIVE)
+    rules(last=Ended(True)).require(DRIVE)
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("off", [math.radians(2.1), -math.radians(2.1)])
+def test_one_joint_off_is_another_posture(joint: int, off: float) -> None:
+    with pytest.raises(InterlockError, match=r"2\.1 deg from HOME.*arm_stowed"):
+        rules(arm=arm_state(joints=off * np.eye(6)[joint])).require(DRIVE)
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "fits"),
+    [(0.9 * LOOK_M, 0.0, True), (0.0, 0.9 * LOOK_RAD, True), (1.1 * LOOK_M, 0.0, False), (0.0, 1.1 * LOOK_RAD, False)],
+)
+def test_a_looking_pose_is_one_by_its_place_and_by_its_turn(shift: float, turn: float, fits: bool) -> None:
+    look = LOOK * pin.SE3(pin.exp3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, -shift]))
+    interlocks = rules(arm=arm_state(joints=POSTURE + 1.0), looks={"the job's": look})
+    if fits:
+        interlocks.require(DRIVE)
+        return
+    with pytest.raises(InterlockError, match="arm_stowed"):
+        interlocks.require(DRIVE)
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "same"),
+    [(0.04e-3, 0.0, True), (0.0, 0.09e-3, True), (-0.06e-3, 0.0, False), (0.0, -0.11e-3, False)],
+)
+def test_the_flange_is_compared_in_place_and_in_turn(shift: float, turn: float, same: bool) -> None:
+    told = LOOK * pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])), np.array([0.0, shift, 0.0]))
+    interlocks = rules(arm=arm_state(flange=to_ur(told)))
+    if same:
+        interlocks.require(MOVE)
+        return
+    with pytest.raises(InterlockError, match="same_kinematics"):
+        interlocks.require(MOVE)
+
+
+def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
+    old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
+    with pytest.raises(DeadlineError, match="newest state is"):
+        rules(arm=old).require(DRIVE)
+    rules(arm=old).require(Command("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "refused"),
+    [(0, True, True), (0, False, False), (1, True, True), (1, False, True), (2, True, False), (2, False, False)],
+)
+def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: int, value: bool, refused: bool) -> None:
+    interlocks = rules(outputs={0: "laser", 1: "claw"})
+    command = Command("arm", "set_digital_output", {"index": index, "value": value})
+    if not refused:
+        interlocks.require(command)
+        return
+    with pytest.raises(InterlockError, match="own_switch"):
+        interlocks.require(command)
+
+
+def test_a_rule_is_lifted_inside_its_context_only() -> None:
+    interlocks = rules(replace(STANDS, speed=0.1))
+    with interlocks.lifted(["vehicle_parked"]):
+        interlocks.require(MOVE)
+        with interlocks.lifted(["way_clear"]):
+            interlocks.require(MOVE)
+        interlocks.require(MOVE)
+    with pytest.raises(InterlockError, match="vehicle_parked"):
+        interlocks.require(MOVE)
+
+
+def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
+    interlocks = rules()
+    light = Command("laser", "lit")
+    with interlocks.purpose("sweep"):
+        with interlocks.purpose("test"):
+            pass
+        interlocks.require(light)
+    with pytest.raises(InterlockError, match="laser_purpose"):
+        interlocks.require(light)
