@@ -102,8 +102,7 @@ def require_bare(found: Standing | None, tolerance: float) -> None:
     x, y, z = 1e3 * found.at
     raise RefusedError(
         f"something stands {1e3 * found.height:.2f} mm out of the surface at ({x:.0f}, {y:.0f}, {z:.0f}) mm, as the "
-        f"scan saw it: the part would come to lie on it, allowed are {1e3 * allowed:.2f} mm, half of the place's "
-        "tolerance. "
-        "Look what it is (a chip, a burr, a drop), then run the job again from its sweep",
+        f"scan saw it: the part would come to lie on it. Allowed are {1e3 * allowed:.2f} mm, half of the place's "
+        "tolerance. Look what it is (a chip, a burr, a drop), then run the job again from its sweep",
         Measured("stands out of the surface", 1e3 * found.height, "mm", most=1e3 * allowed),
     )

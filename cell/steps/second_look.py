@@ -114,10 +114,10 @@ def by_times(swath: Swath) -> Vector:
     return shared
 
 
-def sparse(scan: ScanSection, swept: Swath) -> ScanSection:
-    """One strip of a scan in about `LINES` lines, no faster than it was `swept`: a repetition is slower."""
-    ways = np.linalg.norm(swept.flanges[-1, :3, 3] - swept.flanges[0, :3, 3]) + abs(swept.rail[-1] - swept.rail[0])
-    speed = min(scan.speed, float(ways / (swept.times[-1] - swept.times[0])))
+def sparse(scan: ScanSection, before: Swath) -> ScanSection:
+    """One strip of a scan in about `LINES` lines, no faster than it was swept `before`: a repetition is slower."""
+    ways = np.linalg.norm(before.flanges[-1, :3, 3] - before.flanges[0, :3, 3]) + abs(before.rail[-1] - before.rail[0])
+    speed = min(scan.speed, float(ways / (before.times[-1] - before.times[0])))
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
     return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": scan.swath[:1]})
 
