@@ -2,8 +2,8 @@
 
 A stepper module runs on to its target, and a vehicle drives on for half a second, when nobody talks to them any more.
 The helper holds the same port and waits at a pipe. When the pipe ends, the owner is gone: it says the last words and
-ends. It does nothing while the owner lives, and nothing after `close()`; only while a motion is `attended` it says them
-as well as soon as the owner is silent for a moment.
+ends. It also says them while the owner is frozen (stopped, swapped out, in a debugger), and while a motion is
+`attended` as soon as nobody attends it. It does nothing else while the owner lives, and nothing after `close()`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import InterlockError
+from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import ATTENDED_S
+from drivers.last_words_child import ALIVE, BEAT, FROZEN_S, GOODBYE, REST
+from drivers.pulse import Pulse
 
 PAUSE_S = 0.02
 """Between two of the last words."""
@@ -44,20 +46,34 @@ def attended_by(name: str, helper: LastWords | None) -> AbstractContextManager[C
     return helper.attended()
 
 
+def frozen_fault(device: str, code: str) -> DeviceFault:
+    """What the process beside a frozen one did; the device stands, and may go on once a person or a policy says so."""
+    return DeviceFault(
+        device,
+        code,
+        f"this program gave no sign of life for more than {FROZEN_S:g} s, so the process beside it stopped the device",
+        recoverable=True,
+        hint="The program was suspended, or this computer is too busy or swaps. End other programs, then go on.",
+    )
+
+
 class LastWords:
     """Holds the port with the file `descriptor`; writes each of `words` to it by one system call, in their order."""
 
     def __init__(self, name: str, descriptor: int, words: Sequence[bytes]) -> None:
         self._name = name
         reader, self._pipe = os.pipe()
+        self._told, teller = os.pipe()
+        for end in (self._pipe, self._told):
+            os.set_blocking(end, False)
         script = Path(__file__).with_name("last_words_child.py")
-        command = [sys.executable, "-I", "-S", str(script), str(reader), str(descriptor)]
+        command = [sys.executable, "-I", "-S", str(script), *map(str, (reader, teller, descriptor))]
         command += [repr(PAUSE_S), repr(ATTENDED_S)]
         try:
             self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
                 [*command, *(word.hex() for word in words)],
                 stdin=subprocess.DEVNULL,
-                pass_fds=(reader, descriptor),
+                pass_fds=(reader, teller, descriptor),
                 start_new_session=True,  # what ends the owner's group must not end the helper
             )
         except OSError as error:
@@ -66,22 +82,30 @@ class LastWords:
             self._process = None
         finally:
             os.close(reader)
+            os.close(teller)
+        self._pulse = Pulse(f"{name} pulse", lambda: self._write(ALIVE))
+
+    def require_unspoken(self, code: str) -> None:
+        """Raise `DeviceFault` with `code`, once, after the helper has stopped the device of a frozen owner."""
+        with suppress(OSError):
+            if os.read(self._told, 4096):
+                raise frozen_fault(self._name, code)
 
     @contextmanager
     def attended(self) -> Iterator[Callable[[], None]]:
         """See `drivers.interfaces.Attended`; `InterlockError` when there is no helper."""
-        self._say(b"+")
+        self._say(BEAT)
         try:
-            yield lambda: self._say(b"+")
+            yield lambda: self._say(BEAT)
         finally:
             with suppress(InterlockError):
-                self._say(b"-")
+                self._say(REST)
 
     def _say(self, word: bytes) -> None:
         try:
             if self._process is None or self._pipe < 0:
                 raise OSError("it is not there")
-            os.write(self._pipe, word)
+            self._write(word)
         except OSError as error:
             raise InterlockError(
                 self._name,
@@ -89,13 +113,19 @@ class LastWords:
                 "steps, and open the cell again",
             ) from error
 
+    def _write(self, word: bytes) -> None:
+        with suppress(BlockingIOError):  # What the helper has not read yet is sign enough.
+            os.write(self._pipe, word)
+
     def close(self) -> None:
         """Say goodbye: the helper ends without a word. Idempotent."""
         if self._pipe < 0:
             return
+        self._pulse.close()
         with suppress(OSError):
-            os.write(self._pipe, b"bye")
+            self._write(GOODBYE)
         os.close(self._pipe)
+        os.close(self._told)
         self._pipe = -1
         if self._process is not None:
             try:

@@ -1,34 +1,93 @@
-"""Child side of `last_words`: run by its path, with the standard library's core only, so that it starts at once."""
+"""Child side of `last_words`: run by its path, with the standard library's core only, so that it starts at once.
+
+It also says when a process counts as frozen, for the arm's own child process.
+"""
 
 import os
 import select
 import signal
 import sys
 import time
+from contextlib import suppress
 
-BEAT, REST, GOODBYE = b"+", b"-", b"b"
+BEAT, REST, ALIVE, GOODBYE = b"+", b"-", b".", b"b"
+FROZEN_S = 0.25
+"""An owner without a beat that used no processor time for so long is frozen: stopped, swapped out, in a debugger."""
+HUNG_S = 2.0
+"""An owner without a beat for so long counts as frozen even if it computes."""
+LOOK_S = 0.05
 
 
-def main(pipe: int, port: int, pause: float, silence: float, words: list[bytes]) -> None:
+class Owner:
+    """Signs of life of the process `pid`: its beats, and the processor time that it uses.
+
+    The time counts as well, because a process that computes may hold Python's lock and send no beat meanwhile.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._stat = f"/proc/{pid}/stat"
+        self._beat = self._sign = float("inf")
+        self._used = b""
+
+    def beat(self) -> None:
+        """The owner has sent a beat. It is watched from the first one on."""
+        self._beat = self._sign = time.monotonic()
+
+    def frozen(self) -> bool:
+        """Whether the owner gave no sign of life for too long; asked at least every `LOOK_S`."""
+        now, used = time.monotonic(), self._processor_time()
+        if used != self._used and self._sign < now:
+            self._used, self._sign = used, now
+        return now - self._sign > FROZEN_S or now - self._beat > HUNG_S
+
+    def _processor_time(self) -> bytes:
+        with suppress(OSError), open(self._stat, "rb") as stat:  # noqa: PTH123 (pathlib starts too slowly here)
+            # utime and stime, the 14th and 15th field; the name before them may contain blanks.
+            return b" ".join(stat.read().rpartition(b")")[2].split()[11:13])
+        return b""
+
+
+def raise_priority() -> None:
+    """Run before the processes that compute, where the system allows it: in real time, else with a lower niceness."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (AttributeError, OSError):
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, -10)
+
+
+def main(pipe: int, told: int, port: int, pause: float, silence: float, words: list[bytes]) -> None:
     """Wait for the end of `pipe`; write `words` to `port`, unless the owner has said goodbye.
 
-    From a beat until a rest they are also written each time that nothing was heard for `silence` s: an owner that hung
-    may begin a motion afterwards.
+    They are also written while the owner is frozen, which `told` is told each time. From a beat until a rest they are
+    also written each time that nothing was heard for `silence` s: an owner that hung may begin a motion afterwards.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    attended = False
+    raise_priority()
+    owner = Owner(os.getppid())
+    attended_until = float("inf")
     while True:
-        if attended and not select.select([pipe], [], [], silence)[0]:
+        unattended = time.monotonic() > attended_until
+        if unattended or owner.frozen():
+            if not unattended:
+                with suppress(OSError):
+                    os.write(told, b"!")
             if not say(port, pause, words):
                 return
+            # Again if it goes on.
+            owner.beat()
+            attended_until = time.monotonic() + silence if unattended else attended_until
+        if not select.select([pipe], [], [], min(LOOK_S, max(0.0, attended_until - time.monotonic())))[0]:
             continue
-        heard = os.read(pipe, 64)
+        heard = os.read(pipe, 4096)
         if GOODBYE in heard:
             return
         if not heard:
             break
-        attended = heard[-1:] == BEAT
+        owner.beat()
+        if said := heard.replace(ALIVE, b""):
+            attended_until = time.monotonic() + silence if said[-1:] == BEAT else float("inf")
     say(port, pause, words)
 
 
@@ -44,5 +103,6 @@ def say(port: int, pause: float, words: list[bytes]) -> bool:
 
 
 if __name__ == "__main__":
-    pipe_end, port_end, pause_s, silence_s, *said = sys.argv[1:]
-    main(int(pipe_end), int(port_end), float(pause_s), float(silence_s), [bytes.fromhex(word) for word in said])
+    pipe_end, told_end, port_end, pause_s, silence_s, *said = sys.argv[1:]
+    last = [bytes.fromhex(word) for word in said]
+    main(int(pipe_end), int(told_end), int(port_end), float(pause_s), float(silence_s), last)

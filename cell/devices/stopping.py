@@ -54,8 +54,8 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
     try:
         safety = devices.arm.state().safety
     except DeviceError as error:
-        # A link that is lost, or closed to be recovered: the next command to the arm finds that.
-        if isinstance(error, DeadlineError) or getattr(error, "code", "") == "arm.link_lost":
+        # A late state, or a link that `recover` has closed and opens again: the next command finds what is wrong.
+        if isinstance(error, DeadlineError) or getattr(error, "code", "") == "arm.link_closed":
             return
         raise
     if safety in unfit if unfit else safety is not ArmSafety.NORMAL:

@@ -47,6 +47,10 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "the arm is in local control", False,
         "Switch it to remote control at the pendant (top right corner of its screen), then go on.",
     ),
+    "arm.owner_frozen": (
+        "this program gave no sign of life, so the process beside it stopped the arm", True,
+        "The program was suspended, or this computer is too busy or swaps. End other programs, then go on.",
+    ),
     "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
 }  # fmt: skip
 

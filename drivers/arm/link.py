@@ -21,6 +21,7 @@ from typing import Any
 
 from drivers.arm.messages import UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
+from drivers.pulse import Pulse
 
 _SILENCE_S = 2.0
 _LOOK_S = 0.02
@@ -85,6 +86,7 @@ class ArmLink:
                 f"no connection to the arm at {setup.address}: {reason}. See that it is switched on, that its address "
                 "is right, that it is in remote control and that no other program controls it.",
             )
+        self._pulse = Pulse(f"{name} pulse", self._beat) if setup.control else None
 
     @property
     def pid(self) -> int:
@@ -120,6 +122,8 @@ class ArmLink:
     def close(self, deadline: float) -> None:
         """Let the child stop the arm, switch the safe outputs off and end; it is killed if it does not."""
         self._closing = True
+        if self._pulse is not None:
+            self._pulse.close()
         pending, number = _Pending(), next(self._numbers)
         with self._lock:
             up = self.lost is None
@@ -128,10 +132,16 @@ class ArmLink:
         if up:
             self._transmit(Request(number, "close"))
             pending.done.wait(deadline)
-        self._fail("it was closed")
+        self._fail("it was closed", "arm.link_closed")
         self._end()
 
     # --- inside ---
+
+    def _beat(self) -> None:
+        """A sign of life; one that cannot be sent is no fault: a child that ends by itself makes the arm safe first."""
+        self._raise_if_lost()
+        with self._sending:
+            self._pipe.send(Request(UNANSWERED, "alive"))
 
     def _raise_if_lost(self) -> None:
         if self.lost is not None:
@@ -194,13 +204,13 @@ class ArmLink:
             return "its process closed the pipe"
         return f"its process was ended by {signal.Signals(-code).name}" if code < 0 else f"its process ended ({code})"
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, reason: str, code: str = "arm.link_lost") -> None:
         with self._lock:
             if self.lost is not None:
                 return
             self.lost = DeviceFault(
                 self._name,
-                "arm.link_lost",
+                code,
                 f"the link to the arm at {self._address} was lost: {reason}",
                 recoverable=True,
                 hint="See that the arm is on and connected, then recover() or connect again.",

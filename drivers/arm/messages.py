@@ -36,8 +36,9 @@ class Setup:
 class Request:
     """Do `name` with `arguments`.
 
-    Names: stop, close, output, safe_off, attend, payload, zero_force, move_joints, move_linear, follow. `attend` with
-    wall seconds: from now on what moves is stopped unless this is said again within them; 0 ends that.
+    Names: stop, close, output, safe_off, alive, attend, payload, zero_force, move_joints, move_linear, follow. `alive`
+    is the owner's sign of life (`drivers.pulse`). `attend` with wall seconds: from now on what moves is stopped unless
+    this is said again within them; 0 ends that.
     """
 
     number: int

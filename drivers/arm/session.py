@@ -268,7 +268,7 @@ class ArmSession:
 
         A fault of anything but the link is raised as it is.
         """
-        if error.code not in ("arm.link_lost", "arm.not_stopped"):
+        if error.code not in ("arm.link_lost", "arm.link_closed", "arm.not_stopped"):
             raise error
         if problem := self._safing.confirm():
             raise fault(self._name, "arm.not_safe", f"{error.message} Without it: {problem}") from error

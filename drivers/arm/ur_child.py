@@ -34,6 +34,7 @@ from drivers.arm.ur_packets import Packets
 from drivers.arm.ur_program import PERIOD
 from drivers.clock import Clock
 from drivers.errors import DeviceError
+from drivers.last_words_child import FROZEN_S, LOOK_S, Owner, raise_priority
 
 SILENCE_S = 1.5
 """The arm counts as lost after this time without a packet; it sends one every 2 ms."""
@@ -51,6 +52,7 @@ class Child:
         self._setup = setup
         self._safe_off = setup.safe_off
         self._parent = os.getppid()
+        self._owner = Owner(self._parent)
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
             self._packets = Packets(setup.address)
@@ -116,6 +118,8 @@ class Child:
                     self._send(Reply(request.number, self._switch(*request.arguments)))
                 elif request.name == "safe_off":
                     self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
+                elif request.name == "alive":
+                    self._owner.beat()
                 elif request.name == "attend":
                     # The time first: with the silence alone the watch would look at one that is long past.
                     self._attended_until = time.monotonic() + request.arguments[0]
@@ -153,9 +157,9 @@ class Child:
         os._exit(0)
 
     def _leave_safe(self) -> None:
+        self._control.submit(Request(0, "close"))
         for index in self._safe_off:
             switch_output(self._io, index, False)
-        self._control.submit(Request(0, "close"))
         if not self._control.finished.wait(3.0):
             with suppress(DeviceError):
                 Dashboard("arm", self._setup.address).ask("stop")
@@ -170,9 +174,14 @@ class Child:
     def _watch_arm(self) -> None:
         every = max(1, round(1.0 / (PERIOD * _PUSHES_PER_S * self._setup.rate)))
         count = 0
+        look = time.monotonic()
         while True:
             self._clock.sleep(0.5 * PERIOD)
             before = self._snapshot
+            if time.monotonic() > look:
+                look = time.monotonic() + LOOK_S
+                if self._owner.frozen():
+                    self._stand_in()
             # Read once: the owner may say that nothing is attended any more meanwhile.
             silence = self._silence
             if silence > 0 and time.monotonic() > self._attended_until:
@@ -192,6 +201,13 @@ class Child:
             count += 1
             if count % every == 0 or _urgent(snapshot) != _urgent(before):
                 self._send(snapshot)
+
+    def _stand_in(self) -> None:
+        """Stop the arm and switch the safe outputs off for an owner that is frozen; again if that goes on."""
+        self._control.stop_because("arm.owner_frozen", f"for more than {FROZEN_S:g} s")
+        for index in self._safe_off:
+            switch_output(self._io, index, False)
+        self._owner.beat()
 
     def _lose(self, text: str) -> None:
         self._send(Lost(text))
@@ -234,6 +250,7 @@ def _serve(descriptor: int) -> None:
     signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sys.setswitchinterval(0.0005)
+    raise_priority()
     end = socket.socket(fileno=descriptor)
     twin = end.dup()
 

@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 from drivers.arm.messages import (
+    UNANSWERED,
     Ended,
     Pace,
     Reply,
@@ -49,8 +50,14 @@ class ControlThread:
         self._program = ControlProgram(setup, control, latest)
         self._streaming = Streaming(setup, control, self._program, latest)
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        self._cause: End | None = None
         self.finished = threading.Event()
         threading.Thread(target=self._run, name="arm control", daemon=True).start()
+
+    def stop_because(self, code: str, text: str) -> None:
+        """Stop what moves; its motion then ends with this fault."""
+        self._cause = code, text
+        self.submit(Request(UNANSWERED, "stop"))
 
     def submit(self, request: Request) -> None:
         """Queue a request. A stop drops what waits and ends what runs."""
@@ -89,6 +96,7 @@ class ControlThread:
             case "stop":
                 self._program.to_stop.clear()
                 self._send(Reply(request.number, self._program.brake()))
+                self._cause = None
             case "close":
                 # Whoever never had the arm leaves it as it is.
                 if self._control is not None:
@@ -148,6 +156,8 @@ class ControlThread:
             self._end(motion, *(self._watch(before) or self._program.settled(missed)))
 
     def _end(self, motion: int, how: str, text: str, pace: Pace | None = None) -> None:
+        if how == "stopped" and self._cause is not None:
+            how, text = self._cause
         if how not in ("arrived", "contact", "stopped") and (problem := self._program.end()) is not None:
             text = "; ".join(filter(None, (text, problem[1])))
         self._send(Ended(motion, how, text, pace))

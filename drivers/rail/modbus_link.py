@@ -118,6 +118,8 @@ class ModbusLink:
 
     def read_stamped(self, address: int, count: int, *, input: bool = False) -> tuple[list[int], float, float]:
         """Read registers: values, host time of the middle of the round trip, round trip; in clock seconds."""
+        if self._last_words is not None:
+            self._last_words.require_unspoken("rail.owner_frozen")
         function = READ_INPUT if input else READ
         request = _frame(self._unit, function, *_words(address, count))
         data, stamp, round_trip = self._exchange(request, 5 + 2 * count, f"to read register {address:#06x}", None)

@@ -46,6 +46,9 @@ _USER_BANK = 2
 _FENCE_TYPE = 1
 """Axis parameter 1 is the position; that a module has no such global parameter does not matter."""
 
+_STOPS = (Command.MOTOR_STOP, Command.REFERENCE_SEARCH)
+"""Sent whatever happened before."""
+
 Answer = TypeVar("Answer")
 
 
@@ -206,6 +209,8 @@ class TmclLink:
                     raise NotConnectedError(self.name, "the rail was closed. Open it again")
                 if issued is not None and issued != self._stops:
                     raise Aborted(f"{self.name}: stopped before the command was sent")
+                if self._last_words is not None and request.command not in _STOPS:
+                    self._last_words.require_unspoken("rail.owner_frozen")
                 try:
                     return self._once(request, decode)
                 except TelegramError as error:

@@ -74,6 +74,10 @@ class AgilexLink:
         with self._bus.listening() as heard:
             yield heard
 
+    def require_unspoken(self) -> None:
+        """As `CanLink.require_unspoken`."""
+        self._bus.require_unspoken()
+
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
         self._bus.check()

@@ -115,6 +115,11 @@ class CanLink:
         if self._last_words is None:
             self._last_words = self._after_death(frames)
 
+    def require_unspoken(self) -> None:
+        """As `LastWords.require_unspoken`."""
+        if self._last_words is not None:
+            self._last_words.require_unspoken("vehicle.owner_frozen")
+
     def close(self) -> None:
         """End the receive thread and shut the bus down; idempotent."""
         if self._closing.is_set():

@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,10 @@ import pytest
 from arm_bench import ArmBench
 from cable import Cable
 
+from cell.devices.devices import Devices
+from cell.devices.gate import Gate
+from cell.devices.interlocks import Interlocks
+from cell.devices.stopping import require_healthy
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
@@ -508,6 +513,24 @@ def forward(joints):
         pose = pose * pin.SE3(pin.utils.rotate("z", angle), np.zeros(3))
         pose = pose * pin.SE3(pin.utils.rotate("x", alpha), np.array([a, 0.0, d]))
     return np.concatenate((pose.translation, pin.log3(pose.rotation)))
+
+
+def test_a_dead_link_to_the_arm_ends_what_another_device_does(arm, closes):
+    """While the rail sweeps nothing is commanded to the arm, and the sweep must not go on without it."""
+    devices = Devices(Clock(), Gate(Interlocks(lambda: None, ())), arm=arm)
+    require_healthy(devices)
+    os.kill(arm._session.link.pid, signal.SIGKILL)
+
+    def ails():
+        with suppress(DeviceFault):
+            require_healthy(devices)
+            return False
+        return True
+
+    assert soon(ails, 0.5)
+    with pytest.raises(DeviceFault) as caught:
+        require_healthy(devices)
+    assert caught.value.code == "arm.link_lost"
 
 
 def test_an_arm_of_another_model_is_refused_when_it_connects_and_nothing_moves():

@@ -1,7 +1,8 @@
-"""A process that is killed leaves nothing moving: by the simulated world's truth."""
+"""A process that is killed or frozen leaves nothing moving and no light on: by the simulated world's truth."""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import time
@@ -35,7 +36,7 @@ while True:
 MOVE = """
 rail = assembly.connect_one(config, "rail", clock)
 rail.home().wait(60.0)
-rail.move_to(0.09, 0.01)
+rail.move_to(0.09, 0.01).wait(60.0)
 clock.sleep(1e6)
 """
 SEARCH = """
@@ -43,6 +44,16 @@ rail = assembly.connect_one(config, "rail", clock)
 rail.home()
 clock.sleep(1e6)
 """
+LIT_ARM = """
+arm = assembly.connect_one(config, "arm", clock)
+laser = assembly.connect_one(config, "laser", clock, arm=arm)
+joints = arm.state().joints.copy()
+joints[0] += 2.0
+with laser.lit():
+    arm.move_joints(joints, 0.2, 1.0).wait(60.0)
+"""
+FROZEN = {DRIVE: "vehicle.owner_frozen", MOVE: "rail.owner_frozen", LIT_ARM: "arm.owner_frozen"}
+"""The fault that the process is told once it runs again."""
 
 
 @pytest.fixture(scope="module")
@@ -56,33 +67,44 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
         yield folder, endpoints
 
 
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 @pytest.mark.parametrize(
     ("script", "moving"),
     [
         (DRIVE, lambda truth: truth["vehicle"]["speed"] > 0.2),
         (SEARCH, lambda truth: truth["rail_moving"]),
         (MOVE, lambda truth: truth["rail_moving"] and truth["rail"]["carriage"] > 0.001),
+        (LIT_ARM, lambda truth: truth["arm"]["moving"] and truth["laser_on"]),
     ],
-    ids=["vehicle", "rail searching its switch", "rail"],
+    ids=["vehicle", "rail searching its switch", "rail", "arm and laser"],
 )
-def test_half_a_second_after_the_kill_nothing_moves(
-    serving: tuple[Path, dict[str, Any]], script: str, moving: Callable[[dict[str, Any]], bool]
+def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
+    serving: tuple[Path, dict[str, Any]],
+    script: str,
+    moving: Callable[[dict[str, Any]], bool],
+    how: signal.Signals,
 ) -> None:
     folder, endpoints = serving
-    # Someone may have been killed here before: the rail must not be on its way already.
+    # Someone may have been killed here before: nothing may be on its way already.
     assert not moving(ask(endpoints, op="truth")["truth"])
-    owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=folder)
+    owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=folder, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 60
         while not moving(ask(endpoints, op="truth")["truth"]):
             assert owner.poll() is None
             assert time.monotonic() < deadline
             Clock().sleep(0.02)
+        owner.send_signal(how)
+        Clock().sleep(0.5)
+        truth = ask(endpoints, op="truth")["truth"]
+        if how == signal.SIGSTOP and script in FROZEN:
+            owner.send_signal(signal.SIGCONT)
+            assert FROZEN[script] in owner.communicate(timeout=20)[1].splitlines()[-1]
     finally:
         owner.kill()
-        owner.wait(10)
-    Clock().sleep(0.5)
-    truth = ask(endpoints, op="truth")["truth"]
+        owner.communicate(timeout=10)
     assert truth["vehicle"]["stopped"]
     assert truth["vehicle"]["braked"] or script is not DRIVE
     assert not truth["rail_moving"]
+    assert not truth["arm"]["moving"]
+    assert not truth["laser_on"]

@@ -124,6 +124,10 @@ class CanopenBus:
         """As `CanLink.say_in_the_end`, by identifier and data."""
         self._link.say_in_the_end([_frame(identifier, data) for identifier, data in frames])
 
+    def require_unspoken(self) -> None:
+        """As `CanLink.require_unspoken`."""
+        self._link.require_unspoken()
+
     def close(self) -> None:
         """As `CanLink.close`."""
         self._link.close()

@@ -214,6 +214,7 @@ class CanopenVehicle:
         """
         speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
         yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        self._bus.require_unspoken()
         self._check(driving=True)
         with self._master.command:
             if self._master.stops:
