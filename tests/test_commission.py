@@ -22,7 +22,7 @@ from cell.devices.described import Described
 from cell.devices.direct import VirtualCell
 from cell.job import load_job
 from cell.vision import parse_board
-from drivers.errors import DeadlineError
+from drivers.errors import DeviceFault
 from tests.described_cells import described
 
 SEED = 3
@@ -127,13 +127,29 @@ def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it
     before = cell.world.rail.carriage(cell.clock.now())
     cell.rail.nudge(0.005, 0.005).wait(10.0)
     assert cell.world.rail.carriage(cell.clock.now()) - before == pytest.approx(-0.005, abs=1e-4)
-    with pytest.raises(DeadlineError):
+    with pytest.raises(DeviceFault, match=r"right limit switch tripped .* the motor turns the other way"):
         cell.rail.home().wait(10.0)
+    assert cell.world.rail.carriage(cell.clock.now()) < 0.1035  # short of the end stop
     right = VirtualCell(backwards, SEED, described=described)
     right.rail.nudge(0.005, 0.005).wait(10.0)
     assert right.world.rail.carriage(right.clock.now()) - before == pytest.approx(0.005, abs=1e-4)
     right.rail.home().wait(60.0)
     assert right.world.rail.carriage(right.clock.now()) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_limit_switches_that_are_exchanged_are_found_by_name_short_of_the_end_stop(tmp_path: Path) -> None:
+    files(tmp_path, same)
+    made, result = opened(tmp_path, Shown()), Result()
+    try:
+        simulated = made.desk.cell.simulated
+        assert isinstance(simulated, VirtualCell)
+        simulated.fault("rail.exchanged_switches")
+        by_name("rail_limits").work(made.desk, result)
+        (finding,) = result.findings
+        assert "left limit switch at the left end, measured that of the other end" in str(finding)
+        assert not simulated.world.rail.stalled(simulated.clock.now())
+    finally:
+        made.desk.close()
 
 
 def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_not_into_one_that_ships(

@@ -63,7 +63,10 @@ def test_the_door_without_wires_has_every_fault_but_those_of_a_wire() -> None:
     assert set(direct.NAMES) | set(direct.ON_WIRES) == set(FAULT_NAMES)
     for name in direct.NAMES:
         direct.require(name)
-    assert set(direct.ON_WIRES) == {"arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off"}
+    assert set(direct.ON_WIRES) == {
+        "arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off", "can.foreign_commands",
+        "can.second_vehicle",
+    }  # fmt: skip
     for name in direct.ON_WIRES:
         with pytest.raises(ValueError, match=r"fault of the wire.*use --clock wall"):
             direct.require(name)

@@ -8,7 +8,7 @@ from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.faults import driver_trouble, system_trouble
-from drivers.vehicle.feedback import CAN_MODE, Feedback
+from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, Feedback
 from drivers.vehicle.version import VersionAnswer
 
 
@@ -31,11 +31,13 @@ class Bench:
         )
         self.tell(0, 0)
 
-    def tell(self, left: int, right: int, bits: int = 0, mode: int = CAN_MODE, state: int = 0) -> None:
+    def tell(
+        self, left: int, right: int, bits: int = 0, mode: int = CAN_MODE, state: int = 0, speed: float = 0.0
+    ) -> None:
         """One round of cyclic messages, 20 ms after the last."""
         self.clock.time += 0.02
         self.feedback.take("Odometry", {"Left": left, "Right": right})
-        self.feedback.take("MotionState", {"Speed": 0.0, "YawRate": 0.0})
+        self.feedback.take("MotionState", {"Speed": speed, "YawRate": 0.0})
         self.feedback.take("SystemState", {"State": state, "Mode": mode, "BatteryVoltage": 26.0, "ErrorBits": bits})
 
     def interruption(self) -> tuple[int, str]:
@@ -140,11 +142,49 @@ def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(speed: float, yaw_rat
     bench = Bench()
     asked = bench.clock.time
     assert not bench.feedback.stands(asked)  # what was told before says nothing
-    bench.tell(0, 0)
+    for _ in range(STILL_FRAMES):
+        bench.tell(0, 0)
     assert bench.feedback.stands(asked)
     bench.clock.time += 0.02
     bench.feedback.take("MotionState", {"Speed": speed, "YawRate": yaw_rate})
     assert not bench.feedback.stands(asked)
+
+
+@pytest.mark.parametrize(("speeds", "way"), [((0.0, 0.2), 0), ((0.0, 0.0, 0.0, 0.2), 0), ((0.0,), 3), ((0.0,), -3)])
+def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(speeds: tuple[float, ...], way: int) -> None:
+    """Not by frames of standstill between others, and not while the wheels count on."""
+    bench = Bench()
+    bench.feedback.commanded_to_move()
+    bench.tell(0, 0, speed=0.2)
+    for k in range(24):
+        bench.tell(way * k, way * k, speed=speeds[k % len(speeds)])
+        assert not bench.feedback.stands(0.0)
+    for k in range(5):
+        bench.tell(way * 23 + k % 2, way * 23)
+    assert bench.feedback.stands(0.0)
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+@pytest.mark.parametrize(("other", "step"), [(12_000, 0), (0, 6), (-40, 6), (12_000, 6)])
+def test_two_series_of_counts_are_two_vehicles(other: int, step: int, every: int) -> None:
+    """Whether one stands beside the other or far off, and however seldom the second tells: within 0.5 s."""
+    bench = Bench()
+    bench.feedback.commanded_to_move()
+    with pytest.raises(DeviceFault, match="two vehicles report under the same identifiers") as met:
+        for k in range(25):
+            bench.tell(100 + step * k, 100 + step * k)
+            if k % every == 0:
+                bench.clock.time -= 0.02
+                bench.tell(100 + other, 100 + other)
+            bench.feedback.check(in_command=False, driving=False)
+    assert (met.value.code, met.value.recoverable) == ("vehicle.two_vehicles", False)
+    bench.feedback.acknowledge()  # while it goes on, nobody takes command
+    with pytest.raises(DeviceFault):
+        bench.feedback.require_one()
+    for _ in range(40):
+        bench.tell(100, 100)
+    bench.feedback.acknowledge()
+    bench.feedback.check(in_command=True, driving=True)
 
 
 def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault() -> None:

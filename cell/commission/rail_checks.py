@@ -193,6 +193,16 @@ def _switches(desk: Desk, result: Result, speed: float) -> None:
             _nudge(desk, way)
         except DeviceFault as fault:
             code = fault.code
+            if code == "rail.switches":
+                result.find(
+                    Finding(
+                        code, fault.message, f"the {name} limit switch at the {name} end", "that of the other end",
+                        "Swap the wires of the two limit switches at the module: as they are, neither stops the "
+                        "carriage before the end of the rail.",
+                    )
+                )  # fmt: skip
+                _nudge(desk, -way)
+                return
         state = rail.state()
         hit = state.left_switch if name == "left" else state.right_switch
         result.measure(

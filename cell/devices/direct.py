@@ -24,6 +24,7 @@ from drivers.arm.limits import ArmLimits
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import ConfigError
 from drivers.quantities import UNTOLD
+from drivers.rail.following import CarriageWatch
 from drivers.rail.timing import EvenMotion
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
@@ -123,6 +124,7 @@ def setup_of(config: CellConfig) -> Setup:
             rail.acceleration,
             reverses(rail),
             EvenMotion.of,
+            CarriageWatch,
             _serial(rail),
         ),
         VehicleSetup(

@@ -16,6 +16,7 @@ from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
 from drivers.interfaces import LONGEST_NUDGE_M, LinkStatistics
 from drivers.quantities import check_positive, check_range, shown
+from drivers.rail.following import CarriageWatch
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
 
@@ -113,6 +114,10 @@ class RailAxis(ABC):
         Where it was not begun `homed`, the zero is neither asked for nor given up.
         """
 
+    @abstractmethod
+    def _followed(self) -> tuple[float, bool, bool, Callable[[], bool]]:
+        """Position in m, left and right limit switch, and what asks for a stall: as `CarriageWatch` takes them."""
+
     # --- motions ---
 
     def home(self) -> RailMotion:
@@ -129,7 +134,7 @@ class RailAxis(ABC):
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=lambda: self._home_found(issued),
+                arrived=self._watched(lambda: self._home_found(issued), length),
                 halt=self._halt(issued),
                 duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
             )
@@ -165,7 +170,7 @@ class RailAxis(ABC):
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=self._arrival(goal, issued, [], homed=False),
+                arrived=self._watched(self._arrival(goal, issued, [], homed=False), None),
                 halt=self._halt(issued),
                 duration=move_duration(distance, speed, self._acceleration),
             )
@@ -268,6 +273,16 @@ class RailAxis(ABC):
         here = self._position()
         self._send(position, speed, issued)
         return move_duration(position - here, speed, self._acceleration), abs(position - here) / speed
+
+    def _watched(self, arrived: Callable[[], bool], length: float | None) -> Callable[[], bool]:
+        """`arrived`, with an eye on whether the carriage goes where it is sent."""
+        watch = CarriageWatch(self.name, self._clock, length)
+
+        def followed() -> bool:
+            watch(*self._followed())
+            return arrived()
+
+        return followed
 
     def _halt(self, issued: int) -> Callable[[], None]:
         def halt() -> None:

@@ -5,6 +5,8 @@ Positions in m from the reference switch. Limits are checked before anything is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, LimitError
 from drivers.interfaces import Identity, RailState, Reading
@@ -144,6 +146,10 @@ class ModbusRail(RailAxis):
 
     def _position(self) -> float:
         return self._drive.position()[1]
+
+    def _followed(self) -> tuple[float, bool, bool, Callable[[], bool]]:
+        says, registers = self._drive.says, self.registers
+        return self._position(), says(registers.left_switch), says(registers.right_switch), lambda: False
 
     def _require_zero(self) -> None:
         self._zero.require()

@@ -6,6 +6,8 @@ what was asked for.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError
 from drivers.interfaces import Identity, RailState, Reading
@@ -15,7 +17,7 @@ from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
-from drivers.rail.zero import ZeroMark
+from drivers.rail.zero import STALL_FLAG, ZeroMark
 
 
 class TmclRail(RailAxis):
@@ -123,6 +125,19 @@ class TmclRail(RailAxis):
 
     def _position(self) -> float:
         return self._link.get(Axis.POSITION) / self._counts
+
+    def _followed(self) -> tuple[float, bool, bool, Callable[[], bool]]:
+        link = self._link
+        left, right = (bool(link.get(switch)) for switch in (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH))
+        return self._position(), left, right, self._stalled
+
+    def _stalled(self) -> bool:
+        try:
+            return bool(self._link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG)
+        except CommandRefused as refused:
+            if refused.status == NO_SUCH_TYPE:
+                return False
+            raise
 
     def _require_zero(self) -> None:
         self._zero.require()

@@ -18,7 +18,7 @@ from drivers.rail.tmcl_link import TmclLink
 MARK_VARIABLE = 200
 """User variable that holds the mark: in RAM only."""
 _NONE, _SEARCHING = 0, 1
-_STALL_FLAG = 1
+STALL_FLAG = 1
 _HOME_SWITCH_MODES = range(5, 9)
 _MODE_BITS = 0x3F
 """Without the bits that swap the sides (64) and turn the home switch's polarity round (128)."""
@@ -53,7 +53,7 @@ class ZeroMark:
             )
             self._seen = not (
                 link.get(Axis.MICROSTEP_RESOLUTION) != microstep_resolution
-                or link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG
+                or link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG
                 or any(link.get(switch) for switch in switches)
             )
             if not self._seen:

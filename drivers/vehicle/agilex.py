@@ -78,6 +78,8 @@ class AgilexVehicle:
         self._interruptions = 0
         """How many there had been when the brake was commanded: one more, and it may have been released since."""
         self._stopping = 0
+        self._alarms = 0
+        """Those of others on the bus that this program has answered by the brake."""
         self._closed = threading.Event()
         self._open = partial(
             AgilexLink,
@@ -160,7 +162,10 @@ class AgilexVehicle:
             self._feedback.check(in_command=self._enabled, driving=driving)
         except DeviceFault as fault:
             if fault.code in OUT_OF_COMMAND:
-                self._enabled = False
+                with self._command:
+                    if self._enabled and self._feedback.alarms != self._alarms:
+                        self._brake_against_others()
+                    self._enabled = False
             raise
 
     def enable(self) -> None:
@@ -190,6 +195,7 @@ class AgilexVehicle:
                 self._link = self._open()
                 self.statistics.count("reopened")
                 self._feedback.interrupt("the CAN bus failed and was opened again")
+            self._alarms = self._feedback.alarms
         self._feedback.acknowledge()
         deadline = self._clock.now() + patience(self._clock, ENABLE_TIMEOUT_S)
         while True:
@@ -207,6 +213,7 @@ class AgilexVehicle:
                     self.name,
                     f"did not change to CAN mode within {ENABLE_TIMEOUT_S:.0f} s. Is the remote control in charge?",
                 )
+        self._feedback.require_one()
         with self._command:
             self._enabled = self._took_command = True
 
@@ -223,15 +230,23 @@ class AgilexVehicle:
         with self._command:
             if self._stopping:
                 raise Aborted(f"{self.name}: a stop is under way")
-            if self._braked or not self._enabled:
-                reason = "the brake is locked" if self._braked else "it is not under CAN command"
-                raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
-            self._velocity = (speed, yaw_rate)
-            self._renewed = self._clock.now()
-            self._send_velocity()
+            enabled = self._enabled
+            if enabled and not self._braked:
+                self._velocity = (speed, yaw_rate)
+                self._renewed = self._clock.now()
+                self._send_velocity()
+                return
+        if enabled:
+            # It may have been braked against another's commands since the check above: then that is the fault.
+            self.check()
+        reason = "the brake is locked" if enabled else "it is not under CAN command"
+        raise InterlockError(self.name, f"{reason}, so it would not move. Call enable() first")
 
     def stop(self) -> None:
-        """Command zero at once and wait until the vehicle reports standstill; `DeadlineError` after 4 s."""
+        """Command zero at once and wait until the vehicle reports standstill; `DeadlineError` after 4 s.
+
+        With feedback of two vehicles nobody knows: `DeviceFault`.
+        """
         with self._command:
             self._velocity = (0.0, 0.0)
             self._stopping += 1
@@ -239,12 +254,13 @@ class AgilexVehicle:
             asked = self._clock.now()
             with self._command:
                 self._send_velocity()
-            if not self._wait_for(partial(self._feedback.stands, asked), STOP_TIMEOUT_S):
+            if not self._wait_for(partial(self._feedback.stands_or_contradicts, asked), STOP_TIMEOUT_S):
                 self._link.check()
                 raise DeadlineError(
                     self.name,
                     f"did not report standstill within {STOP_TIMEOUT_S:.0f} s of the stop. Press its emergency stop",
                 )
+            self._feedback.require_one()
         finally:
             with self._command:
                 self._stopping -= 1
@@ -252,11 +268,15 @@ class AgilexVehicle:
     def brake(self) -> None:
         """Stop, wait for standstill and lock the brake; it stays locked until `enable()`.
 
-        The brake is locked also when standstill is not reported in time, which is raised afterwards.
+        The brake is locked also when standstill is not reported in time, which is raised afterwards. While somebody
+        else commands the vehicle it is locked first: it would not come to a standstill.
         """
         with self._command:
             self._stopping += 1
         try:
+            with self._command:
+                if self._feedback.contested:
+                    self._brake_against_others()
             self.stop()
         finally:
             # No drive() between the standstill and the brake.
@@ -285,11 +305,25 @@ class AgilexVehicle:
                 if self._velocity != (0.0, 0.0) and self._clock.now() - self._renewed > DEAD_MAN_S:
                     self._velocity = (0.0, 0.0)
                     self.statistics.count("dead_man")
-                if self._enabled and self._link.alive:
+                if (self._enabled or self._stopping) and self._link.alive:
                     try:
-                        self._send_velocity()
+                        if self._feedback.alarms != self._alarms:
+                            self._brake_against_others()
+                        elif self._enabled:
+                            self._send_velocity()
                     except CellError:
                         self.statistics.count("keep_alive_failed")
+
+    def _brake_against_others(self) -> None:
+        """Lock the brake at once, holding `_command`: against another's commands no zero leads to a standstill.
+
+        `state` tells of an unknown brake until `brake` or `enable`: another may have released it again.
+        """
+        self._velocity, self._braked = (0.0, 0.0), True
+        self._alarms = self._feedback.alarms
+        self._send_velocity()
+        self._link.send("BrakeCommand", Locked=1)
+        self.statistics.count("braked_against_others")
 
     def _send_velocity(self) -> None:
         """Send the set velocity, holding `_command`: else an older velocity could follow the zero of a stop."""

@@ -33,8 +33,8 @@ _DRIVER = {
 }
 _DRIVER_WORKING = 0x40 | 0x80
 """Enabled and reset: states, no faults."""
-OUT_OF_COMMAND = ("vehicle.command_lost", "vehicle.disturbed")
-"""Codes of the faults that mean that somebody else is in charge."""
+OUT_OF_COMMAND = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.two_vehicles")
+"""Codes of the faults that mean that somebody else is in charge, or may be."""
 
 
 def system_trouble(bits: int, *, commanded: bool) -> tuple[str, ...]:
@@ -111,6 +111,17 @@ def disturbed(name: str, what: str) -> DeviceFault:
         what,
         recoverable=False,
         hint="Find out who else commands or pushes the vehicle and end it, then run the job again.",
+    )
+
+
+def two_vehicles(name: str, what: str) -> DeviceFault:
+    """The fault of feedback that contradicts itself: nobody knows which vehicle it tells of."""
+    return DeviceFault(
+        name,
+        "vehicle.two_vehicles",
+        f"{what}. Its motion and its standstill are not known",
+        recoverable=False,
+        hint="Take the other vehicle off the CAN bus, or give it identifiers of its own, then run the job again.",
     )
 
 

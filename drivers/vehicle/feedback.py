@@ -16,6 +16,7 @@ from drivers.vehicle.faults import (
     no_feedback,
     system_trouble,
     system_warnings,
+    two_vehicles,
     vehicle_error,
 )
 from drivers.vehicle.travel import Travel
@@ -39,6 +40,11 @@ _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
 STILL = 0.0035
 """Reported speeds up to this, m/s and rad/s, count as standstill: at rest they waver by three steps of the protocol."""
+
+STILL_FRAMES = 4
+"""A stop is confirmed by so many frames in a row that all say so: of two vehicles that report, one may stand."""
+_CREPT = 2
+"""Counts in mm that an odometer may go on while the speed says standstill: one of noise, one of rounding."""
 
 
 def patience(clock: Clock, seconds: float) -> float:
@@ -66,6 +72,9 @@ class Feedback:
         self._newest: dict[str, tuple[float, dict[str, float]]] = {}
         self._quiet = 0.0
         self._version = VersionAnswer()
+        self._still = 0
+        """Frames in a row that say standstill."""
+        self._still_at: tuple[float, float] | None = None
 
     def take(self, message: str, signals: dict[str, float]) -> None:
         """Keep a message that has just come in, and count odometry on."""
@@ -77,6 +86,15 @@ class Feedback:
                 self._quiet = 0.0
             if message == "Odometry":
                 self._travel.count(now, int(signals["Left"]), int(signals["Right"]))
+                counts = signals["Left"], signals["Right"]
+                self._still_at = self._still_at or counts
+                if max(abs(a - b) for a, b in zip(counts, self._still_at, strict=True)) > _CREPT:
+                    self._still, self._still_at = 0, counts
+            elif message == "MotionState":
+                if max(abs(signals["Speed"]), abs(signals["YawRate"])) <= STILL:
+                    self._still += 1
+                else:
+                    self._still, self._still_at = 0, None
             elif message == "MotionCommand" and (signals["Speed"] or signals["YawRate"]):
                 self._travel.disturb("somebody else on the CAN bus commands it to move")
             elif message == "BrakeCommand" and not signals["Locked"]:
@@ -105,6 +123,24 @@ class Feedback:
         """How often odometry lost its connection to where the vehicle was before."""
         with self._news:
             return self._travel.interruptions
+
+    @property
+    def alarms(self) -> int:
+        """How often somebody else commanded or moved the vehicle, or was taken for it."""
+        with self._news:
+            return self._travel.alarms
+
+    @property
+    def contested(self) -> bool:
+        """Whether somebody else commands or moves the vehicle, or is taken for it, and nobody has acknowledged that."""
+        with self._news:
+            return bool(self._travel.disturbance or self._travel.two_vehicles)
+
+    def require_one(self) -> None:
+        """Raise the `DeviceFault` of two vehicles that report under the same identifiers."""
+        with self._news:
+            if what := self._travel.two_vehicles:
+                raise two_vehicles(self._name, what)
 
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what others did before."""
@@ -158,9 +194,13 @@ class Feedback:
         return self.newer("SystemState", since) and system["Mode"] == CAN_MODE and fit
 
     def stands(self, since: float) -> bool:
-        """True when the vehicle has reported standstill after host time `since`."""
-        motion = self._newest["MotionState"][1]
-        return self.newer("MotionState", since) and max(abs(motion["Speed"]), abs(motion["YawRate"])) <= STILL
+        """True when the vehicle has reported standstill after host time `since`, and nothing contradicts that."""
+        news = self.newer("MotionState", since) and self.newer("Odometry", since)
+        return news and self._still >= STILL_FRAMES
+
+    def stands_or_contradicts(self, since: float) -> bool:
+        """As `stands`; True also when two vehicles report, of which nobody can tell."""
+        return bool(self._travel.two_vehicles) or self.stands(since)
 
     def state(self, max_age: float, braked: bool | None) -> VehicleState:
         """All as one record; `DeadlineError` when it is older than `max_age` s.
@@ -200,7 +240,8 @@ class Feedback:
         )
 
     def check(self, *, in_command: bool, driving: bool) -> None:
-        """Raise the `DeviceFault` that the feedback shows: vehicle.silent, vehicle.emergency_stop, vehicle.error.
+        """Raise the `DeviceFault` that the feedback shows: vehicle.two_vehicles, vehicle.silent,
+        vehicle.emergency_stop, vehicle.error.
 
         With `in_command` also vehicle.command_lost and vehicle.disturbed: nobody else may command what this program
         has enabled. One who is `driving` must have heard of it lately. For a vehicle that stands it is enough that the
@@ -211,6 +252,7 @@ class Feedback:
             system, disturbance = self._newest["SystemState"][1], self._travel.disturbance
             trouble = self._trouble(commanded=in_command)
             quiet = self._quiet
+            self.require_one()
         silent = self._clock.now() - oldest
         if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
             raise no_feedback(self._name, f"no feedback for {silent:.2f} s ({which} came last before that)")

@@ -31,7 +31,7 @@ class PlanarOdometry:
         last, self._last = self._last, (left, right)
         if last is None:
             return True
-        way_left, way_right = (self._unit * _difference(new, old) for new, old in zip((left, right), last, strict=True))
+        way_left, way_right = (self._unit * difference(new, old) for new, old in zip((left, right), last, strict=True))
         if max(abs(way_left), abs(way_right)) > farthest:
             return False
         way = 0.5 * (way_left + way_right)
@@ -43,5 +43,6 @@ class PlanarOdometry:
         return True
 
 
-def _difference(new: int, old: int) -> int:
+def difference(new: int, old: int) -> int:
+    """Counts from `old` to `new`, the shorter way round of a counter of 32 bits."""
     return (new - old + _HALF) % _SPAN - _HALF

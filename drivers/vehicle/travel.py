@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 from drivers.clock import Clock
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.odometry import PlanarOdometry
+from drivers.vehicle.odometry import PlanarOdometry, difference
 
 REST_AFTER_S = 4.0
 """After its last command to move the vehicle stands within this."""
@@ -14,13 +15,18 @@ STANDS_M = 0.005
 """A side that counts more than this without a command has been moved by somebody else."""
 _JUMP_M = 0.05
 """What a side may count from one reading to the next besides what it can have driven: readings come in bursts."""
+_SWING_M = 0.003
+"""A side that counts more than this ahead and as much back from one reading to the next makes a swing."""
+SWINGS = 3
+"""So many swings within `_SWINGS_S` are two vehicles: no wheel turns back and forth at 20 ms."""
+_SWINGS_S = 0.5
 
 
 class Travel:
     """Odometry of two sides whose counters are signed 32-bit numbers of `unit` m, and what interrupted it.
 
-    `disturbance` says how somebody else moved or commanded the vehicle, until `acknowledge`. Not safe between threads:
-    whoever holds it locks.
+    `disturbance` says how somebody else moved or commanded the vehicle, until `acknowledge`; `alarms` counts how often
+    that happened. Not safe between threads: whoever holds it locks.
     """
 
     def __init__(
@@ -46,6 +52,12 @@ class Travel:
         self.interruption = ""
         """Why it did last."""
         self.disturbance = ""
+        self.two_vehicles = ""
+        """How the counts show two vehicles under the same identifiers; kept until it has passed and is acknowledged."""
+        self.alarms = 0
+        self._counts: tuple[int, int] | None = None
+        self._ways = (0, 0)
+        self._swings: deque[float] = deque(maxlen=SWINGS)
 
     @property
     def driven(self) -> bool:
@@ -59,6 +71,8 @@ class Travel:
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what others did before."""
         self.disturbance, self._rest = "", None
+        if not self._swings_now():
+            self.two_vehicles = ""
 
     def interrupt(self, why: str) -> None:
         """From now on odometry does not tell where the vehicle is relative to where it was before."""
@@ -68,10 +82,37 @@ class Travel:
     def disturb(self, what: str) -> None:
         """Somebody else commands or moves the vehicle."""
         self.disturbance = what
+        self.alarms += 1
         self.interrupt(what)
+
+    def _look_for_swings(self, now: float, left: int, right: int) -> None:
+        last, self._counts = self._counts or (left, right), (left, right)
+        ways = (difference(left, last[0]), difference(right, last[1]))
+        swings = (
+            b * a < 0 and min(abs(b), abs(a)) * self._unit > _SWING_M for a, b in zip(ways, self._ways, strict=True)
+        )
+        if any(swings):
+            self._swings.append(now)
+            if self._swings_now() and not self.two_vehicles:
+                first, second = (
+                    [f"{1e3 * self._unit * count:.0f}" for count in counts] for counts in (last, self._counts)
+                )
+                self.two_vehicles = (
+                    f"the odometers jump between two series of counts, left and right {' and '.join(first)} mm, then "
+                    f"{' and '.join(second)} mm: two vehicles report under the same identifiers"
+                )
+                self.alarms += 1
+                self.interrupt(self.two_vehicles)
+        if any(ways):
+            self._ways = ways
+
+    def _swings_now(self) -> bool:
+        recent = self._clock.now() - _SWINGS_S * max(1.0, self._clock.rate)
+        return len(self._swings) == SWINGS and self._swings[0] > recent
 
     def count(self, now: float, left: int, right: int) -> None:
         """Take a reading of both counters at host time `now`."""
+        self._look_for_swings(now, left, right)
         before = now if math.isnan(self._counted) else self._counted
         self._counted = now
         # It has driven no longer than since its last reading, and only until it came to rest after its last command.

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sim_backends.faults import ARM_FAULTS, CAMERA_FAULTS, FAULT_NAMES, TARGET_CAMERA_FAULTS
+from sim_backends.models.rail import FAULTS as RAIL_MODEL_FAULTS
 from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
 
 if TYPE_CHECKING:
     from sim_backends.direct.cell import DirectCell
 
-RAIL_FAULTS = ("rail.reset",)
+RAIL_FAULTS = ("rail.reset", *RAIL_MODEL_FAULTS)
 NAMES = (*ARM_FAULTS, *RAIL_FAULTS, *VEHICLE_FAULTS, *CAMERA_FAULTS, *TARGET_CAMERA_FAULTS)
 ON_WIRES = tuple(name for name in FAULT_NAMES if name not in NAMES)
 """Faults of a wire: of a reply, or of a bus."""
@@ -31,6 +32,7 @@ def clear(cell: DirectCell) -> None:
     """Take away all causes of faults, as a person would: buttons are released, motors are well again."""
     cell.world.arm.clear()
     cell.world.vehicle.clear(cell.clock.now())
+    cell.world.rail.clear(cell.clock.now())
 
 
 def cause(cell: DirectCell, name: str) -> None:
@@ -38,6 +40,8 @@ def cause(cell: DirectCell, name: str) -> None:
     require(name)
     if name in ARM_FAULTS:
         cell.world.arm.fault(name.removeprefix("arm."))
+    elif name in RAIL_MODEL_FAULTS:
+        cell.world.rail.fault(name, cell.clock.now())
     elif name in RAIL_FAULTS:
         cell.rail.reset()
     elif name in VEHICLE_FAULTS:

@@ -93,11 +93,19 @@ class ArmSetup:
     safe_off: tuple[int, ...]
 
 
+class CarriageWatch(Protocol):
+    """Whether the carriage goes where it is sent."""
+
+    def __call__(self, position: float, left: bool, right: bool, stalled: Callable[[], bool]) -> None:
+        """Judge a reading: position in m, both limit switches, and what asks for a stall; raises `DeviceFault`."""
+
+
 @dataclass(frozen=True)
 class RailSetup:
     """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round; `even` fits a sweep from times,
     positions and round trips (n,) each.
 
+    `watch` takes the rail's name, its clock and its travel in m, None for a nudge.
     `serial` is the number by which the cell knows it; None where it tells its own.
     """
 
@@ -109,6 +117,7 @@ class RailSetup:
     acceleration: float
     reversed: bool
     even: Callable[[Vector, Vector, Vector], EvenMotion]
+    watch: Callable[[str, Any, float | None], CarriageWatch]
     serial: str | None = None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState
 from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import RailSetup, within
+from sim_backends.direct.product import CarriageWatch, RailSetup, within
 from sim_backends.direct.rail_motion import POLL_S, DirectSweep, RailMove
 from sim_backends.models.rail import RailModel
 
@@ -93,7 +93,7 @@ class DirectRail:
         self._set_up()
         self._homed = self._lost = False
         self.model.search(self.clock.now())
-        self._motion = RailMove(self, None)
+        self._motion = RailMove(self, None, self._watch(self.travel[1] - self.travel[0]))
         return self._motion
 
     def move_to(self, position: float, speed: float | None = None) -> RailMove:
@@ -110,7 +110,7 @@ class DirectRail:
         now = self.clock.now()
         target = self.model.position(now) + round(distance * self._counts)
         self._send(target, self._checked(speed))
-        self._motion = RailMove(self, target)
+        self._motion = RailMove(self, target, self._watch(None))
         return self._motion
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
@@ -173,6 +173,9 @@ class DirectRail:
         self.model.reset(self.clock.now())
 
     # --- inside ---
+
+    def _watch(self, length: float | None) -> CarriageWatch:
+        return self.setup.watch(self.name, self.clock, length)
 
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import Vector
-from sim_backends.direct.product import EvenMotion
+from sim_backends.direct.product import CarriageWatch, EvenMotion
 
 if TYPE_CHECKING:
     from sim_backends.direct.rail import DirectRail
@@ -19,10 +19,11 @@ STANDSTILL_S = 0.5
 
 
 class RailMove:
-    """A motion of the rail to `target` in counts, or to its home switch (None)."""
+    """A motion of the rail to `target` in counts, or to its home switch (None), with an eye of `watch` on it."""
 
-    def __init__(self, rail: DirectRail, target: int | None) -> None:
+    def __init__(self, rail: DirectRail, target: int | None, watch: CarriageWatch | None = None) -> None:
         self._rail = rail
+        self._watch = watch
         self._target = target
         self._issued = rail.stops
         self._begun = self._moved = rail.clock.now()
@@ -66,6 +67,9 @@ class RailMove:
             self._end(rail.reset_fault("in its motion"))
         elif rail.stops != self._issued:
             self._end(Aborted(f"{rail.name}: stopped at {1e3 * rail.counted(now):.3f} mm before its target"))
+        elif (fault := self._seen(now)) is not None:
+            rail.stop()
+            self._end(fault)
         elif self._target is None:
             if not model.searching(now) and model.velocity(now) == 0:
                 rail.found_zero()
@@ -76,6 +80,17 @@ class RailMove:
             self._last, self._moved = position, now
         elif now - self._moved > STANDSTILL_S and model.velocity(now) == 0:
             self._end(self._failure(now))
+
+    def _seen(self, now: float) -> DeviceFault | None:
+        rail, model = self._rail, self._rail.model
+        if self._watch is None:
+            return None
+        try:
+            switches = model.left_switch(now), model.right_switch(now)
+            self._watch(rail.counted(now), *switches, lambda: model.stalled(now))
+        except DeviceFault as fault:
+            return fault
+        return None
 
     def _failure(self, now: float) -> DeviceFault:
         rail, model = self._rail, self._rail.model

@@ -17,17 +17,23 @@ from sim_backends.models.rail_settings import RailParams, RailSettings
 
 __all__ = ["RailModel", "RailParams", "RailSettings"]
 
+EXCHANGED, LOST_STEPS = "rail.exchanged_switches", "rail.lost_steps"
+FAULTS = (EXCHANGED, LOST_STEPS)
+_LOST = 0.10
+"""Share of the steps that a motor with `LOST_STEPS` loses, as the counter goes on."""
 _KEEP = 30.0
 _BACK_OFF = 0.0005
 
 
 @dataclass(frozen=True)
 class _Leg:
-    """One piece of the time line with the nut's place at its start and the motor turn that the counter calls zero."""
+    """One piece of the time line with the nut's place at its start, the motor turn that the counter calls zero, and
+    what it counts in a turn."""
 
     piece: ramp.Piece
     nut: float
     zero: float
+    steps: float
     searching: bool
 
 
@@ -39,13 +45,14 @@ class RailModel:
         self.params = params
         self.settings = RailSettings()
         self._rng = rng
+        self._faults: set[str] = set()
         self._lock = threading.RLock()
         self._edge = 0.0
         self._switch_distance = 0
         self._stalled_at: float | None = None
         motor = params.screw.nut(params.start)
         self._zero = motor
-        self._legs = [_Leg(ramp.Piece(0.0, motor, 0.0, 0.0), motor, motor, False)]
+        self._legs = [_Leg(ramp.Piece(0.0, motor, 0.0, 0.0), motor, motor, self._signed_steps(), False)]
         self._target = 0
         self._target_velocity = 0
         self._positioning = False
@@ -64,13 +71,13 @@ class RailModel:
         """Step counter in microsteps."""
         with self._lock:
             leg = self._leg(t)
-            return round((leg.piece.at(max(t, leg.piece.t))[0] - leg.zero) * self._signed_steps())
+            return round((leg.piece.at(max(t, leg.piece.t))[0] - leg.zero) * leg.steps)
 
     def velocity(self, t: float) -> int:
         """Present velocity in microsteps per second."""
         with self._lock:
             leg = self._leg(t)
-            return round(leg.piece.at(max(t, leg.piece.t))[1] * self._signed_steps())
+            return round(leg.piece.at(max(t, leg.piece.t))[1] * leg.steps)
 
     def target(self) -> int:
         """Target of the last positioning in microsteps."""
@@ -88,12 +95,12 @@ class RailModel:
             return self.velocity(t) == 0 and self.position(t) == self._target and not self.searching(t)
 
     def left_switch(self, t: float) -> bool:
-        """State of the left limit switch."""
-        return self.carriage(t) <= self.params.switches[0] + self._edge + 1e-9
+        """State of the input of the left limit switch."""
+        return self._at_switch(t, 1 if EXCHANGED in self._faults else 0)
 
     def right_switch(self, t: float) -> bool:
-        """State of the right limit switch."""
-        return self.carriage(t) >= self.params.switches[1] + self._edge - 1e-9
+        """State of the input of the right limit switch."""
+        return self._at_switch(t, 0 if EXCHANGED in self._faults else 1)
 
     def home_switch(self, t: float) -> bool:
         """State of the home switch: active from its edge at 0 to the left end."""
@@ -118,6 +125,19 @@ class RailModel:
         """Microsteps between the switches as found by the last search of mode 2, else 0."""
         with self._lock:
             return self._switch_distance
+
+    def fault(self, name: str, t: float) -> None:
+        """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps.
+
+        Raises ValueError for a name that is not in `FAULTS`.
+        """
+        if name not in FAULTS:
+            raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
+        self._have(t, self._faults | {name})
+
+    def clear(self, t: float) -> None:
+        """Take away both faults; steps that were lost stay lost."""
+        self._have(t, set())
 
     # --- commands ---
 
@@ -176,9 +196,12 @@ class RailModel:
             self._target, self._target_velocity, self._positioning = 0, 0, False
             legs = ramp.to_velocity(t, x, v, 0.0, self._acceleration())
             if self.backwards:
-                self._search_in_vain(legs)
+                self._search_in_vain(legs, +1)
                 return
             mode = self.settings.search_mode
+            if EXCHANGED in self._faults and mode not in (5, 7):
+                self._search_in_vain(legs, -1 if mode == 1 else +1)
+                return
             right = self._motor(self.params.switches[1], +1)
             if mode in (2, 3, 6):
                 legs = self._run(legs, right, self.settings.search_speed)
@@ -205,18 +228,40 @@ class RailModel:
         """Whether the motor turns against what the controller counts."""
         return self.params.reversed != self.settings.reverse_shaft
 
-    def _steps(self) -> int:
-        return self.params.steps_per_turn << self.settings.microsteps
+    def _at_switch(self, t: float, side: int) -> bool:
+        """Whether the carriage is at the limit switch that sits at the left (0) or right (1) end."""
+        edge = self.params.switches[side] + self._edge
+        return self.carriage(t) >= edge - 1e-9 if side else self.carriage(t) <= edge + 1e-9
 
-    def _signed_steps(self) -> int:
+    def _have(self, t: float, faults: set[str]) -> None:
+        """Have these faults from `t` on: the counter keeps its value, and what runs goes on."""
+        with self._lock:
+            count, searching, speed = self.position(t), self.searching(t), self.velocity(t)
+            x, v = self._begin(t)
+            self._faults = faults
+            self._zero = x - count / self._signed_steps()
+            self._append([ramp.Piece(t, x, v, 0.0)], searching=False)
+            if searching:
+                self.search(t)
+            elif self._positioning and speed:
+                self.move_to(t, self._target)
+            elif speed:
+                self.rotate(t, self._target_velocity)
+
+    def _steps(self) -> float:
+        """What the counter counts while the motor turns once: more where it loses steps."""
+        steps = self.params.steps_per_turn << self.settings.microsteps
+        return steps / (1.0 - _LOST) if LOST_STEPS in self._faults else steps
+
+    def _signed_steps(self) -> float:
         return -self._steps() if self.backwards else self._steps()
 
-    def _search_in_vain(self, legs: list[ramp.Piece]) -> None:
-        """Away from the switch that it looks for, up to the mechanical end, where it goes on searching."""
-        end = self.params.screw.motor(self.params.ends[1], +1)
-        start = legs[-1]
-        way = ramp.to_velocity(start.t, start.x, 0.0, self.settings.search_speed / self._steps(), self._acceleration())
-        pieces, self._stalled_at = ramp.clip(legs[:-1] + way, end, +1)
+    def _search_in_vain(self, legs: list[ramp.Piece], direction: int) -> None:
+        """Past or away from the switch that it looks for, up to the mechanical end, where it goes on searching."""
+        end = self.params.screw.motor(self.params.ends[(direction + 1) // 2], direction)
+        start, speed = legs[-1], direction * self.settings.search_speed / self._steps()
+        way = ramp.to_velocity(start.t, start.x, 0.0, speed, self._acceleration())
+        pieces, self._stalled_at = ramp.clip(legs[:-1] + way, end, direction)
         self._append(pieces, searching=True)
 
     def _acceleration(self) -> float:
@@ -251,7 +296,7 @@ class RailModel:
         nut = self._nut(leg, t)
         self._zero = leg.zero
         self._legs = self._legs[max(0, first - 1) : keep]
-        self._legs.append(_Leg(ramp.Piece(t, x, v, 0.0), nut, leg.zero, False))
+        self._legs.append(_Leg(ramp.Piece(t, x, v, 0.0), nut, leg.zero, leg.steps, False))
         return x, v
 
     def _follow(self, pieces: list[ramp.Piece]) -> None:
@@ -259,7 +304,7 @@ class RailModel:
         for direction, enabled in ((-1, self.settings.left_stop), (+1, self.settings.right_stop)):
             side = (direction + 1) // 2
             # A limit switch stops the direction that the controller believes to lead to it.
-            if enabled and not self.backwards:
+            if enabled and not self.backwards and EXCHANGED not in self._faults:
                 pieces = self._stop_at(pieces, self._motor(self.params.switches[side], direction), direction)
             end = self.params.screw.motor(self.params.ends[side], direction)
             pieces, stalled = ramp.clip(pieces, end, direction)
@@ -290,4 +335,4 @@ class RailModel:
             if last.piece.t == piece.t:
                 self._legs.pop()
                 nut = last.nut
-            self._legs.append(_Leg(piece, nut, self._zero, searching))
+            self._legs.append(_Leg(piece, nut, self._zero, self._signed_steps(), searching))

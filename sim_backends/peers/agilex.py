@@ -12,13 +12,15 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
 from sim_backends.models.vehicle import Feedback, Mode, VehicleModel, VehicleParams
 from sim_backends.peers.slcan import CanFrame, SlcanBus
 
-FAULTS = ("can.bus_off", *VEHICLE_FAULTS)
+FOREIGN, SECOND = "can.foreign_commands", "can.second_vehicle"
+FAULTS = ("can.bus_off", FOREIGN, SECOND, *VEHICLE_FAULTS)
 
 MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY = 0x211, 0x221, 0x291, 0x311, 0x361
@@ -28,6 +30,10 @@ MOTOR_MOTION, MOTOR_DRIVER = 0x251, 0x261
 _TICK = 0.005
 _FAST, _SLOW = 0.005, 0.020
 _DRIVER_ENABLED = 0x40
+_FOREIGN_FRAME = struct.pack(">hhhh", 200, 0, 0, 0)
+"""What somebody else on the bus commands: 0.2 m/s ahead."""
+_SECOND_AT_M = (12.0, 11.5)
+"""Odometers, left and right, of the second vehicle, which stands."""
 _SIDES = (1, -1, -1, 1)
 """Motors 1…4 are right front, left front, left rear, right rear: +1 right, −1 left."""
 
@@ -50,6 +56,8 @@ class AgilexPeer:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
         self._count = 0
+        self._others: set[str] = set()
+        """`FOREIGN` and `SECOND`, while they are on the bus."""
         self._schedule = [_Cyclic(identifier, *entry) for identifier, entry in _CYCLES.items()]
 
     @property
@@ -70,19 +78,24 @@ class AgilexPeer:
         self._bus.stop()
 
     def fault(self, name: str) -> None:
-        """`can.bus_off`: the adapters drop out and have to be opened again; the others are the vehicle's own.
+        """`can.bus_off`: the adapters drop out and have to be opened again. Until `clear`, `can.foreign_commands` is
+        somebody else who commands 0.2 m/s ahead, `can.second_vehicle` another vehicle that stands and reports under the
+        same identifiers. The others are the vehicle's own.
 
         Raises ValueError for a name that is not in `FAULTS`.
         """
         if name == "can.bus_off":
             self._bus.drop()
+        elif name in (FOREIGN, SECOND):
+            self._others.add(name)
         elif name in VEHICLE_FAULTS:
             self.model.fault(name, self._clock.now())
         else:
             raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(FAULTS)}")
 
     def clear(self) -> None:
-        """Take away the vehicle's faults."""
+        """Take away the vehicle's faults, and others from the bus."""
+        self._others.clear()
         self.model.clear(self._clock.now())
 
     def _run(self) -> None:
@@ -97,8 +110,21 @@ class AgilexPeer:
                 if cyclic.due(t, time.monotonic()):
                     self._count = (self._count + 1) & 0xFF
                     frames.append(CanFrame(cyclic.id, cyclic.encode(feedback, self.model.params, self._count)))
+                    frames += self._of_others(cyclic, feedback)
             if frames:
                 self._bus.send(frames)
+
+    def _of_others(self, cyclic: _Cyclic, feedback: Feedback) -> list[CanFrame]:
+        """What others put on the bus beside this frame of the vehicle's."""
+        frames = []
+        if SECOND in self._others and cyclic.id in (SYSTEM_STATE, MOTION_STATE, ODOMETRY):
+            left, right = _SECOND_AT_M
+            second = replace(feedback, speed=0.0, yaw_rate=0.0, left=left, right=right)
+            frames.append(CanFrame(cyclic.id, cyclic.encode(second, self.model.params, self._count)))
+        if FOREIGN in self._others and cyclic.id == MOTION_STATE:
+            frames.append(CanFrame(MOTION_COMMAND, _FOREIGN_FRAME))
+            self._receive(frames[-1])
+        return frames
 
     def _receive(self, frame: CanFrame) -> None:
         if frame.extended or frame.remote or not frame.data:

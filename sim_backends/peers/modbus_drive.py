@@ -21,10 +21,11 @@ from pymodbus.pdu.register_message import (
 )
 
 from sim_backends.clock import WorldClock
+from sim_backends.models.rail import FAULTS as RAIL_FAULTS
 from sim_backends.models.rail import RailModel
 from sim_backends.peers.serial_port import SerialServer
 
-FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset")
+FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset", *RAIL_FAULTS)
 LATE_S = 0.2
 """Wall seconds by which `rail.late_reply` delays every reply."""
 SEARCH_RPM, CREEP_RPM = 600.0, 120.0
@@ -50,6 +51,14 @@ class ModbusDrive:
             if (entry := self._map[name]) is not None:
                 self._writable |= set(range(entry["address"], entry["address"] + entry["words"]))
         self._power_on()
+
+    def fault(self, name: str) -> None:
+        """Cause a fault of the rail's own."""
+        self.rail.fault(name, self._clock.now())
+
+    def clear(self) -> None:
+        """Take the rail's own faults away."""
+        self.rail.clear(self._clock.now())
 
     def reset(self) -> None:
         """Start anew, as after a loss of power: the drive has forgotten its zero and what was written to it."""
@@ -204,11 +213,12 @@ class ModbusPeer(SerialServer):
             case "rail.reset":
                 self.drive.reset()
             case _:
-                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
+                self.drive.fault(name)
 
     def clear(self) -> None:
         """Take away all faults; a drive that was reset stays so."""
         self._drop, self._late = 0, False
+        self.drive.clear()
 
     def _hear(self, data: bytes, write: Callable[[bytes], object]) -> bytes:
         used, request = self._framer.handleFrame(data, 0, 0)

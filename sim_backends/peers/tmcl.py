@@ -9,11 +9,12 @@ import threading
 from collections.abc import Callable
 
 from sim_backends.clock import WorldClock
+from sim_backends.models.rail import FAULTS as RAIL_FAULTS
 from sim_backends.models.rail import RailModel
 from sim_backends.peers.serial_port import SerialServer
 from sim_backends.peers.tmcl_module import TmclModule
 
-FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset")
+FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset", *RAIL_FAULTS)
 LATE_S = 0.2
 """Wall seconds by which `rail.late_reply` delays every reply."""
 _REQUEST = 9
@@ -33,7 +34,8 @@ class TmclPeer(SerialServer):
         """Cause a fault of `FAULTS`; ValueError for another name.
 
         `rail.drop_reply`: the next request is carried out, but its reply is lost. `rail.late_reply`: from now on every
-        reply comes `LATE_S` after its request was carried out. `rail.reset`: the module starts anew.
+        reply comes `LATE_S` after its request was carried out. `rail.reset`: the module starts anew. The others
+        are the rail's own.
         """
         match name:
             case "rail.drop_reply":
@@ -44,13 +46,14 @@ class TmclPeer(SerialServer):
             case "rail.reset":
                 self.module.reset()
             case _:
-                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
+                self.module.fault(name)
 
     def clear(self) -> None:
         """Take away all faults; a module that was reset stays so."""
         with self._lock:
             self._drop = 0
         self._late = False
+        self.module.clear()
 
     def _hear(self, data: bytes, write: Callable[[bytes], object]) -> bytes:
         while len(data) >= _REQUEST:

@@ -92,6 +92,14 @@ class TmclModule:
             for kind, value in self._stored.items():
                 self._set_axis(kind, 0, value)
 
+    def fault(self, name: str) -> None:
+        """Cause a fault of the rail's own."""
+        self.rail.fault(name, self._clock.now())
+
+    def clear(self) -> None:
+        """Take the rail's own faults away."""
+        self.rail.clear(self._clock.now())
+
     def handle(self, request: bytes) -> bytes | None:
         """The reply to nine bytes, or None when they are addressed to another module."""
         address, command, kind, motor, value, checksum = struct.unpack(">BBBBiB", request)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import re
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,6 +66,7 @@ def connect(
     address: int = 1,
     control: bool = True,
     reversed: bool = False,
+    reference_mode: int = 5,
 ) -> TmclRail:
     return TmclRail(
         "rail",
@@ -76,6 +79,7 @@ def connect(
         acceleration=ACCELERATION,
         address=address,
         motor=0,
+        reference_mode=reference_mode,
         reversed=reversed,
         control=control,
         clock=clock,
@@ -738,6 +742,41 @@ def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(ho
     assert not looking.state().homed
     looking.close()
     assert homed.model.settings.microsteps == 7
+
+
+@pytest.mark.parametrize(
+    ("params", "fault", "mode", "told", "longest"),
+    [
+        ({"reversed": True, "start": 0.08}, "", 5, "rail.switches: .*the right limit switch tripped .* sent left", 3.0),
+        ({"start": 0.02}, "rail.exchanged_switches", 1, "rail.switches: .*the right limit .* exchanged", 3.0),
+        ({"reversed": True, "start": 0.09, "switches": (-1, 1)}, "", 5, "rail.stalled: .* no limit switch shows", 4.0),
+        ({"reversed": True, "switches": (-1, 1), "ends": (-1, 1)}, "", 5, "rail.no_reference: .* over 11", 8.0),
+    ],
+)
+def test_a_search_ends_at_the_first_sign_that_the_carriage_goes_elsewhere(
+    params: dict[str, Any], fault: str, mode: int, told: str, longest: float
+) -> None:
+    """By a switch of the other side, by a count that stands, or after the travel and a margin."""
+    world, clock = WorldClock(1.0), Clock(1.0)
+    model = RailModel(RailParams(**params), np.random.default_rng(3))
+    peer = TmclPeer(model, world)
+    peer.start()
+    try:
+        rail = connect(peer.url, clock, reference_mode=mode)
+        if fault:
+            peer.fault(fault)
+        begun = clock.now()
+        with pytest.raises(DeviceFault) as met:
+            rail.home().wait(30.0)
+        assert re.search(told, f"{met.value.code}: {met.value}")
+        assert clock.now() - begun < longest
+        clock.sleep(0.3)
+        low, high = model.params.ends
+        assert "rail.switches" not in told or low + 1e-4 < model.carriage(world.now()) < high - 1e-4
+        assert not rail.state().homed and not rail.state().moving
+        rail.close()
+    finally:
+        peer.stop()
 
 
 def test_a_rail_is_nudged_before_it_is_homed_and_a_motor_that_turns_backwards_is_turned_round() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import can
@@ -84,9 +86,9 @@ def threads() -> list[str]:
     ]
 
 
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    world, clock = WorldClock(SPEED), Clock(SPEED)
+@contextmanager
+def benched(speed: float) -> Iterator[Bench]:
+    world, clock = WorldClock(speed), Clock(speed)
     model = VehicleModel(VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK), np.random.default_rng(5))
     peer = AgilexPeer(model, world)
     peer.start()
@@ -99,6 +101,12 @@ def bench() -> Iterator[Bench]:
         finally:
             peer.stop()
     assert threads() == []
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with benched(SPEED) as made:
+        yield made
 
 
 @pytest.fixture
@@ -240,6 +248,76 @@ def test_what_somebody_else_commands_on_the_bus_ends_the_command(enabled: Bench)
             enabled.until(lambda: enabled.vehicle.drive(0.1, 0.0) is not None)
         with pytest.raises(InterlockError, match="not under CAN command"):
             enabled.vehicle.drive(0.1, 0.0)
+
+
+class Recorder(can.Listener):
+    """What was on the bus, with the times at which an adapter of its own heard it."""
+
+    def __init__(self) -> None:
+        self.frames: list[tuple[float, int, bytes]] = []
+
+    def on_message_received(self, message: can.Message) -> None:
+        self.frames.append((time.monotonic(), message.arbitration_id, bytes(message.data)))
+
+    def first(self, identifier: int, data: bytes) -> float:
+        """When the first frame came that begins so."""
+        return next(
+            (at for at, number, all_ in self.frames if number == identifier and all_.startswith(data)), math.nan
+        )
+
+
+@pytest.mark.parametrize(
+    ("fault", "mark", "code"),
+    [
+        ("can.foreign_commands", (0x111, b"\x00\xc8"), "vehicle.disturbed"),
+        ("can.second_vehicle", (0x311, b"\x00\x00\x2e\xe0"), "vehicle.two_vehicles"),
+    ],
+)
+@pytest.mark.parametrize("asked", [False, True])
+def test_it_is_braked_first_against_others_on_the_bus(
+    fault: str, mark: tuple[int, bytes], code: str, asked: bool
+) -> None:
+    """It locks the brake within 0.2 s of the first foreign frame, by itself, whether it is `asked` meanwhile or not."""
+    with benched(1.0) as made, can.Bus(interface="slcan", channel=made.peer.channel, sleep_after_open=0) as bus:
+        recorder = Recorder()
+        notifier = can.Notifier(bus, [recorder], 0.02)
+        vehicle, here = made.vehicle, 0.0
+        try:
+            vehicle.enable()
+            made.drive_for(0.8, 0.3)
+            here = made.truth()[0]
+            made.peer.fault(fault)
+            if asked:
+                with pytest.raises(DeviceFault):
+                    while made.clock.sleep(0.002) is None:
+                        vehicle.check()
+            made.until(lambda: not math.isnan(recorder.first(0x131, b"\x01")))
+            assert 0.0 < recorder.first(0x131, b"\x01") - recorder.first(*mark) < 0.2
+            with pytest.raises(DeviceFault if not asked else (DeviceFault, InterlockError)) as met:
+                vehicle.drive(0.1, 0.0)
+            assert asked or (met.value.code, met.value.recoverable) == (code, False)
+            assert recorder.frames[-1][0] - recorder.first(*mark) < 0.5
+            begun = made.clock.now()
+            if code == "vehicle.disturbed":
+                vehicle.brake()
+            else:
+                # One of the two says that it stands: nobody knows of which that is true.
+                with pytest.raises(DeviceFault, match=r"left and right (12000|\d+) and (11500|\d+) mm"):
+                    vehicle.brake()
+                assert made.clock.now() - begun < 0.2
+                with pytest.raises(DeviceFault, match="two vehicles report"):
+                    vehicle.enable()
+            assert made.model.feedback(made.world.now()).braked
+            assert made.clock.now() - begun < 3.0
+            assert made.true_speed() == 0.0
+            assert made.truth()[0] - here < 0.12
+            made.peer.clear()
+            made.clock.sleep(0.6)
+            vehicle.enable()
+            made.drive_for(0.3, 0.2)
+            vehicle.stop()
+        finally:
+            notifier.stop()
 
 
 def test_a_person_who_takes_the_remote_control_ends_the_command(enabled: Bench) -> None:

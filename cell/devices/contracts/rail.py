@@ -138,6 +138,20 @@ class RailContract(DeviceContract):
         rail.move_to(FAR_M * bench.motion).wait(PATIENCE_S)
         assert rail.state().position == pytest.approx(FAR_M * bench.motion, abs=EXACT_M)
 
+    def test_exchanged_limit_switches_are_named_before_the_end_stop(self, bench: Bench[Rail]) -> None:
+        """Beyond its travel the wrong one trips: it is stopped at once, and told which."""
+        if not isinstance(bench.device, Nudged):
+            pytest.skip("it moves only within its travel")
+        rail = self.homed(bench)
+        with bench.faulty() as faults:
+            faults.cause("rail.exchanged_switches")
+            with pytest.raises(DeviceFault, match=r"right limit switch tripped .* sent left") as met:
+                bench.device.nudge(-0.006, 0.005).wait(PATIENCE_S)  # type: ignore[attr-defined]
+            assert (met.value.code, met.value.recoverable) == ("rail.switches", False)
+            self.stands(bench)
+            assert rail.state().position > -0.0035
+        rail.home().wait(PATIENCE_S)
+
     def test_time_stamps_are_of_the_host_when_the_position_held(self, bench: Bench[Rail]) -> None:
         """Between the question and the answer, and never backwards."""
         rail, stamps = self.homed(bench), []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivers.errors import DeviceFault
 
 SETUP = "vehicle.setup"
-TOLD_ONCE = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.units")
+TOLD_ONCE = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.two_vehicles", "vehicle.units")
 """Codes of faults that end command: whoever is in charge afterwards is no fault of the vehicle."""
 
 

@@ -15,7 +15,7 @@ from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
 from drivers.vehicle.cia402.objects import OPERATIONAL, STATUS
 from drivers.vehicle.cia402.states import DriveState, may_turn
 from drivers.vehicle.cia402.units import UnitCheck
-from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback
+from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback, two_vehicles
 from drivers.vehicle.travel import Travel
 
 SILENCE_S = 0.5
@@ -215,6 +215,8 @@ class Feedback:
 
     def stands(self, since: float) -> bool:
         """True when both drives have reported standstill after host time `since`."""
+        if self._travel.two_vehicles:
+            return False
         step = 1.5 * self._wheels.velocity_step
         slow = max(STILL, step)
         at_rest = all(abs(drive.velocity) * self._wheels.velocity_step <= slow for drive in self.drives)
@@ -233,7 +235,9 @@ class Feedback:
             return self._contradicted()
 
     def _reported(self) -> DeviceFault | None:
-        """An emergency stop, or a drive's fault."""
+        """Feedback of two vehicles, an emergency stop, or a drive's fault."""
+        if what := self._travel.two_vehicles:
+            return two_vehicles(self._name, what)
         if self._stopped():
             return emergency_stop(self._name)
         trouble = self._trouble()
