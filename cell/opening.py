@@ -19,7 +19,7 @@ from cell.devices.mix import Sim, simulated_of
 from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
 from cell.opened import Opened
 from cell.run.lock import CellLock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, NotConnectedError
 
 SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
@@ -63,6 +63,9 @@ def open_devices(
         virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
     needed = connected_for(loaded, only)
+    for name in needed:
+        if missing := (whole or name not in names) and loaded.make(name).missing():
+            raise NotConnectedError(name, missing)
     world: SimulatedCell | None = None
     if whole:
         from cell.devices.described import Described

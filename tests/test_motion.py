@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -10,7 +12,7 @@ from cell.motion import bodies
 from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionError, CollisionModel
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints, Unreachable
-from cell.motion.planning import Planner
+from cell.motion.planning import EFFORTS, Planner
 from cell.motion.point_speed import PointSpeed, carried_points
 from cell.motion.trajectory import LineLimits, SingularLine, Trajectory, join, plan_joint, plan_line
 from drivers.errors import RefusedError
@@ -261,6 +263,24 @@ def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics) -> 
     left, right = (planner.reach(down(0.6, y, 0.25), WORKING, "beside") for y in (0.30, -0.30))
     motion = planner.free(left, right)
     assert all(model.free(q) for q in motion.joints)
+
+
+def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(
+    arm: ArmKinematics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    wall = bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
+    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), wall])
+    planner = Planner(arm, model)
+    left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
+    assert first_touch(model, np.stack([left, right])) is not None
+    motion = planner.free(left, right)
+    assert first_touch(model, motion.joints) is None
+    assert np.array_equal(motion.joints, planner.free(left, right).joints)
+    monkeypatch.setattr("cell.motion.planning.EFFORTS", EFFORTS[:1])
+    monkeypatch.setattr(model, "free", lambda joints, allowed=(): not 0.0 < joints[0] - min(left[0], right[0]) < 1.0)
+    with pytest.raises(CollisionError, match=r"over one corner.*ompl .*Python 3\.\d+"):
+        planner.free(left, right)
 
 
 def test_an_end_that_touches_is_refused_by_name(planner: Planner) -> None:

@@ -24,6 +24,7 @@ from cell.cli.options import (
 from cell.cli.runs import NoiseOption, RunArgument, folder_of_runs
 
 if TYPE_CHECKING:
+    from cell.config import CellConfig
     from cell.run.job_run import Observer, RunOutcome
     from cell.supervisor import Cell
 
@@ -82,8 +83,12 @@ def dry_run(
         float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
     ] = None,
     clock: Annotated[
-        CellClock, typer.Option(help='"virtual": without wires and without waiting; the same seed, the same bytes.')
-    ] = CellClock.wall,
+        CellClock | None,
+        typer.Option(
+            help='"virtual": without wires and without waiting; the same seed, the same bytes. "wall" unless something '
+            "is missing to speak with a device."
+        ),
+    ] = None,
     inject: Annotated[
         list[str] | None,
         typer.Option(
@@ -115,7 +120,10 @@ def dry_run(
     from cell.supervisor import Cell
 
     loaded, mesh = load_job(job)
-    require_fit(loaded, load_config(find_config(config, simulated=True)), mesh, calibrates=True)
+    described = load_config(find_config(config, simulated=True))
+    require_fit(loaded, described, mesh, calibrates=True)
+    if clock is None and speed is None:
+        clock = _clock(described)
     find_kind(loaded.job.kind).until(until)
     for text in inject or ():
         Injection.parse(text, find_kind(loaded.job.kind).names)
@@ -128,7 +136,7 @@ def dry_run(
         speed=speed,
         job=job,
         confirm=None if confirm is None else confirm.value,
-        clock=clock.value,
+        clock=(clock or CellClock.wall).value,
     )
     if console:
         from cell.cli.console import require_installed, run_shown
@@ -137,6 +145,16 @@ def dry_run(
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
         _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
+
+
+def _clock(config: CellConfig) -> CellClock:
+    """The wall's time, or the virtual one, said so, where something is missing to speak with the devices."""
+    from cell.config import DEVICES
+
+    missing = (f"{name}: {why}" for name in DEVICES if (why := config.make(name).missing()))
+    if why := next(missing, ""):
+        typer.echo(f"this dry run is on the virtual clock, without the devices' protocols. {why}", err=True)
+    return CellClock.virtual if why else CellClock.wall
 
 
 def resume(

@@ -27,6 +27,7 @@ from cell.devices.rail_makes import MODBUS
 from cell.devices.switch_makes import SWITCH_MAKES
 from cell.devices.vehicle_makes import CANOPEN, CanVehicleConfig
 from cell.units import quantity, whole
+from drivers.packages import lacking
 
 if TYPE_CHECKING:
     from drivers.arm.ur import UrArm
@@ -248,7 +249,10 @@ BUILT_IN: tuple[AnyMake, ...] = (
         "rail", "tmcl", TmclRailConfig, _rail, frozenset(("lead", "steps_per_turn", "microsteps")),
         calibrated_since=frozenset(("reference_mode", "reversed")), simulated=_with("url"),
     ),
-    Make("arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address")),
+    Make(
+        "arm", "ur", UrArmConfig, _arm, frozenset(("model",)), simulated=_with("address"),
+        missing=lambda: lacking("rtde_control", "ur-rtde"),
+    ),
     Make("vehicle", "agilex", AgilexVehicleConfig, _vehicle, simulated=_with("interface", "channel")),
     Make("vehicle", "fixed", FixedVehicleConfig, _no_vehicle, simulated=_with()),
     CANOPEN,

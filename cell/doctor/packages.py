@@ -24,7 +24,10 @@ def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
         table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
         groups = table.get("optional-dependencies", {})
         lines = {ALWAYS: table["dependencies"], **{extra: groups.get(extra, []) for extra in extras}}
-        return {extra: [Requirement(line) for line in wanted] for extra, wanted in lines.items()}
+        asked = {extra: map(Requirement, wanted) for extra, wanted in lines.items()}
+        return {
+            extra: [one for one in wanted if not one.marker or one.marker.evaluate()] for extra, wanted in asked.items()
+        }
     found: dict[str, list[Requirement]] = {extra: [] for extra in (ALWAYS, *extras)}
     for requirement in map(Requirement, requires(DISTRIBUTION) or ()):
         marker = requirement.marker

@@ -17,7 +17,7 @@ from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
 from cell.motion.point_speed import PointSpeed, carried_points
-from cell.motion.search import Effort, search
+from cell.motion.search import Effort, limits, search
 from cell.motion.trajectory import LineLimits, Trajectory, join, plan_joint, plan_line
 
 EFFORTS = (
@@ -97,5 +97,5 @@ class Planner:
                 return path
         raise CollisionError(
             f"no free way was found between joints {np.degrees(start).round(1).tolist()} and "
-            f"{np.degrees(end).round(1).tolist()} deg. Move the arm to a freer posture with `cell jog` first"
+            f"{np.degrees(end).round(1).tolist()} deg{limits()}. Move the arm to a freer posture with `cell jog` first"
         )

@@ -21,6 +21,7 @@ from typing import Any
 
 from drivers.arm.messages import UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
+from drivers.packages import lacking
 from drivers.pulse import Pulse
 
 _SILENCE_S = 2.0
@@ -50,10 +51,13 @@ class ArmLink:
         on_lost: Callable[[DeviceFault], None],
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline.
+        """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline,
+        or at once without ur-rtde.
 
         `Aborted`, with the child gone, as soon as it is not `wanted` any more.
         """
+        if missing := lacking("rtde_control", "ur-rtde"):
+            raise NotConnectedError(name, missing)
         self.lost: DeviceFault | None = None
         self._name = name
         self._address = setup.address

@@ -1,0 +1,90 @@
+"""Which platform and Python has wheels of what the cell needs, asked of the package index; writes docs/platforms.md.
+
+    python -m cell.lab.bench.platforms docs/platforms.md
+
+The questions are those of an installation, put by `uv pip compile`: nothing is downloaded but what wheels say of
+themselves. What a platform has is what can be installed there; only where the docs say so was it run as well.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+
+PLATFORMS = {
+    "Linux x86-64": "x86_64-manylinux_2_28",
+    "Linux aarch64": "aarch64-manylinux_2_28",
+    "macOS arm64": "aarch64-apple-darwin",
+    "Windows x86-64": "x86_64-pc-windows-msvc",
+}
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+OPTIONAL = ("ur-rtde", "ompl")
+"""Imported when they are needed; `pyproject.toml` asks for them where they have wheels."""
+HEAD = """# Platforms
+
+What `pip install -e .` finds on the package index: wheels of each package and of what it needs in turn. Asked on {date}
+by `python -m cell.lab.bench.platforms docs/platforms.md`, which needs `uv` and writes this page.
+
+- Tested is Linux x86-64: Python 3.11 by the whole test suite, and the newest other Python that `.ci/run` finds by a dry
+  run. The other rows say what can be installed, and were not run. The devices' drivers are for Linux.
+- **Wires**: real arms, simulated cells over the devices' protocols, `cell console`. Without ur-rtde, `cell dry-run`
+  takes the virtual clock and says so.
+- **Ways**: free moves of the arm. Without OMPL it takes a direct way or one over one corner; where neither is free,
+  the move is refused.
+- **Offline**: `cell dry-run --clock virtual`, `cell report`, `cell calibrate --from`.
+- **Built**: packages without a wheel, which pip builds from their sources; that needs a C++ compiler and CMake.
+
+| platform | Python | wires | ways | offline | built |
+|---|---|---|---|---|---|
+"""
+
+
+def resolved(wanted: list[str], platform: str, python: str, *options: str) -> bool:
+    """Whether the index has all of `wanted`, and all that it needs in turn, for this platform and Python."""
+    command = ["uv", "pip", "compile", "--quiet", "--python-platform", platform, "--python-version", python, *options]
+    done = subprocess.run([*command, "-"], input="\n".join(wanted), capture_output=True, text=True, timeout=300)
+    if done.returncode and "No solution found" not in done.stderr and "Failed to build" not in done.stderr:
+        raise RuntimeError(f"the index was not asked: {done.stderr.strip()}")
+    return done.returncode == 0
+
+
+def lacking(wanted: dict[str, str], platform: str, python: str) -> tuple[set[str], set[str]]:
+    """Names of `wanted` (their requirements by name) without a wheel, and those of them without sources either."""
+    wheels = ("--only-binary", ":all:")
+    certain = [line for name, line in wanted.items() if name not in OPTIONAL]
+    # One question answers for most platforms; package by package only where it does not.
+    doubtful = OPTIONAL if resolved(certain, platform, python, *wheels) else tuple(wanted)
+    bare = {name for name in doubtful if not resolved([wanted[name]], platform, python, *wheels)}
+    # ur-rtde's and OMPL's sources need libraries that pip does not bring.
+    return bare, {name for name in bare if name in OPTIONAL or not resolved([wanted[name]], platform, python)}
+
+
+def works(no_wheel: set[str], nothing: set[str]) -> tuple[str, str, str, str]:
+    """Wires, ways, offline and built of a row of the table; `nothing` are those that cannot be built either."""
+    built = ", ".join(sorted(no_wheel - nothing))
+    if barred := ", ".join(sorted(nothing - set(OPTIONAL))):
+        return f"no: {barred}", f"no: {barred}", f"no: {barred}", built
+    wires = "no: ur-rtde" if "ur-rtde" in nothing else "yes"
+    return wires, "over one corner: ompl" if "ompl" in nothing else "yes", "yes", built
+
+
+def main(path: Path) -> None:
+    """Ask for every platform and write the page."""
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    asked = {one.name: f"{one.name}{one.specifier}" for one in map(Requirement, project["dependencies"])}
+    rows = []
+    for name, platform in PLATFORMS.items():
+        for python in PYTHONS:
+            rows.append((name, python, *works(*lacking(asked, platform, python))))
+            print(*rows[-1], sep=" | ", flush=True)
+    table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    path.write_text(HEAD.format(date=time.strftime("%Y-%m-%d")) + table, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,78 @@
+"""Where a package has no wheel the cell says so by name, with the remedy, and does what it can without it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import partial
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from cell import Cell, NotConnectedError
+from cell.cli import run
+from cell.cli.app import app
+from cell.doctor.packages import asked_for
+from cell.lab.bench import platforms
+from drivers.arm.link import ArmLink
+from drivers.packages import lacking
+
+NEVER = 'ur-rtde>=1.6.3,<1.7; python_version < "3"'
+
+
+@pytest.fixture
+def without_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
+    monkeypatch.setattr("drivers.packages.requires", lambda name: [NEVER])
+
+
+def test_a_package_without_a_wheel_here_is_named_with_a_python_that_has_one(without_wheel: None) -> None:
+    words = lacking("rtde_control", "ur-rtde")
+    assert f"ur-rtde has no wheel for Python {sys.version.split()[0]}" in words
+    assert "Python 3.12 on Linux x86-64" in words
+    assert lacking("numpy", "numpy") == ""
+
+
+def test_a_package_that_has_a_wheel_here_is_to_be_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
+    monkeypatch.setattr("drivers.packages.requires", lambda name: ["ur-rtde>=1.6.3,<1.7"])
+    assert "pip install 'ur-rtde<1.7,>=1.6.3'" in lacking("rtde_control", "ur-rtde")
+
+
+@pytest.mark.parametrize(
+    ("options", "clock", "said"),
+    [((), "virtual", True), (("--clock", "wall"), "wall", False), (("--speed", "2"), "wall", False)],
+)
+def test_a_dry_run_without_the_arms_package_takes_the_virtual_clock_and_says_so(
+    without_wheel: None, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], clock: str, said: bool
+) -> None:
+    opened: list[partial[Any]] = []
+    monkeypatch.setattr(run, "_perform", lambda cell, *others: opened.append(cell))
+    done = CliRunner().invoke(app, ["dry-run", *options], catch_exceptions=False)
+    assert opened[0].keywords["clock"] == clock
+    assert ("virtual clock" in done.stderr and "ur-rtde has no wheel" in done.stderr) is said
+
+
+def test_over_the_wires_it_is_refused_before_anything_is_started(
+    without_wheel: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subprocess, "Popen", lambda *given, **options: pytest.fail(f"started {given}"))
+    for connect in (
+        lambda: Cell.open(sim="all"),
+        lambda: ArmLink("arm", None, 1.0, print, print, print),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(NotConnectedError, match="arm: ur-rtde has no wheel"):
+            connect()
+
+
+def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cell.doctor.packages.tomllib.loads", lambda text: {"project": {"dependencies": [NEVER]}})
+    assert asked_for(()) == {"": []}
+
+
+def test_the_table_of_platforms_follows_from_what_lacks() -> None:
+    assert platforms.works(set(), set()) == ("yes", "yes", "yes", "")
+    assert platforms.works({"ur-rtde"}, {"ur-rtde"}) == ("no: ur-rtde", "yes", "yes", "")
+    assert platforms.works({"ompl", "ruckig"}, {"ompl"}) == ("yes", "over one corner: ompl", "yes", "ruckig")
+    assert platforms.works({"pin", "ompl"}, {"pin", "ompl"}) == ("no: pin",) * 3 + ("",)
