@@ -33,7 +33,7 @@ class Options:
 
     `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
     eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
-    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read.
+    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read, None for none.
     """
 
     poses: str | None = None
@@ -42,7 +42,7 @@ class Options:
     plan: bool = False
     camera: CameraModel | None = None
     hold_camera: bool = False
-    laser: Laser = Laser.AUTO
+    laser: Laser | None = Laser.AUTO
 
 
 @dataclass
@@ -72,7 +72,7 @@ def attach_poses(
         _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
-    in_order = [other for one in series for other in (_in_order(one, frames), _as_words(one, frames)) if other]
+    in_order = [other for one in series for other in _other_orders(one, frames)]
     boards = {}
     for k, frame in enumerate(frames):
         if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
@@ -100,31 +100,13 @@ def attach_poses(
 def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, options: Options) -> Understood:
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
-    understood = Understood(
-        best.setup,
-        {
-            "source": [one.name],
-            "reading": best.reading.name,
-            "text": best.reading.text,
-            "unit": best.unit,
-            "setup": best.setup,
-            "matched_by": one.by,
-            "given": [n for n, v in vars(options).items() if v and n != "plan"],
-            "evidence": decision.evidence,
-            "turn_deg": float(np.degrees(best.turn)),
-            "shift_mm": 1e3 * best.shift,
-        },
-    )
-    if decision.by_name is not None and one.by == "order as words":
-        understood.notes.append(
-            f"the poses of {one.name} belong to the pictures sorted as words (1, 10, 2), which leaves {best.left}; in "
-            f"the order of their numbers they leave {decision.by_name.left}"
-        )
-    elif decision.by_name is not None:
+    understood = Understood(best.setup, about_poses(decision, options))
+    if decision.by_name is not None:
         decision.by_name.series.alone = []
+        how = "in order" if one.by == "order" else "in the order of the pictures sorted as words (1, 10, 2)"
         understood.notes.append(
-            f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
-            f"leaves {best.left}; by name they leave {decision.by_name.left}"
+            f"the poses of {one.name} were taken {how}, which leaves {best.left}; matched by "
+            f"{decision.by_name.series.by} they leave {decision.by_name.left}"
         )
     understood.notes += [
         f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
@@ -161,6 +143,23 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
     return understood
 
 
+def about_poses(decision: Decision, options: Options) -> dict[str, Any]:
+    """How the poses were read, for the JSON."""
+    best = decision.best
+    return {
+        "source": [best.series.name],
+        "reading": best.reading.name,
+        "text": best.reading.text,
+        "unit": best.unit,
+        "setup": best.setup,
+        "matched_by": best.series.by,
+        "given": [n for n in ("poses", "pose_field", "setup") if getattr(options, n)],
+        "evidence": decision.evidence,
+        "turn_deg": float(np.degrees(best.turn)),
+        "shift_mm": 1e3 * best.shift,
+    }
+
+
 def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
     """Give a frame without a pose that of another picture of its place."""
     index = {id(frame): k for k, frame in enumerate(frames)}
@@ -169,24 +168,19 @@ def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
             one.of.setdefault(index[id(frame.shows)], one.of[k])
 
 
-def _in_order(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
-    """The same poses given to the pictures in order, where there are as many and their names say otherwise."""
+def _other_orders(one: Series, frames: Sequence[RecordedFrame]) -> list[Series]:
+    """The same poses where there are as many as pictures: in order and not by name, or sorted as words (1, 10, 2)."""
     places = [k for k, f in enumerate(frames) if f.shows is None]
-    if one.by not in ("name", "number") or len(places) != len(one.records):
-        return None
-    single = len({r.path for r in one.records}) == len(one.records)
-    records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
-    of = dict(zip(places, records, strict=True))
-    return None if all(one.of.get(k) is r for k, r in of.items()) else Series(one.name, records, of, "order")
-
-
-def _as_words(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
-    """Rows in the order in which the pictures' names are sorted as words: 1, 10, 2; None where that is no other."""
-    places = [k for k, f in enumerate(frames) if f.shows is None]
-    words = sorted(places, key=lambda k: frames[k].name)
-    if one.by != "order" or words == places or len(places) != len(one.records):
-        return None
-    return Series(one.name, one.records, dict(zip(words, one.records, strict=True)), "order as words")
+    if len(places) != len(one.records):
+        return []
+    if one.by == "order":
+        words = sorted(places, key=lambda k: frames[k].name)
+        other = Series(one.name, one.records, dict(zip(words, one.records, strict=True)), "order as words")
+    else:
+        single = len({r.path for r in one.records}) == len(one.records)
+        records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
+        other = Series(one.name, records, dict(zip(places, records, strict=True)), "order")
+    return [] if all(one.of.get(k) is r for k, r in other.of.items()) else [other]
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

@@ -13,10 +13,9 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.agreement import SCALE_SIGMAS, UNITS, Fit, angle, fits_of
-from cell.calibration.recorded.conventions import readings_of, why_not
+from cell.calibration.recorded.conventions import FORM, TRIED, readings_of, why_not
 from cell.calibration.recorded.series import Series
-from cell.calibration.solve.consistency import turns_apart
-from cell.geometry.poses import from_parts
+from cell.calibration.solve.consistency import orders, turns_apart
 from drivers.errors import RefusedError
 
 # The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
@@ -25,8 +24,6 @@ CLEAR, AGREES = 2.5, 0.06
 AS_MUCH, CLEAR_SHIFT, LEAST_SHIFT = 0.95, 5.0, 0.002
 # Poses that are shifted by one picture are named when they then agree so much better, in so many frames.
 SHIFTED, LEAST_SHIFTED = 0.5, 6
-# What a mirror in the camera, or a left-handed base, does.
-MIRROR = np.diag([-1.0, 1.0, 1.0])
 QUICK_LOOK, ALIKE = 24, 0.2
 # The flange's way and the board's size may disagree by this share before it is said, and before it is refused.
 SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
@@ -93,7 +90,10 @@ def decide(
     if not fits:
         records = [r for one in series for r in one.records]
         reasons = problems or [why_not(records[0].numbers, records[0].named, wanted)]
-        raise RefusedError(f"the poses of {series[0].name} cannot be read: {reasons[0]}")
+        raise RefusedError(
+            f"the poses of {series[0].name} cannot be read: {reasons[0]}; another convention is named with --poses, as "
+            f"{FORM}"
+        )
     best = fits[0]
     if not best.score < AGREES:
         sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
@@ -142,7 +142,7 @@ def _shifted(
     setup: str | None,
     shifts: Sequence[int],
 ) -> str:
-    """The question that poses ask which agree with no picture: do they with the one before or after, or in a mirror?"""
+    """The question that poses ask which agree with no picture: do they with the one before or after?"""
     for step in shifts:
         moved = []
         for one in series:
@@ -157,19 +157,10 @@ def _shifted(
                 f"with the pose of the {'next' if step > 0 else 'previous'} picture, {fits[0].text}, they leave "
                 f"{fits[0].left}: are poses and pictures shifted by one, and one of either missing? Number them anew"
             )
-    mirrored = {
-        k: [from_parts(MIRROR @ b.translation, MIRROR @ b.rotation @ MIRROR) for b in boards[k]] for k in boards
-    }
-    fits, _ = _all_fits(series, mirrored, wanted, setup) if _turn_alike(series, boards, wanted) else ([], [])
-    if fits and fits[0].score < SHIFTED * AGREES and len(boards) >= LEAST_SHIFTED:
-        return (
-            f"as mirror images they agree, {fits[0].text}, and leave {fits[0].left}: are the pictures flipped, or are "
-            "the poses from a left-handed system? Save the pictures as the sensor has them, or turn one axis round"
-        )
     angles = any(one.count == 6 for one in series)
     return (
         f"are they the poses of these pictures, of the flange{' (and not joint angles)' if angles else ''}, and is the "
-        "board's pitch right?"
+        f"board's pitch right? Tried were {', '.join(TRIED)}; another convention is named with --poses, as {FORM}"
     )
 
 
@@ -180,7 +171,11 @@ def _turn_alike(series: Sequence[Series], boards: dict[int, list[pin.SE3]], want
         for reading in readings_of(one.count, one.named, wanted):
             poses = one.poses(reading)
             both = [k for k in keys if k in poses]
-            if len(both) > 2 and turns_apart([poses[k] for k in both], [boards[k][0] for k in both]) < ALIKE:
+            if len(both) < 3:
+                continue
+            flanges = [poses[k] for k in both]
+            seen = [boards[k][turn] for k, turn in zip(both, orders(flanges, [boards[k] for k in both]), strict=True)]
+            if turns_apart(flanges, seen) < ALIKE:
                 return True
     return False
 
