@@ -444,15 +444,6 @@ def test_the_boards_poses_beside_the_pictures_are_not_taken_for_the_flanges(reco
     assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
 
 
-def test_the_same_poses_in_two_files_of_different_units_are_no_question(recording, seen):
-    rotation_vectors_in_a_table(recording)
-    rows = [row([*1e3 * p[:3, 3], *angles(p, "xyz")], ",") for p in POSES]
-    (recording / "raw.csv").write_text("\n".join(rows))
-    _, understood, _ = understand(recording, seen)
-    assert not understood.refused
-    assert understood.about["turn_deg"] < 0.1
-
-
 def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
     tuples(recording)
     _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
@@ -464,12 +455,6 @@ def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
     frames, understood, _ = understand(recording, seen)
     assert "25.0" in understood.refused
     assert all(f.base_from_flange is None for f in frames)
-
-
-def test_positions_in_inches_are_named(recording, seen):
-    one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], p[:3, 3] / 0.0254], p[3:]]).ravel()))
-    _, understood, _ = understand(recording, seen)
-    assert "are the positions in inches?" in understood.refused
 
 
 def test_poses_of_other_pictures_agree_in_no_reading(recording, seen):
@@ -504,26 +489,6 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert "another unit" in frames[4].text
     others = [f for f in frames if f is not frames[4]]
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
-
-
-def test_poses_that_are_shifted_by_one_picture_are_named(recording, seen):
-    for k, pose in enumerate([*POSES[1:], POSES[0]]):
-        (recording / f"pose{k + 3:02d}.txt").write_text(row(pose.ravel()))
-    frames, understood, _ = understand(recording, seen)
-    assert "previous picture" in understood.refused
-    assert "shifted by one" in understood.refused
-    assert all(f.base_from_flange is None for f in frames)
-
-
-def test_rows_that_are_sorted_as_words_are_found_out_and_said(tmp_path, pictures, seen):
-    names = [f"shot{k}.png" for k in range(8, 16)]
-    for name, path in zip(names, sorted(pictures.iterdir()), strict=True):
-        (tmp_path / name).symlink_to(path)
-    order = sorted(range(len(names)), key=names.__getitem__)
-    (tmp_path / "poses.txt").write_text("\n".join(row([*POSES[k][:3, 3], *quaternion(POSES[k])]) for k in order))
-    frames, understood, _ = understand(tmp_path, dict(zip(names, seen.values(), strict=True)))
-    assert "sorted as words (1, 10, 2)" in understood.notes[0]
-    assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
 
 
 def test_a_raw_picture_of_a_colour_camera_is_called_so(tmp_path, pictures):
@@ -636,17 +601,6 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
         path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
     _, _, unread = read_series(list_folder(recording))
     assert all(len(reason) > 5 for _, reason in unread)
-
-
-def test_numbers_that_are_off_by_one_are_found_out_and_said(recording, seen):
-    one_file_each(recording, lambda p: row(p.ravel()))
-    for k in range(len(POSES)):
-        (recording / f"pose{k + 3:02d}.txt").rename(recording / f"pose{k + 2:02d}.txt")
-    frames, understood, _ = understand(recording, seen)
-    assert understood.about["matched_by"] == "order"
-    assert "taken in order" in understood.notes[0]
-    for frame, pose in zip(frames, POSES, strict=True):
-        assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
 
 
 def in_little_light(image: np.ndarray, light: float, seed: int) -> np.ndarray:

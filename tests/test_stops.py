@@ -15,7 +15,7 @@ from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
 from drivers.errors import ConfigError
-from tests.recorded_scenes import DOTS_PX, LENS, MATRIX, SIZE, scene
+from tests.recorded_scenes import DOTS_PX, FLANGE_FROM_CAMERA, LENS, MATRIX, SIZE, scene
 from tests.test_no_confident_wrong_answer import right, solved
 
 
@@ -65,6 +65,20 @@ def test_pairs_of_one_stop_count_as_one():
     np.testing.assert_allclose(often["hand_eye"]["sigma_mm"], once["hand_eye"]["sigma_mm"], rtol=1e-3)
     with pytest.raises(ConfigError, match="of 3 stops"):
         calibrate_pairs([pair for pair in pairs[:3] for _ in range(4)])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_scale_that_stands_alone_is_a_doubt_beside_the_value(seed):
+    """28 views round a board: what moves the boards a little looks like a scale, and the hand-eye is right."""
+    pairs = given_pairs(scene(seed, count=28, arm_mm=0.6, arm_mrad=0.3, laser=False, spread=0.15))
+    middle = np.mean([b.translation for _, b in pairs], axis=0)
+    pairs = [(f, pin.SE3(b.rotation, middle + (b.translation - middle) / 1.12)) for f, b in pairs]
+    result = calibrate_pairs(pairs)
+    (check,) = (c for c in result["checks"] if "travel" in c["name"])
+    assert check["verdict"] == "doubt", check
+    off = np.array(result["hand_eye"]["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation
+    sigma = np.linalg.norm(result["hand_eye"]["sigma_mm"])
+    assert np.linalg.norm(off) / 3 < sigma < 1.0
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from cell.calibration.recorded.agreement import scaled
 from cell.calibration.recorded.conventions import why_not
 from cell.calibration.recorded.decide import Decision, decide, scale_problem
 from cell.calibration.recorded.folder import RecordedFrame
-from cell.calibration.recorded.listing import natural
 from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
@@ -72,10 +71,9 @@ def attach_poses(
         _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
-    in_order = [other for one in series for other in _other_orders(one, frames)]
     boards = {}
     for k, frame in enumerate(frames):
-        if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
             continue
         try:
             boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
@@ -91,7 +89,7 @@ def attach_poses(
         )
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
-        decision = decide(series, boards, pitch, options.poses, options.setup, in_order)
+        decision = decide(series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
         return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
     return _apply(decision, frames, pitch, options)
@@ -101,13 +99,6 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
     understood = Understood(best.setup, about_poses(decision, options))
-    if decision.by_name is not None:
-        decision.by_name.series.alone = []
-        how = "in order" if one.by == "order" else "in the order of the pictures sorted as words (1, 10, 2)"
-        understood.notes.append(
-            f"the poses of {one.name} were taken {how}, which leaves {best.left}; matched by "
-            f"{decision.by_name.series.by} they leave {decision.by_name.left}"
-        )
     understood.notes += [
         f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
         for name in decision.boards_own
@@ -166,21 +157,6 @@ def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
     for k, frame in enumerate(frames):
         if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
             one.of.setdefault(index[id(frame.shows)], one.of[k])
-
-
-def _other_orders(one: Series, frames: Sequence[RecordedFrame]) -> list[Series]:
-    """The same poses where there are as many as pictures: in order and not by name, or sorted as words (1, 10, 2)."""
-    places = [k for k, f in enumerate(frames) if f.shows is None]
-    if len(places) != len(one.records):
-        return []
-    if one.by == "order":
-        words = sorted(places, key=lambda k: frames[k].name)
-        other = Series(one.name, one.records, dict(zip(words, one.records, strict=True)), "order as words")
-    else:
-        single = len({r.path for r in one.records}) == len(one.records)
-        records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
-        other = Series(one.name, records, dict(zip(places, records, strict=True)), "order")
-    return [] if all(one.of.get(k) is r for k, r in other.of.items()) else [other]
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

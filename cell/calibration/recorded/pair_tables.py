@@ -55,7 +55,7 @@ def pairs_of_tables(
         unit = min(UNITS, key=lambda u: abs(math.log(max(far * UNITS[u], 1e-9) / USUAL_M)))
         poses = {k: scaled(p.inverse() if inverse else p, unit) for k, p in poses.items()}
         try:
-            decision = decide([arm], {k: [p] for k, p in poses.items()}, 0.0, options.poses, options.setup, shifts=())
+            decision = decide([arm], {k: [p] for k, p in poses.items()}, 0.0, options.poses, options.setup)
         except RefusedError as error:
             refused.append(str(error))
             continue
@@ -64,7 +64,7 @@ def pairs_of_tables(
         raise RefusedError(f"{arm.name} and {board.name} give no hand-eye: {refused[0] if refused else 'no poses'}")
     decision, reading, unit, seen = min(found, key=lambda f: f[0].best.score)
     for rival, other, *_ in found:
-        if other is not reading and not clearly_worse(rival.best, decision.best):
+        if other != reading and not clearly_worse(rival.best, decision.best):
             raise RefusedError(
                 f"{board.name} can be read in two ways that agree about equally: {reading.text} leaves "
                 f"{decision.best.left}, {other.text} leaves {rival.best.left}; write its poses as 4×4 matrices, "

@@ -75,12 +75,9 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
         except Exception as error:
             # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
             unread.append((name, f"it cannot be read ({type(error).__name__}): {error}"))
-    joined = join_halves([half for content in contents.values() for half in content.halves])
-    paired = {r.path for r in joined} | {
-        r.path.parent / r.field.removeprefix("with ") for r in joined if r.field.startswith("with ")
-    }
+    joined, paired = join_halves([half for content in contents.values() for half in content.halves])
     for name, content in contents.items():
-        if not content.records and not content.links and not any(h.path in paired for h in content.halves):
+        if not content.records and not content.links and not any(path in paired for path, _, _ in content.halves):
             what = (
                 "positions or rotations only: name both files alike, such as R_gripper2base.txt and t_gripper2base.txt"
             )

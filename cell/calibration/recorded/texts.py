@@ -29,9 +29,8 @@ ORTHOGONAL_OFF = 0.02
 UNIT_OFF = 0.02
 LARGEST_NUMBER = 1e6
 """What stands in front of a pose and is larger is a time and no picture's number."""
-LEAST_HALVES = 3
-LONGEST = 8
-"""Lines of one pose."""
+LEAST_HALVES, LONGEST = 3, 8
+"""Rows of a half; lines of one pose."""
 NUMBER = re.compile(
     r"(?<![\w.])(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?![\w.:])|[-+]?(?:nan|inf)(?!\w))", re.IGNORECASE
 )
@@ -41,8 +40,10 @@ MOVE = re.compile(r"\bmove[a-z]+\s*\(\s*p\s*\[([^\]]*)\]")
 PREFIXES = ("", "t", "p", "pos", "trans", "translation", "position", "tcp", "flange", "robot", "pose")
 TURNS = (("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"), ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("a", "b", "c"))
 NUMBERING = re.compile(r"id|index|frame|image|file|name|no\b|num|^n$|pic")
-TURN_WORDS = re.compile(r"r|rot|rots|rotations?|rmats?|rvecs?|rotvecs?|q|quats?|quaternions?|euler|rpy|orientations?")
-PLACE_WORDS = re.compile(r"t|trans|translations?|tvecs?|pos|positions?|xyz|p")
+HALVES = re.compile(
+    r"r|rot|rotations?|rmats?|rvecs?|rotvecs?|q|quats?|quaternions?|(t|trans|translations?|tvecs?|pos|positions?|xyz|p)"
+)
+"""What the two halves of poses are called; the second are the positions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,39 +63,14 @@ class Record:
     exact: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Half:
-    """One array of a file: `rows` (n, 9) rotation matrices, (n, 4) quaternions, or (n, 3) positions or rotations."""
-
-    path: Path
-    field: str
-    rows: Array
-
-    @property
-    def words(self) -> list[str]:
-        """The words of file and field."""
-        apart = re.sub(r"([a-z])([A-Z])", r"\1 \2", f"{self.path.stem} {self.field}").lower()
-        return [w for w in re.split(r"[^a-z]+", apart) if w]
-
-    @property
-    def turns(self) -> bool:
-        """True for rotations: nine or four numbers each, or three that are called so and not positions."""
-        called = any(map(TURN_WORDS.fullmatch, self.words)) and not any(map(PLACE_WORDS.fullmatch, self.words))
-        return self.rows.shape[1] != 3 or called
-
-    @property
-    def rest(self) -> tuple[str, ...]:
-        """What is left of the name without the words that say which half it is."""
-        return tuple(w for w in self.words if not TURN_WORDS.fullmatch(w) and not PLACE_WORDS.fullmatch(w))
-
-
 @dataclass
 class Content:
     """What a text holds: records, halves of them, and links between files (picture, or name of the other, file)."""
 
     records: list[Record] = field(default_factory=list)
     links: list[dict[str, str]] = field(default_factory=list)
-    halves: list[Half] = field(default_factory=list)
+    halves: list[tuple[Path, str, Array]] = field(default_factory=list)
+    """Rotations (n, 9), (n, 4) or (n, 3), or positions (n, 3), with their place in the file."""
 
 
 def read_content(path: Path) -> Content:
@@ -251,7 +227,7 @@ def _take(path: Path, array: Array, place: list[str], label: str | None, content
             assert one is not None
             content.records.append(_record(path, [*place, f"[{k}]"], f"[{k}]", one))
     elif (rows := half_of(array)) is not None:
-        content.halves.append(Half(path, "/".join(place), rows))
+        content.halves.append((path, "/".join(place), rows))
 
 
 def _record(path: Path, place: list[str], label: str | None, numbers: Array, named: str = "") -> Record:
@@ -367,7 +343,7 @@ def _read_table(path: Path, text: str, content: Content) -> None:
     if widest >= min(COUNTS):
         _read_rows(path, header, lines, words, numbers, content)
     elif len({len(n) for n in numbers}) == 1 and not any(words) and (rows := half_of(np.array(numbers))) is not None:
-        content.halves.append(Half(path, "", rows))
+        content.halves.append((path, "", rows))
     elif not _read_blocks(path, words, numbers, content) and not content.links:
         raise ValueError(f"it holds {sum(map(len, numbers))} numbers; {NEEDED}")
 
@@ -453,47 +429,37 @@ def _of_block(words: Sequence[list[str]], numbers: Sequence[list[float]]) -> lis
 
 def half_of(array: Array) -> Array | None:
     """The rows of an array that is one half of at least three poses, or None."""
-    if not np.isfinite(array).all():
+    if not np.isfinite(array).all() or array.ndim not in (2, 3):
         return None
-    if array.ndim == 3 and array.shape[1:] in ((3, 1), (1, 3), (4, 1), (1, 4), (3, 3)):
+    rows = array.reshape(-1, 9) if array.shape[-1] == 3 and array.size % 9 == 0 else array.reshape(len(array), -1)
+    stack = rows.reshape(-1, 3, 3) if rows.shape[1] == 9 else np.zeros((0, 3, 3))
+    matrices = bool(len(stack)) and np.abs(stack @ stack.transpose(0, 2, 1) - np.eye(3)).max() < ORTHOGONAL_OFF
+    if not matrices:
         rows = array.reshape(len(array), -1)
-    elif array.ndim == 2 and array.shape[1] == 3 and _matrices(array):
-        rows = array.reshape(-1, 9)
-    elif array.ndim == 2 and (array.shape[1] in (3, 9) or (array.shape[1] == 4 and _unit(array))):
-        rows = array
-    else:
-        return None
-    if rows.shape[1] == 9 and not _matrices(rows.reshape(-1, 3)):
-        return None
-    return rows if len(rows) >= LEAST_HALVES else None
+    unit = rows.shape[1] == 4 and np.abs(np.linalg.norm(rows, axis=1) - 1).max() < UNIT_OFF
+    return rows if len(rows) >= LEAST_HALVES and (matrices or unit or rows.shape[1] == 3) else None
 
 
-def _matrices(rows: Array) -> bool:
-    """True for 3×3 rotations one below the other."""
-    if len(rows) % 3:
-        return False
-    stack = rows.reshape(-1, 3, 3)
-    return bool(np.abs(stack @ stack.transpose(0, 2, 1) - np.eye(3)).max() < ORTHOGONAL_OFF)
-
-
-def _unit(rows: Array) -> bool:
-    return bool(np.abs(np.linalg.norm(rows, axis=1) - 1).max() < UNIT_OFF)
-
-
-def join_halves(halves: Sequence[Half]) -> list[Record]:
-    """The poses of halves that belong together by their names, or are the only two."""
-    turns, places = [h for h in halves if h.turns], [h for h in halves if not h.turns]
+def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[Record], set[Path]]:
+    """The poses of halves that belong together by their names or are the only two, and the files they were in."""
+    kinds: tuple[list[Any], list[Any]] = ([], [])
+    for path, where, rows in halves:
+        words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", f"{path.stem} {where}").lower())
+        roles = [found for word in words if (found := HALVES.fullmatch(word))]
+        turns = rows.shape[1] != 3 or (bool(roles) and not any(found[1] for found in roles))
+        rest = [word for word in words if not HALVES.fullmatch(word)]
+        kinds[not turns].append((path, where, rows, rest))
     records: list[Record] = []
-    for turn in turns:
-        near = [p for p in places if len(p.rows) == len(turn.rows) and p.path.parent == turn.path.parent]
-        named = [p for p in near if p.rest == turn.rest]
-        if len(named) != 1:
-            alone = sum(len(t.rows) == len(turn.rows) for t in turns) == 1
-            named = near if alone and len(near) == 1 else []
-        for place in named:
-            wide = turn.rows.shape[1] == 9
-            both = np.hstack([turn.rows, place.rows] if wide else [place.rows, turn.rows])
-            kind = "rotation" if turn.rows.shape[1] == 3 else ""
-            where = f"{turn.field}+{place.field}" if place.path == turn.path else f"with {place.path.name}"
-            records += [Record(turn.path, where, f"[{k}]", squared(row), kind) for k, row in enumerate(both)]
-    return records
+    used: set[Path] = set()
+    for path, where, turns, rest in kinds[0]:
+        near = [place for place in kinds[1] if len(place[2]) == len(turns) and place[0].parent == path.parent]
+        named = [place for place in near if place[3] == rest]
+        if len(named) != 1 and sum(len(other[2]) == len(turns) for other in kinds[0]) == 1:
+            named = near
+        if len(named) == 1:
+            matrices, field_name = turns.shape[1] == 9, f"{where}+{named[0][1]}" if where else "row"
+            both = np.hstack([turns, named[0][2]] if matrices else [named[0][2], turns])
+            named_as = "rotation" if turns.shape[1] == 3 else ""
+            records += [Record(path, field_name, f"[{k}]", squared(row), named_as) for k, row in enumerate(both)]
+            used |= {path, named[0][0]}
+    return records, used
