@@ -22,7 +22,8 @@ UNIT_SHARE = 0.2
 LEAST_FRAMES = 5
 DOUBT, REFUSE = 1.0, 5.0
 DOUBT_SIGMAS, REFUSE_SIGMAS = 3.0, 5.0
-EXPLAINS = 0.5
+EXPLAINS, CLEARLY = 0.5, 0.7
+"""Shares of the squared residuals from which a scale is believed, and from which it refuses by itself."""
 INDEPENDENT = (
     "closed form against adjustment",
     "closed form against least squares",
@@ -65,7 +66,7 @@ class Scale:
 
     def check(self, others: Iterable[Check]) -> Check:
         """How far it is from 1; a doubt where it stands alone against the `others` of the hand-eye."""
-        alone = self.explained < EXPLAINS and all(c.verdict == "ok" for c in others if c.name in INDEPENDENT)
+        alone = self.explained < CLEARLY and all(c.verdict == "ok" for c in others if c.name in INDEPENDENT)
         share = 100 * self.sigma / max(abs(self.value), 1e-9)
         off = 100 * abs(math.log(max(self.value, 1e-9)))
         if self.unit is not None:
