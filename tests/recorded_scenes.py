@@ -45,10 +45,12 @@ def scene(
     board: str = BOARD.name,
     focal: float = 1.0,
     tilt: float = 0.45,
+    spread: float = 1.0,
 ) -> list[RecordedFrame]:
     """Frames with poses. `bend` in m at the board's edge; turns about `axes` axes; `second`: frames of another line.
 
-    `focal`: the boards are seen with so many times the focal length. `tilt`: at most, rad, each way.
+    `focal`: the boards are seen with so many times the focal length. `tilt`: at most, rad, each way. `spread`: of the
+    board's place before the camera; an arm that goes round the board leaves it in one place.
     """
     rng = np.random.default_rng(seed)
     spec = parse_board(board)
@@ -62,6 +64,7 @@ def scene(
         angles += (0.25, 0.1, 0.3) if axes < 2 else (0.0, 0.0, 0.0)
         turn = _turn(2, angles[2]) @ _turn(0, angles[0]) @ _turn(1, angles[1])
         at = np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.035, 0.035), 0.4 + rng.uniform(-0.06, 0.06)])
+        at = (0.0, 0.0, 0.4) + spread * (at - (0.0, 0.0, 0.4))
         camera_from_board = pin.SE3(turn, at - turn @ middle)
         frame = RecordedFrame(Path(f"frame{k:04d}.png"), f"frame{k:04d}.png")
         frame.view = _view(spec, real, camera_from_board, rng, focal)

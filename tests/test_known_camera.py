@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -63,6 +64,33 @@ def test_other_lenses_are_refused_by_name(tmp_path, model, lens, words):
 def test_a_matrix_that_is_no_camera_is_refused(tmp_path, matrix, words):
     with pytest.raises(ConfigError, match=words):
         read_camera(file_of(tmp_path, "plumb_bob", "0, 0, 0, 0, 0", matrix))
+
+
+VISP = """<?xml version="1.0"?><root><camera><name>Camera</name>
+<image_width>1280</image_width><image_height>960</image_height>
+<model><type>perspectiveProjWithoutDistortion</type><px>1380</px><py>1390</py><u0>650</u0><v0>470</v0></model>
+<model><!--lens--><type>perspectiveProjWithDistortion</type>
+<px>1400</px><py>1410</py><u0>650</u0><v0>470</v0><kud>-0.1</kud><kdu>0.11</kdu></model>
+</camera></root>"""
+
+
+@pytest.mark.parametrize("kind", ["camera.xml", "camera.yml", "camera.json", "visp.xml"])
+def test_files_of_opencv_and_visp_are_read(tmp_path, kind):
+    """Written by OpenCV itself, sizes and lens under the names of its own sample."""
+    path = tmp_path / kind
+    lens = (-0.1, 0.0, 0.0, 0.0, 0.0) if kind.startswith("visp") else (-0.1, 1e-05, 0.001, -0.001, 0.2)
+    if kind.startswith("visp"):
+        path.write_text(VISP)
+    else:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for name, value in (("calibration_time", "Mon"), ("image_width", 1280), ("image_height", 960)):
+            storage.write(name, value)
+        storage.write("camera_matrix", np.array([[1400.0, 0, 650], [0, 1410, 470], [0, 0, 1]]))
+        storage.write("distortion_coefficients", np.array([lens]).T)
+        storage.release()
+    camera = read_camera(path)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx) == (1280, 960, 1400, 1410, 650)
+    assert camera.dist == lens
 
 
 def test_a_given_camera_without_pictures_is_refused():

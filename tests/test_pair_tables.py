@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from cell.calibration.recorded.attach import Options
 from cell.calibration.recorded.command import calibrate_folder
-from cell.calibration.recorded.pair_tables import _inverse
+from cell.calibration.recorded.pair_tables import goes_inverse
 from cell.cli.app import app
 from drivers.errors import ConfigError, RefusedError
 from tests.recorded_scenes import FLANGE_FROM_CAMERA, scene
@@ -55,7 +55,7 @@ def test_degrees_in_mm_and_rotation_vectors_in_m_are_told_apart(tmp_path):
     ],
 )
 def test_which_way_a_table_goes_is_told_by_its_name_or_not_at_all(name, inverse):
-    assert _inverse(f"{name}.csv") is inverse
+    assert goes_inverse(f"{name}.csv") is inverse
 
 
 @pytest.mark.parametrize("name", ["cam2board.txt", "T_board_from_camera.txt"])

@@ -10,12 +10,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.calibration.recorded.decide import decide
 from cell.calibration.recorded.folder import RecordedFrame, read_pose_pairs
 from cell.calibration.recorded.pairs import calibrate_pairs
+from cell.calibration.recorded.series import Series
+from cell.calibration.recorded.texts import Record
+from cell.calibration.solve.consistency import odd_turns
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
 from drivers.errors import ConfigError
-from tests.recorded_scenes import DOTS_PX, LENS, MATRIX, SIZE, scene
+from tests.recorded_scenes import BOARD, DOTS_PX, FLANGE_FROM_CAMERA, LENS, MATRIX, SIZE, scene
 from tests.test_no_confident_wrong_answer import right, solved
 
 
@@ -65,6 +69,47 @@ def test_pairs_of_one_stop_count_as_one():
     np.testing.assert_allclose(often["hand_eye"]["sigma_mm"], once["hand_eye"]["sigma_mm"], rtol=1e-3)
     with pytest.raises(ConfigError, match="of 3 stops"):
         calibrate_pairs([pair for pair in pairs[:3] for _ in range(4)])
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_views_that_do_not_turn_carry_no_vote(seed):
+    """Of 15 views 11 have one orientation, and agree with every rotation; wrong ones among the others are named."""
+    pairs = given_pairs(scene(seed, count=15, arm_mm=0.5, arm_mrad=2.0, laser=False))
+    still = [k for k in range(15) if k not in (2, 5, 8, 12)]
+    flange, board = pairs[0]
+    base_from_board = flange * FLANGE_FROM_CAMERA * board
+    rng = np.random.default_rng(seed)
+    for k in still:
+        moved = pin.SE3(flange.rotation @ pin.exp3(rng.normal(0, 2e-3, 3)), flange.translation + rng.normal(0, 0.04, 3))
+        seen = (moved * FLANGE_FROM_CAMERA).inverse() * base_from_board
+        pairs[k] = (moved, pin.SE3(seen.rotation @ pin.exp3(rng.normal(0, 2e-3, 3)), seen.translation))
+    result = calibrate_pairs(pairs)
+    assert all(f["used"] for f in result["frames"])
+    off = np.linalg.norm(np.array(result["hand_eye"]["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation)
+    assert off < 3 * np.linalg.norm(result["hand_eye"]["sigma_mm"])
+    one = Series("poses", [Record(Path("poses"), "row", "", f.homogeneous.ravel()) for f, _ in pairs])
+    one.of = dict(enumerate(one.records))
+    decision = decide([one], {k: [b] for k, (_, b) in enumerate(pairs)}, 0.018)
+    assert decision.best.reading.name == "matrix-4x4"
+    flanges = [f for f, _ in pairs]
+    turn = pin.log3(flanges[0].rotation.T @ flanges[5].rotation)
+    flanges[5] = pin.SE3(flanges[5].rotation @ pin.exp3(0.3 * turn / np.linalg.norm(turn)), flanges[5].translation)
+    assert list(odd_turns(flanges, [b for _, b in pairs])) == [5]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_scale_that_stands_alone_is_a_doubt_beside_the_value(seed):
+    """28 views round a board: what moves the boards a little looks like a scale, and the hand-eye is right."""
+    pairs = given_pairs(scene(seed, count=28, arm_mm=0.6, arm_mrad=0.3, laser=False, spread=0.15))
+    at = np.array([b.act(BOARD.points().mean(axis=0)) for _, b in pairs])
+    off = (at - at.mean(axis=0)) * (1 / 1.15 - 1)
+    pairs = [(f, pin.SE3(b.rotation, b.translation + d)) for (f, b), d in zip(pairs, off, strict=True)]
+    result = calibrate_pairs(pairs)
+    (check,) = (c for c in result["checks"] if "travel" in c["name"])
+    assert check["verdict"] == "doubt", check
+    off = np.array(result["hand_eye"]["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation
+    sigma = np.linalg.norm(result["hand_eye"]["sigma_mm"])
+    assert np.linalg.norm(off) / 3 < sigma < 1.0
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def calibrate(
         str | None,
         typer.Option(
             "--laser",
-            help="The laser's colour: red, green, blue, grey; or auto: the pictures tell, which is the default.",
+            help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
         ),
     ] = None,
     json: JsonOption = False,
@@ -132,14 +132,14 @@ def _setup(text: str | None) -> str | None:
     return None if text is None else text.replace("-", "_")
 
 
-def _laser(text: str | None) -> Laser:
+def _laser(text: str | None) -> Laser | None:
     from cell.vision import Laser
     from drivers.errors import ConfigError
 
-    allowed = ("red", "green", "blue", "grey", "auto")
+    allowed = ("none", "red", "green", "blue", "grey", "auto")
     if text not in (None, *allowed):
         raise ConfigError(f"--laser {text}: allowed are {', '.join(allowed)}")
-    return Laser(text or "auto")
+    return None if text == "none" else Laser(text or "auto")
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool) -> None:

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.calibration.recorded.conventions import Reading
 from cell.calibration.recorded.series import Series
-from cell.calibration.solve.consistency import odd_turns, orders
+from cell.calibration.solve.consistency import odd_turns, orders, turn_votes, weighted_median
 from cell.calibration.solve.hand_eye import park_martin
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
@@ -127,15 +127,18 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     # What turned by another angle than the board did is of another frame, whatever the hand-eye: it would bend it.
     odd = odd_turns(flanges, boards)
     kept = [k for k in range(len(flanges)) if k not in odd]
+    # A view that is turned like most agrees with these whatever the rotation: those that turn decide.
+    votes = turn_votes(flanges, boards)
     rotation, turn = np.eye(3), math.inf
     for _ in range(3):
         rotation = park_martin([flanges[k] for k in kept], [boards[k] for k in kept])
         there = [f.rotation @ rotation @ b.rotation for f, b in zip(flanges, boards, strict=True)]
         apart = np.array([[angle(a, b) for b in there] for a in there])
-        middle = int(np.argmin(np.median(apart, axis=1)))
-        turn = float(np.median(np.delete(apart[middle], middle)))
+        typical = weighted_median(apart, votes)
+        middle = int(np.argmin(typical))
+        turn = float(typical[middle])
         agree = [k for k in range(len(flanges)) if apart[middle, k] <= max(4 * turn, 0.02)]
-        if agree == kept or len(agree) < max(3, 0.6 * len(flanges)):
+        if agree == kept or len(agree) < 3 or votes[agree].sum() < 0.6 * votes.sum():
             break
         kept = agree
     return rotation, turn, kept

@@ -13,7 +13,6 @@ from cell.calibration.recorded.agreement import scaled
 from cell.calibration.recorded.conventions import why_not
 from cell.calibration.recorded.decide import Decision, decide, scale_problem
 from cell.calibration.recorded.folder import RecordedFrame
-from cell.calibration.recorded.listing import natural
 from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
 from cell.vision.board.board import board_pose
@@ -33,7 +32,7 @@ class Options:
 
     `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
     eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
-    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read.
+    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read, None for none.
     """
 
     poses: str | None = None
@@ -42,7 +41,7 @@ class Options:
     plan: bool = False
     camera: CameraModel | None = None
     hold_camera: bool = False
-    laser: Laser = Laser.AUTO
+    laser: Laser | None = Laser.AUTO
 
 
 @dataclass
@@ -72,10 +71,9 @@ def attach_poses(
         _lend(one, frames)
     if camera is None:
         return Understood(about={"source": [s.name for s in series]}, notes=[])
-    in_order = [other for one in series for other in (_in_order(one, frames), _as_words(one, frames)) if other]
     boards = {}
     for k, frame in enumerate(frames):
-        if frame.view is None or frame.reason is not None or not any(k in s.of for s in (*series, *in_order)):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
             continue
         try:
             boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
@@ -91,7 +89,7 @@ def attach_poses(
         )
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
-        decision = decide(series, boards, pitch, options.poses, options.setup, in_order)
+        decision = decide(series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
         return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
     return _apply(decision, frames, pitch, options)
@@ -100,32 +98,7 @@ def attach_poses(
 def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, options: Options) -> Understood:
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
-    understood = Understood(
-        best.setup,
-        {
-            "source": [one.name],
-            "reading": best.reading.name,
-            "text": best.reading.text,
-            "unit": best.unit,
-            "setup": best.setup,
-            "matched_by": one.by,
-            "given": [n for n, v in vars(options).items() if v and n != "plan"],
-            "evidence": decision.evidence,
-            "turn_deg": float(np.degrees(best.turn)),
-            "shift_mm": 1e3 * best.shift,
-        },
-    )
-    if decision.by_name is not None and one.by == "order as words":
-        understood.notes.append(
-            f"the poses of {one.name} belong to the pictures sorted as words (1, 10, 2), which leaves {best.left}; in "
-            f"the order of their numbers they leave {decision.by_name.left}"
-        )
-    elif decision.by_name is not None:
-        decision.by_name.series.alone = []
-        understood.notes.append(
-            f"the numbers of poses and pictures do not go together: the poses of {one.name} were taken in order, which "
-            f"leaves {best.left}; by name they leave {decision.by_name.left}"
-        )
+    understood = Understood(best.setup, about_poses(decision, options))
     understood.notes += [
         f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
         for name in decision.boards_own
@@ -161,32 +134,29 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
     return understood
 
 
+def about_poses(decision: Decision, options: Options) -> dict[str, Any]:
+    """How the poses were read, for the JSON."""
+    best = decision.best
+    return {
+        "source": [best.series.name],
+        "reading": best.reading.name,
+        "text": best.reading.text,
+        "unit": best.unit,
+        "setup": best.setup,
+        "matched_by": best.series.by,
+        "given": [n for n in ("poses", "pose_field", "setup") if getattr(options, n)],
+        "evidence": decision.evidence,
+        "turn_deg": float(np.degrees(best.turn)),
+        "shift_mm": 1e3 * best.shift,
+    }
+
+
 def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
     """Give a frame without a pose that of another picture of its place."""
     index = {id(frame): k for k, frame in enumerate(frames)}
     for k, frame in enumerate(frames):
         if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
             one.of.setdefault(index[id(frame.shows)], one.of[k])
-
-
-def _in_order(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
-    """The same poses given to the pictures in order, where there are as many and their names say otherwise."""
-    places = [k for k, f in enumerate(frames) if f.shows is None]
-    if one.by not in ("name", "number") or len(places) != len(one.records):
-        return None
-    single = len({r.path for r in one.records}) == len(one.records)
-    records = sorted(one.records, key=lambda r: natural(r.path.name if single else r.label or ""))
-    of = dict(zip(places, records, strict=True))
-    return None if all(one.of.get(k) is r for k, r in of.items()) else Series(one.name, records, of, "order")
-
-
-def _as_words(one: Series, frames: Sequence[RecordedFrame]) -> Series | None:
-    """Rows in the order in which the pictures' names are sorted as words: 1, 10, 2; None where that is no other."""
-    places = [k for k, f in enumerate(frames) if f.shows is None]
-    words = sorted(places, key=lambda k: frames[k].name)
-    if one.by != "order" or words == places or len(places) != len(one.records):
-        return None
-    return Series(one.name, one.records, dict(zip(words, one.records, strict=True)), "order as words")
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

@@ -85,6 +85,8 @@ def solve_chain(
         )
     setup, observations, staged = _placed(frames, pictures, known)
     scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)
+    if scale is not None:
+        scale = scale.with_focal(float(pictures.sigma[0]) / pictures.camera.fx)
     _refuse_strangers(staged, scale)
     staged, stripes, no_plane = _with_plane(observations, staged, pictures)
     choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
@@ -216,7 +218,7 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     """The absolute checks of hand-eye and light plane."""
     made = hand_eye_checks(chain.choice, chain.staged.camera_from_board, pictures)
     if chain.scale is not None:
-        made.append(chain.scale.check())
+        made.append(chain.scale.check(made))
     best, staged = chain.choice.best, chain.staged
     state = best.adjusted.state
     known = chain.plane_known

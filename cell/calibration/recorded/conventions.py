@@ -1,103 +1,80 @@
-"""What the numbers of a pose may mean: quaternions in both orders, rotation vectors, Euler angles, matrices.
+"""What the numbers of a pose may mean: the table of conventions that are tried, and the names that --poses knows.
 
 Nothing is chosen here: `decide.py` asks the pictures which reading they agree with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import pinocchio as pin
-import scipy
+from scipy.spatial.transform import Rotation
 
+from cell.calibration.recorded.texts import COUNTS, ORTHOGONAL_OFF
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_matrix, from_parts, from_quaternion
 from drivers.errors import ConfigError
 
-# Matrices are written with few digits at times.
-ORTHOGONAL_OFF = 0.02
+TRIED = {
+    "xyz+quaternion-xyzw": "quaternion xyzw",
+    "xyz+quaternion-wxyz": "quaternion wxyz",
+    "xyz+rotvec-rad": "rotation vector, in rad",
+    "xyz+rpy-rad": "roll, pitch, yaw about fixed x, y, z, in rad",
+    "xyz+rpy-deg": "roll, pitch, yaw about fixed x, y, z, in deg",
+    "xyz+abc-deg": "KUKA's A, B, C about z, the new y, the new x, in deg",
+    "xyz+zyz-deg": "Euler angles about z, the new y, the new z, in deg",
+    "matrix-4x4": "4×4 matrix by rows",
+    "matrix-4x4-by-columns": "4×4 matrix by columns",
+}
+"""The readings that are tried without being asked for, with a text for people."""
+FORM = (
+    "xyz+KIND or KIND+xyz, with KIND quaternion-xyzw, quaternion-wxyz, rotvec-rad, rpy-deg, or three axes such as "
+    "ZYX-deg (about the turned axes) and zyx-rad (about the fixed ones); matrix-4x4, matrix-4x4-by-columns"
+)
+NAMED = re.compile(r"(xyz\+)?(?:quaternion-(xyzw|wxyz)|(rotvec|rpy|abc|[xyz]{3}|[XYZ]{3})-(rad|deg))(\+xyz)?")
+SEQUENCES = {"rpy": "xyz", "abc": "ZYX", "zyz": "ZYZ"}
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A meaning of `count` numbers: `name` for --poses, `text` for people, `pose` from numbers, lengths as they are."""
+    """A meaning of `count` numbers by its name for --poses."""
 
     name: str
-    count: int
-    text: str
-    pose: Callable[[Array], pin.SE3]
+
+    @property
+    def count(self) -> int:
+        """How many numbers it takes."""
+        return 16 if self.name.startswith("matrix") else 7 if "quaternion" in self.name else 6
+
+    @property
+    def text(self) -> str:
+        """The reading in words."""
+        return TRIED.get(self.name, self.name)
+
+    def pose(self, numbers: Array) -> pin.SE3:
+        """The pose of numbers (count,), lengths as they are. Raises ValueError where they are none."""
+        found = NAMED.fullmatch(self.name)
+        if found is None:
+            return _matrix(numbers.reshape(4, 4).T if self.name.endswith("columns") else numbers.reshape(4, 4))
+        turn, place = (numbers[3:], numbers[:3]) if found[1] else (numbers[:-3], numbers[-3:])
+        if found[2]:
+            return from_quaternion(place, turn if found[2] == "xyzw" else turn[[1, 2, 3, 0]])
+        if found[3] == "rotvec":
+            return from_parts(place, Rotation.from_rotvec(turn, degrees=found[4] == "deg").as_matrix())
+        rotation = Rotation.from_euler(SEQUENCES.get(found[3], found[3]), turn, degrees=found[4] == "deg")
+        return from_parts(place, rotation.as_matrix())
 
 
-def _quaternion(numbers: Array, first: bool, wxyz: bool) -> pin.SE3:
-    turn, place = (numbers[:4], numbers[4:]) if first else (numbers[3:], numbers[:3])
-    return from_quaternion(place, turn[[1, 2, 3, 0]] if wxyz else turn)
-
-
-def _angles(numbers: Array, first: bool, kind: str, degrees: bool) -> pin.SE3:
-    turn, place = (numbers[:3], numbers[3:]) if first else (numbers[3:], numbers[:3])
-    if kind == "rotvec":
-        rotation = scipy.spatial.transform.Rotation.from_rotvec(turn, degrees=degrees)
-    else:
-        rotation = scipy.spatial.transform.Rotation.from_euler(kind, turn, degrees=degrees)
-    return from_parts(place, rotation.as_matrix())
-
-
-def _nine(numbers: Array, first: bool, transposed: bool) -> pin.SE3:
-    turn, place = (numbers[:9], numbers[9:]) if first else (numbers[3:], numbers[:3])
-    matrix = turn.reshape(3, 3).T if transposed else turn.reshape(3, 3)
-    return _rigid(matrix, place)
-
-
-def _matrix(numbers: Array, columns: bool) -> pin.SE3:
-    rows = len(numbers) // 4
-    matrix = numbers.reshape(4, rows).T if columns else numbers.reshape(rows, 4)
-    # Some write zeros where the last 1 belongs.
-    if rows == 4 and (np.abs(matrix[3, :3]).max() > 1e-6 or min(abs(matrix[3, 3] - 1), abs(matrix[3, 3])) > 1e-6):
-        raise ValueError(f"its last row is {matrix[3].tolist()}, not 0 0 0 1")
-    return _rigid(matrix[:3, :3], matrix[:3, 3])
-
-
-def _rigid(rotation: Array, place: Array) -> pin.SE3:
+def _matrix(whole: Array) -> pin.SE3:
+    """The pose of a 4×4. Some write zeros where the last 1 belongs."""
+    last, rotation = whole[3], whole[:3, :3]
+    if np.abs(last[:3]).max() > 1e-6 or min(abs(last[3] - 1), abs(last[3])) > 1e-6:
+        raise ValueError(f"its last row is {last.tolist()}, not 0 0 0 1")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHOGONAL_OFF:
         raise ValueError(f"its 3×3 is no rotation: {np.round(rotation, 4).tolist()}")
-    whole = np.eye(4)
-    whole[:3, :3], whole[:3, 3] = rotation, place
-    return from_matrix(whole)
-
-
-def _readings() -> dict[str, Reading]:
-    found: list[Reading] = []
-    for first in (False, True):
-        place = "{}+xyz" if first else "xyz+{}"
-        for order in ("xyzw", "wxyz"):
-            pose = partial(_quaternion, first=first, wxyz=order == "wxyz")
-            found.append(Reading(place.format(f"quaternion-{order}"), 7, f"quaternion {order}", pose))
-        for kind, name, text in (
-            ("rotvec", "rotvec", "rotation vector"),
-            ("xyz", "rpy", "roll, pitch, yaw about fixed x, y, z"),
-            ("XYZ", "euler-xyz", "Euler angles about x, then the new y, then the new z"),
-            ("ZYX", "abc", "angles A, B, C about z, then the new y, then the new x"),
-            ("ZYZ", "euler-zyz", "Euler angles about z, then the new y, then the new z"),
-            ("ZXZ", "euler-zxz", "Euler angles about z, then the new x, then the new z"),
-            ("zyx", "ypr", "yaw, pitch, roll about fixed z, y, x"),
-        ):
-            for unit in ("rad", "deg"):
-                pose = partial(_angles, first=first, kind=kind, degrees=unit == "deg")
-                found.append(Reading(place.format(f"{name}-{unit}"), 6, f"{text}, in {unit}", pose))
-        for by, text in (("", "rows"), ("-by-columns", "columns")):
-            pose = partial(_nine, first=first, transposed=bool(by))
-            found.append(Reading(place.format(f"rotation-9{by}"), 12, f"3×3 rotation by {text}", pose))
-    for rows in (3, 4):
-        for by, text in (("", "rows"), ("-by-columns", "columns")):
-            pose = partial(_matrix, columns=bool(by))
-            found.append(Reading(f"matrix-{rows}x4{by}", 4 * rows, f"{rows}×4 matrix by {text}", pose))
-    return {r.name: r for r in found}
-
-
-READINGS = _readings()
+    return from_matrix(np.vstack([whole[:3], [0.0, 0.0, 0.0, 1.0]]))
 
 
 def readings_of(count: int, named: str, wanted: str | None) -> list[Reading]:
@@ -105,27 +82,29 @@ def readings_of(count: int, named: str, wanted: str | None) -> list[Reading]:
 
     `named` is a record's: "quaternion" or "rotation" (position first), or empty.
     """
-    if wanted is not None:
-        return [READINGS[wanted]] if READINGS[wanted].count == count else []
-    if named == "quaternion":
-        return [READINGS["xyz+quaternion-xyzw"]]
-    return [r for r in READINGS.values() if r.count == count and not (named and not r.name.startswith("xyz+"))]
+    if wanted is None and named == "quaternion":
+        wanted = "xyz+quaternion-xyzw"
+    return [r for r in map(Reading, TRIED if wanted is None else (wanted,)) if r.count == count]
 
 
 def check_reading(name: str | None) -> None:
     """ConfigError for a name that --poses does not know."""
-    if name is not None and name not in READINGS:
-        raise ConfigError(f"--poses {name}: unknown, allowed are {', '.join(READINGS)}")
+    found = None if name is None else NAMED.fullmatch(name)
+    good = found is not None and bool(found[1]) != bool(found[5])
+    if good and found is not None and found[3] not in (None, "rotvec", *SEQUENCES):
+        good = all(a != b for a, b in zip(found[3], found[3][1:], strict=False))
+    if name is not None and not good and name not in TRIED:
+        raise ConfigError(f"--poses {name}: unknown, allowed is {FORM}")
 
 
-def why_not(record_numbers: Array, named: str, wanted: str | None) -> str:
-    """Why no reading makes a pose of these numbers."""
-    if not np.isfinite(record_numbers).all():
+def why_not(numbers: Array, named: str, wanted: str | None) -> str:
+    """Why no reading makes a pose of these numbers (n,)."""
+    if not np.isfinite(numbers).all():
         return "it holds values that are not finite"
-    errors = []
-    for reading in readings_of(len(record_numbers), named, wanted):
+    for reading in readings_of(len(numbers), named, wanted):
         try:
-            reading.pose(record_numbers)
+            reading.pose(numbers)
         except ValueError as error:
-            errors.append(str(error))
-    return errors[0] if errors else f"it holds {len(record_numbers)} numbers, which --poses {wanted} does not mean"
+            return str(error)
+    what = f"which --poses {wanted} does not mean" if wanted else f"a pose has {', '.join(map(str, COUNTS))}"
+    return f"it holds {len(numbers)} numbers, {what}"

@@ -16,9 +16,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
+from cell.calibration.recorded.drawn import set_copies_aside, small_copy
 from cell.calibration.recorded.listing import PICTURES, Listing
-from cell.calibration.recorded.matching import frame_key, made_of_others
+from cell.calibration.recorded.matching import frame_key
 from cell.calibration.recorded.places import Place, find_places, named_lit
 from cell.calibration.recorded.stripes import Channel, ReadStripe, Source, choose_channel, read_on_board
 from cell.geometry.camera import Array
@@ -66,23 +68,23 @@ class RecordedFrame:
 
 
 def read_frames(
-    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (), laser: Laser = Laser.AUTO
+    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (), laser: Laser | None = Laser.AUTO
 ) -> tuple[list[RecordedFrame], Channel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together. Raises ConfigError when there are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError when there are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
     frames = [RecordedFrame(path, listing.name(path)) for path in listing.pictures]
     seen: dict[str, RecordedFrame] = {}
-    _set_made_ones_aside(frames)
+    small: list[NDArray[np.float32] | None] = []
     for frame in frames:
-        if frame.reason is not None:
-            continue
         image = None
+        small.append(None)
         try:
             image = read_picture(frame.path)
+            small[-1] = small_copy(image)
             frame.view = find_board(image, spec)
         except PictureRefused as refused:
             raw = RAW if refused.reason is Reason.NO_BOARD and image is not None and looks_raw(image) else ""
@@ -98,6 +100,7 @@ def read_frames(
             if first is not frame:
                 frame.shows = first
                 frame.refuse(Reason.DUPLICATE, f"the same file as {first.name}")
+    set_copies_aside(frames, small)
     _refuse_other_sizes(frames)
     channel = _read_stripes(frames, find_places(frames, links), laser)
     for frame in frames:
@@ -105,20 +108,6 @@ def read_frames(
         while frame.shows is not None and frame.shows.shows is not None:
             frame.shows = frame.shows.shows
     return frames, channel
-
-
-def _set_made_ones_aside(frames: Sequence[RecordedFrame]) -> None:
-    """Pictures that a program made of others beside them, by their names: they show no more, or another lens."""
-    plain: dict[str, RecordedFrame] = {}
-    for frame in frames:
-        if not made_of_others(frame.name):
-            plain.setdefault(frame_key(frame.name), frame)
-    for frame in frames:
-        key = frame_key(frame.name)
-        first = plain.get(key) if key and made_of_others(frame.name) else None
-        if first is not None:
-            frame.shows = first
-            frame.refuse(Reason.DUPLICATE, f"by its name it was made of {first.name}")
 
 
 def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
@@ -139,7 +128,7 @@ def _refuse_other_sizes(frames: Sequence[RecordedFrame]) -> None:
             )
 
 
-def _read_stripes(frames: Sequence[RecordedFrame], places: Sequence[Place], laser: Laser) -> Channel:
+def _read_stripes(frames: Sequence[RecordedFrame], places: Sequence[Place], laser: Laser | None) -> Channel:
     """Read the stripe of each board in its own picture or in another of its place, and set the others aside."""
     sources = [place.sources() for place in places]
     boards = {id(f) for place in places for f in (place.board, *place.others)}

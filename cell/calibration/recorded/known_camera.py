@@ -1,15 +1,14 @@
-"""A camera that is known already, from a file: JSON of an earlier result, or YAML as OpenCV and ROS write it."""
+"""A camera that is known already, from a file: JSON of an earlier result, YAML or XML as OpenCV, ROS and ViSP write."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cell.calibration.recorded.yaml_subset import read_yaml
+from cell.calibration.recorded.texts import decoded, stored_matrix, structured
 from cell.geometry.camera import PARAMETER_NAMES, CameraModel
 from drivers.errors import ConfigError
 
@@ -41,20 +40,41 @@ LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion")
 def read_camera(path: Path) -> CameraModel:
     """The camera of a file. Raises ConfigError that says what is missing."""
     try:
-        text = path.read_text(encoding="utf-8")
-        data = json.loads(text) if path.suffix.lower() == ".json" else read_yaml(text)
+        data = structured(path.suffix.lower(), decoded(path.read_bytes()))
     except (OSError, ValueError) as error:
         raise ConfigError(f"--camera {path}: it cannot be read: {error}") from error
-    if isinstance(data, dict) and isinstance(data.get("intrinsics"), dict):
-        data = data["intrinsics"]
     if not isinstance(data, dict):
         raise ConfigError(f"--camera {path}: {FORM}")
     try:
-        return _camera(data)
+        return _camera(_inner(data))
     except ConfigError as error:
         raise ConfigError(f"--camera {path}: {error}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"--camera {path}: {FORM}; {error} is missing or no number") from error
+
+
+def _inner(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The map that holds the camera: below `intrinsics`, OpenCV's storage, or ViSP's last model with its size."""
+    if any(name in data for name in (*MATRICES, "fx")):
+        return data
+    if "model" in data and {"image_width", "image_height"} <= set(data):
+        models = data["model"] if isinstance(data["model"], list) else [data["model"]]
+        return {**_of_visp(models[-1]), "width": data["image_width"], "height": data["image_height"]}
+    for value in data.values():
+        several = value if isinstance(value, list) else [value]
+        if several and isinstance(several[-1], dict) and "data" not in several[-1]:
+            found = _inner(several[-1])
+            if any(name in found for name in (*MATRICES, "fx")):
+                return {**data, **found}
+    return data
+
+
+def _of_visp(model: Mapping[str, Any]) -> dict[str, Any]:
+    """ViSP's names as those used here: its kud is k1, its kdu an inverse that is not needed."""
+    if "Kannala" in str(model.get("type")):
+        raise ConfigError(f"the model's type is {model['type']}, read can be perspectiveProjWithDistortion; {NEXT}")
+    lens = {"k1": model.get("kud", 0.0)}
+    return {"fx": model["px"], "fy": model["py"], "cx": model["u0"], "cy": model["v0"], **lens}
 
 
 def _camera(data: Mapping[str, Any]) -> CameraModel:
@@ -123,4 +143,5 @@ def _first(data: Mapping[str, Any], names: tuple[str, ...]) -> Any:
 
 
 def _numbers(value: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return np.ravel(np.asarray(value["data"] if isinstance(value, dict) else value, dtype=np.float64))
+    matrix = stored_matrix(value) if isinstance(value, dict) else value
+    return np.ravel(np.asarray(value["data"] if matrix is None else matrix, dtype=np.float64))

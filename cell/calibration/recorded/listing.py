@@ -1,7 +1,4 @@
-"""What lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name.
-
-Nothing is left out silently: hidden files, archives, broken links and unknown kinds are listed with the reason.
-"""
+"""What lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name."""
 
 from __future__ import annotations
 
@@ -13,18 +10,15 @@ from pathlib import Path
 from drivers.errors import ConfigError
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz")
-ARCHIVES = (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz")
-BAGS = (".bag", ".db3", ".mcap")
+TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz", ".pos")
 OTHERS = {
-    ".xlsx": "a spreadsheet: save it as CSV",
-    ".xls": "a spreadsheet: save it as CSV",
-    ".ods": "a spreadsheet: save it as CSV",
-    ".mat": "a file of MATLAB: save its poses with writematrix as CSV",
-    ".pkl": "a pickle, which may run code when it is read: save its arrays with numpy.savez",
-    ".pickle": "a pickle, which may run code when it is read: save its arrays with numpy.savez",
+    (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz"): "an archive: unpack it",
+    (".bag", ".db3", ".mcap"): "a ROS bag: export its pictures and poses to files",
+    (".mp4", ".avi", ".mov", ".mkv", ".webm"): "a film: save its pictures to files",
+    (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
+    (".mat",): "a file of MATLAB: save its poses with writematrix as CSV",
+    (".pkl", ".pickle"): "a pickle, which may run code when it is read: save its arrays with numpy.savez",
 }
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 LARGEST_TEXT = 50_000_000
 
 
@@ -57,9 +51,12 @@ def list_folder(folder: Path) -> Listing:
         for name in [f for f in folders if _hidden(f)]:
             folders.remove(name)
             listing.unread.append((listing.name(Path(root, name)) + "/", "hidden, not read"))
-        folders.sort(key=natural)
         for path in (Path(root, name) for name in files):
-            _sort_in(listing, path)
+            reason = _why_not(path)
+            if reason:
+                listing.unread.append((listing.name(path), reason))
+            else:
+                (listing.pictures if path.suffix.lower() in PICTURES else listing.texts).append(path)
     listing.pictures.sort(key=lambda p: natural(listing.name(p)))
     listing.texts.sort(key=lambda p: natural(listing.name(p)))
     listing.unread.sort(key=lambda u: natural(u[0]))
@@ -75,28 +72,17 @@ def _hidden(name: str) -> bool:
     return name.startswith((".", "__MACOSX"))
 
 
-def _sort_in(listing: Listing, path: Path) -> None:
-    suffix, reason = path.suffix.lower(), ""
+def _why_not(path: Path) -> str:
+    """Why a file is neither a picture nor a text that may be read; empty where it is."""
+    suffix = path.suffix.lower()
     if _hidden(path.name):
-        reason = "hidden, not read"
-    elif not path.exists():
-        reason = "a link to a file that is not there"
-    elif not path.is_file():
-        reason = "no ordinary file"
-    elif suffix in PICTURES:
-        listing.pictures.append(path)
-    elif suffix in TEXTS:
-        if path.stat().st_size > LARGEST_TEXT:
-            reason = f"{path.stat().st_size / 1e6:.0f} MB are too much for a table of poses"
-        else:
-            listing.texts.append(path)
-    elif suffix in ARCHIVES:
-        reason = "an archive: unpack it"
-    elif suffix in BAGS:
-        reason = "a ROS bag: export its pictures and poses to files"
-    elif suffix in VIDEOS:
-        reason = "a film: save its pictures to files"
-    else:
-        reason = OTHERS.get(suffix, "neither a picture nor a table that is known")
-    if reason:
-        listing.unread.append((listing.name(path), reason))
+        return "hidden, not read"
+    if not path.exists():
+        return "a link to a file that is not there"
+    if not path.is_file():
+        return "no ordinary file"
+    if suffix in TEXTS and path.stat().st_size > LARGEST_TEXT:
+        return f"{path.stat().st_size / 1e6:.0f} MB are too much for a table of poses"
+    if suffix in (*PICTURES, *TEXTS):
+        return ""
+    return next((r for kinds, r in OTHERS.items() if suffix in kinds), "neither a picture nor a table that is known")

@@ -1,4 +1,4 @@
-"""Which pose, and which second picture, belongs to which picture: by a table, by name, by number, by time, in order."""
+"""Which pose belongs to which picture: by name, by folder, by number, by time, in order."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.calibration.recorded.listing import PICTURES
+from cell.calibration.recorded.listing import PICTURES, TEXTS
 
 # Words that say what is in a file and not which frame it is of.
 ROLES = (
     "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
     "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
-)
-# Words for pictures that somebody's program made of others: with the board drawn in, or the lens taken out.
-MADE = (
-    "corners?|drawn|draw|detected|detections?|annotated|overlay|vis|visuali[sz]ed|visuali[sz]ations?|undist|undistorted|"
-    "rectified|remapped|debug"
 )
 CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
 
@@ -35,32 +30,28 @@ class Matched:
     alone: list[int]
     doubled: dict[int, list[int]]
 
+    @property
+    def hits(self) -> int:
+        """How many pictures have what belongs to them."""
+        return sum(k is not None for k in self.of)
+
 
 def match(pictures: Sequence[str], labels: Sequence[str | None], times: Sequence[float | None]) -> Matched:
     """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
-    ways = [
-        ("name", list(pictures), [_as_path(x) for x in labels]),
-        ("name", [Path(p).name for p in pictures], [Path(_as_path(x)).name for x in labels]),
-        ("name", [_stem(p) for p in pictures], [_stem(_as_path(x)) for x in labels]),
-        ("name", [_plain(p) for p in pictures], [_plain(_as_path(x)) for x in labels]),
-        ("number", numbers(list(pictures)), numbers([_as_path(x) for x in labels])),
-    ]
-    best: Matched | None = None
-    for by, left, right in ways:
-        if by == "number" and any(x is not None and x.startswith("[") for x in labels):
-            continue
-        found = _equal(left, right, by)
-        hits = sum(k is not None for k in found.of)
-        if hits and (best is None or hits > sum(k is not None for k in best.of)):
-            best = found
-    by_time = _nearest(pictures, labels, times)
-    if by_time is not None and (best is None or sum(k is not None for k in best.of) < len(pictures) / 2):
+    told = ["" if label is None else label.replace("\\", "/") for label in labels]
+    both = (list(pictures), told)
+    ways = [("name", [[of(x) for x in side] for side in both]) for of in (str, _file, _stem, frame_key)]
+    # A folder for each pose.
+    ways.append(("folder", [[str(Path(x).parent) for x in side] for side in both]))
+    if not any(x.startswith("[") for x in told):
+        ways.append(("number", [numbers(side) for side in both]))
+    best = max((_equal(left, right, by) for by, (left, right) in ways), key=lambda found: found.hits)
+    by_time = _nearest(pictures, told, times)
+    if by_time is not None and best.hits < len(pictures) / 2:
         return by_time
-    if best is not None and sum(k is not None for k in best.of) >= min(2, len(pictures)):
-        return best
-    if len(labels) == len(pictures):
+    if len(labels) == len(pictures) and best.hits < 2:
         return Matched(list(range(len(labels))), "order", [], {})
-    return best or Matched([None] * len(pictures), "nothing", list(range(len(labels))), {})
+    return best
 
 
 def numbers(names: list[str]) -> list[str]:
@@ -81,57 +72,46 @@ def _equal(left: list[str], right: list[str], by: str) -> Matched:
         if key:
             many.setdefault(key, []).append(k)
     taken = Counter(key for key in left if key in many)
-    of: list[int | None] = []
-    doubled: dict[int, list[int]] = {}
-    for k, key in enumerate(left):
-        hits = many.get(key, [])
-        of.append(hits[0] if len(hits) == 1 and (taken[key] == 1 or by == "number") else None)
-        if len(hits) > 1:
-            doubled[k] = hits
-    used = {k for k in of if k is not None} | {k for hits in doubled.values() for k in hits}
-    return Matched(of, by, [k for k in range(len(right)) if k not in used], doubled)
+    hits = [many.get(key, []) for key in left]
+    of = [
+        h[0] if len(h) == 1 and (taken[key] == 1 or by != "name") else None for h, key in zip(hits, left, strict=True)
+    ]
+    used = {k for h in hits if len(h) > 1 for k in h} | {k for k in of if k is not None}
+    alone = [k for k in range(len(right)) if k not in used]
+    return Matched(of, by, alone, {k: h for k, h in enumerate(hits) if len(h) > 1})
 
 
-def _nearest(pictures: Sequence[str], labels: Sequence[str | None], times: Sequence[float | None]) -> Matched | None:
+def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> Matched | None:
     """The pose of the nearest time, where names and table have times of the same clock."""
-    shown = [_clock(p) for p in pictures]
-    told = [t if t is not None and math.isfinite(t) else _clock(x or "") for t, x in zip(times, labels, strict=True)]
+    shown = [_clock(Path(p).name) for p in pictures]
+    told = [t if t is not None and math.isfinite(t) else _clock(x) for t, x in zip(times, labels, strict=True)]
     timed = [k for k, t in enumerate(told) if t is not None]
     if len(timed) < 2 or 2 * len(timed) < len(told) or any(s is None for s in shown):
         return None
+    table = np.array([t for t in told if t is not None])
     for scale in (1.0, 1e-3, 1e-6, 1e-9):
         clock = np.array([s for s in shown if s is not None]) * scale
-        table = np.array([t for t in told if t is not None])
         apart = np.abs(clock[:, None] - table[None, :])
-        near = apart.argmin(axis=1)
-        reach = 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
+        near, reach = apart.argmin(axis=1), 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
         good = apart.min(axis=1) <= max(reach, 1e-3)
         if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
             of = [timed[k] if g else None for k, g in zip(near, good, strict=True)]
-            alone = [k for k in range(len(labels)) if k not in set(of)]
-            return Matched(of, "time", alone, {})
+            return Matched(of, "time", [k for k in range(len(labels)) if k not in of], {})
     return None
 
 
 def _clock(name: str) -> float | None:
-    found = CLOCK.search(Path(name).name if Path(name).suffix.lower() in PICTURES else name)
+    found = CLOCK.search(name)
     return None if found is None else float(found[0].replace("_", "."))
 
 
-def _as_path(label: str | None) -> str:
-    return "" if label is None else label.replace("\\", "/")
+def _file(name: str) -> str:
+    return Path(name).name
 
 
 def _stem(name: str) -> str:
     path = Path(name)
-    return path.stem if path.suffix.lower() in (*PICTURES, ".txt", ".csv", ".json", ".yaml", ".yml") else path.name
-
-
-def _plain(name: str) -> str:
-    """The name without the words that say what is in a file."""
-    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
-    told = [w for w in words if w and not re.fullmatch(f"{ROLES}|{MADE}", w)]
-    return "-".join(str(int(w)) if w.isdecimal() else w for w in told)
+    return path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
 
 
 def series_name(name: str) -> str:
@@ -139,11 +119,8 @@ def series_name(name: str) -> str:
     return re.sub(r"\d+", "N", name.lstrip("_"))
 
 
-def made_of_others(name: str) -> bool:
-    """True for a picture whose name or folder says that a program made it of another."""
-    return any(re.fullmatch(MADE, word) for word in re.split(r"[^a-z]+", name.lower()))
-
-
 def frame_key(name: str) -> str:
     """What two pictures of one frame have in common: their name without folders and the words for what is in them."""
-    return _plain(name)
+    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
+    told = [w for w in words if w and not re.fullmatch(ROLES, w)]
+    return "-".join(str(int(w)) if w.isdecimal() else w for w in told)

@@ -81,7 +81,8 @@ def calibrate_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]]) -> dict[str, Any]:
         "pairs of poses only: no intrinsics, no light plane, no flatness",
     ]
     scale = metric_scale(flanges, boards)
-    apply_checks(_checks(refined, closed, sigma, off, boards) + ([] if scale is None else [scale.check()]), result)
+    checks = _checks(refined, closed, sigma, off, boards)
+    apply_checks(checks + ([] if scale is None else [scale.check(checks)]), result)
     return result
 
 

@@ -70,8 +70,8 @@ def frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
 def channel_dict(channel: Channel) -> dict[str, Any]:
     """In what the laser was read, and what spoke for it."""
     return {
-        "asked": str(channel.asked),
-        "channel": str(channel.chosen),
+        "asked": str(channel.asked or "none"),
+        "channel": str(channel.chosen or "none"),
         "looked": channel.looked,
         "votes": channel.votes,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,12 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.conventions import Reading, readings_of
-from cell.calibration.recorded.halves import join_halves
+from cell.calibration.recorded.conventions import Reading
 from cell.calibration.recorded.listing import Listing
 from cell.calibration.recorded.matching import match, series_name
-from cell.calibration.recorded.numbers import read_content
-from cell.calibration.recorded.records import Content, Record
+from cell.calibration.recorded.texts import NEEDED, Content, Record, join_halves, read_content
 from cell.vision.pictures import Reason
 from drivers.errors import ConfigError
 
@@ -73,27 +72,32 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             contents[name] = read_content(path)
         except ValueError as error:
             unread.append((name, str(error)))
-            continue
         except Exception as error:
             # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
             unread.append((name, f"it cannot be read ({type(error).__name__}): {error}"))
-            continue
-    joined = join_halves([half for content in contents.values() for half in content.halves])
+    joined, paired = join_halves([half for content in contents.values() for half in content.halves])
     for name, content in contents.items():
-        if not content.records and not content.links and not any(h.path in _paths(joined) for h in content.halves):
-            unread.append((name, _why_none(content)))
+        if not content.records and not content.links and not any(path in paired for path, _, _ in content.halves):
+            what = (
+                "positions or rotations only: name both files alike, such as R_gripper2base.txt and t_gripper2base.txt"
+            )
+            unread.append((name, f"it holds {what}" if content.halves else f"no pose is in it ({NEEDED} numbers)"))
     groups: dict[tuple[str, str, int], list[Record]] = {}
     for record in joined:
         groups.setdefault((listing.name(record.path), record.field, len(record.numbers)), []).append(record)
+    alike = Counter((path.parent, series_name(path.name)) for path in listing.texts)
     for content in contents.values():
         for record in content.records:
-            alone = sum(r.field == record.field for r in content.records) == 1
-            source = (record.path.parent / series_name(record.path.name)) if alone else record.path
-            source_name = listing.name(source)
-            place = "" if alone and record.field in ("row", "matrix") else record.field
-            groups.setdefault((source_name, place, len(record.numbers)), []).append(record)
+            source, place = listing.name(record.path), record.field
+            if sum(r.field == record.field for r in content.records) == 1:
+                # A folder for each pose: files that are the only one of their kind in theirs are of one series.
+                own = alike[record.path.parent, series_name(record.path.name)] == 1
+                parent = listing.name(record.path.parent)
+                source = series_name(source) if own else (Path(parent) / series_name(record.path.name)).as_posix()
+                place = "" if place == "row" else place
+            groups.setdefault((source, place, len(record.numbers)), []).append(record)
     found = [
-        Series(f"{source}:{place}" if place not in ("", "row", "matrix") else source, records)
+        Series(f"{source}:{place}" if place not in ("", "row") else source, records)
         for (source, place), records in _apart(groups)
     ]
     links = [link for content in contents.values() for link in content.links]
@@ -116,24 +120,13 @@ def _apart(groups: dict[tuple[str, str, int], list[Record]]) -> list[tuple[tuple
                 kinds.setdefault(record.exact, []).append(record)
         if len(kinds) > 1:
             found += [((source, kind), some) for kind, some in kinds.items()]
-        elif count == 12 and not any(_reads(record) for record in records):
+        elif count == 12:
             for half, name in ((slice(0, 6), "numbers1-6"), (slice(6, 12), "numbers7-12")):
                 six = [replace(record, numbers=record.numbers[half]) for record in records]
-                found.append(((source, f"{place}/{name}" if place not in ("", "row", "matrix") else name), six))
+                found.append(((source, f"{place}/{name}" if place not in ("", "row") else name), six))
         else:
             found.append(((source, place), records))
     return found
-
-
-def _reads(record: Record) -> bool:
-    """True where some reading makes a pose of a record, or it has values that are not finite, which tell nothing."""
-    for reading in readings_of(len(record.numbers), record.named, None):
-        try:
-            reading.pose(record.numbers)
-        except ValueError:
-            continue
-        return True
-    return not bool(np.isfinite(record.numbers).all())
 
 
 def match_series(
@@ -217,22 +210,3 @@ def _others(series: Sequence[Series], listing: Listing) -> list[Path]:
             f"{', '.join(sorted(map(listing.name, owners)))}; give one of these folders with --from"
         )
     return sorted(owners - {listing.folder}) if len(owners) > 1 else []
-
-
-def _paths(records: Sequence[Record]) -> set[Path]:
-    """The files of records of which each was joined from two halves: of the rotations, and those it says it is with."""
-    return {r.path for r in records} | {
-        r.path.parent / r.field.removeprefix("with ") for r in records if r.field.startswith("with ")
-    }
-
-
-def _why_none(content: Content) -> str:
-    """Why a text that could be read gives no pose."""
-    half = next((h for h in content.halves if h.called), None)
-    if half is None:
-        return "no pose is in it (6, 7, 12 or 16 numbers that belong together)"
-    here, there = ("rotations", "positions") if half.turns else ("positions", "rotations")
-    return (
-        f"it holds {len(half.rows)} {here} only; name it and the file of the {there} alike, such as "
-        "R_gripper2base.txt and t_gripper2base.txt, with as many rows"
-    )

@@ -68,15 +68,15 @@ class Channel:
     """In what the laser is read: what was `asked`, what was `chosen`, and how many of the pictures that were
     `looked` at stood out in each mix of colours."""
 
-    asked: Laser
-    chosen: Laser
+    asked: Laser | None
+    chosen: Laser | None
     looked: int = 0
     votes: dict[str, int] = field(default_factory=dict)
     reads: dict[Path, ReadStripe] = field(default_factory=dict)
     """What was read in it already, by the picture."""
 
 
-def choose_channel(sources: Sequence[Source], laser: Laser) -> Channel:
+def choose_channel(sources: Sequence[Source], laser: Laser | None) -> Channel:
     """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
 
     Where none of them shows it, the others are read in grey.
@@ -100,6 +100,8 @@ def _mix(profile: StripeProfile) -> str:
 
 def read_on_board(source: Source, channel: Channel) -> ReadStripe:
     """The stripe on the board of a picture, along rows or columns, whichever shows more of it."""
+    if channel.chosen is None:
+        return ReadStripe()
     if source.path in channel.reads:
         return channel.reads[source.path]
     try:

@@ -111,12 +111,12 @@ def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int
     Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
     """
     count = len(flanges)
-    apart: Array = np.abs(_turns(flanges) - _turns(boards))
+    apart, votes = np.abs(_turns(flanges) - _turns(boards)), turn_votes(flanges, boards)
     odd: dict[int, float] = {}
     index = list(range(count))
     while len(index) > 2:
-        inner = apart[np.ix_(index, index)] + np.diag(np.full(len(index), np.nan))
-        typical = np.nanmedian(inner, axis=1)
+        inner = np.ix_(index, index)
+        typical = weighted_median(apart[inner], votes[inner])
         worst = int(np.argmax(typical))
         usual = float(np.median(np.delete(typical, worst)))
         if typical[worst] < max(LEAST_ANGLE, ODD_ANGLE_RATIO * usual):
@@ -187,9 +187,25 @@ def turns_apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> float:
 
     A reading in which nothing turns agrees with nothing: its share is 1 as well.
     """
-    pairs = np.triu_indices(len(flanges), 1)
-    hand, eye = _turns(flanges)[pairs], _turns(boards)[pairs]
-    return float(np.median(np.abs(hand - eye) / np.maximum(np.maximum(hand, eye), LEAST_ANGLE)))
+    hand, eye = _turns(flanges).ravel(), _turns(boards).ravel()
+    share = np.abs(hand - eye) / np.maximum(np.maximum(hand, eye), LEAST_ANGLE)
+    votes = turn_votes(flanges, boards).ravel()
+    return float(weighted_median(share, votes)) if votes.max() > 0 else 1.0
+
+
+def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
+    """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none."""
+    votes = np.sin(0.5 * np.maximum(_turns(flanges), _turns(boards))) ** 2
+    np.fill_diagonal(votes, 0.0)
+    return np.asarray(votes)
+
+
+def weighted_median(values: Array, weights: Array) -> Array:
+    """Medians along the last axis of values (…, n) with weights (…, n), the largest value that has half the weight."""
+    order = np.argsort(values, axis=-1)
+    share = np.cumsum(np.take_along_axis(weights, order, -1), axis=-1)
+    middle = np.argmax(share >= 0.5 * share[..., -1:], axis=-1)
+    return np.asarray(np.take_along_axis(np.take_along_axis(values, order, -1), middle[..., None], -1)[..., 0])
 
 
 def _turns(poses: Sequence[pin.SE3]) -> Array:

@@ -6,8 +6,8 @@ Whatever the hand-eye, the flange's travel in its own unit and the board as the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -22,31 +22,51 @@ UNIT_SHARE = 0.2
 LEAST_FRAMES = 5
 DOUBT, REFUSE = 1.0, 5.0
 DOUBT_SIGMAS, REFUSE_SIGMAS = 3.0, 5.0
+EXPLAINS, CLEARLY = 0.5, 0.7
+"""Shares of the squared residuals from which a scale is believed, and from which it refuses by itself."""
+INDEPENDENT = (
+    "closed form against adjustment",
+    "closed form against least squares",
+    "board in left-out frames",
+    "board in left-out pairs",
+    "the arm's scatter",
+)
+"""Checks of the hand-eye that say the same by other means."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
     """By how much the board would have to be larger to agree with the arm's metres, and its deviation.
 
-    `shift` (3,) in m is what the camera would move on the flange if the scale were free.
+    `shift` (3,) in m is what the camera would move on the flange if the scale were free; `explained` the share of the
+    squared residuals that would go with it.
     """
 
     value: float
     sigma: float
     shift: Array
+    explained: float
 
     @property
     def believed(self) -> bool:
-        """True when the arm and the board's name do not agree: what that moves is not known better."""
-        return abs(self.value - 1) > DOUBT_SIGMAS * self.sigma
+        """True when the arm and the board's name do not agree, and a scale makes most of what they differ by.
+
+        What that moves is not known better. A scale that explains little is picked up from something else.
+        """
+        return abs(self.value - 1) > DOUBT_SIGMAS * self.sigma and self.explained > EXPLAINS
+
+    def with_focal(self, share: float) -> Scale:
+        """The same for a focal length that is known to `share` of itself: the boards' distances follow it."""
+        return replace(self, sigma=math.hypot(self.sigma, share))
 
     @property
     def unit(self) -> str | None:
         """The unit in which the arm's positions seem to be; None when it is the metre or none that is known."""
         return next((name for factor, name in UNITS.items() if abs(self.value / factor - 1) < UNIT_SHARE), None)
 
-    def check(self) -> Check:
-        """How far it is from 1."""
+    def check(self, others: Iterable[Check]) -> Check:
+        """How far it is from 1; a doubt where it stands alone against the `others` of the hand-eye."""
+        alone = self.explained < CLEARLY and all(c.verdict == "ok" for c in others if c.name in INDEPENDENT)
         share = 100 * self.sigma / max(abs(self.value), 1e-9)
         off = 100 * abs(math.log(max(self.value, 1e-9)))
         if self.unit is not None:
@@ -58,7 +78,7 @@ class Scale:
             )
         return Check(
             "hand_eye", "arm's travel against the board's size", off, max(DOUBT, DOUBT_SIGMAS * share),
-            max(REFUSE, REFUSE_SIGMAS * share), "%", says,
+            math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), "%", says,
         )  # fmt: skip
 
 
@@ -85,4 +105,7 @@ def metric_scale(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Scale
     sigma = np.sqrt((count - 1) / count * np.sum((values[1:] - values[1:].mean()) ** 2))
     known = rows.reshape(-1, 7)
     held = np.linalg.lstsq(known[:, :6], -travel.ravel() - known[:, 6], rcond=None)[0]
-    return Scale(float(values[0]), float(sigma), np.asarray(solutions[0][:3] - held[:3]))
+    free_off = known @ solutions[0] + travel.ravel()
+    held_off = known[:, :6] @ held + known[:, 6] + travel.ravel()
+    explained = 1 - float(free_off @ free_off) / max(float(held_off @ held_off), 1e-30)
+    return Scale(float(values[0]), float(sigma), np.asarray(solutions[0][:3] - held[:3]), explained)
