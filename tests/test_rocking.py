@@ -135,7 +135,7 @@ def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
 
 
 def test_a_refused_scan_stays_refused_and_both_readings_are_told() -> None:
-    with pytest.raises(RefusedError, match=r"off the nominal.*or the vehicle rocks at .* Hz.*waves of [\d.]+ mm"):
+    with pytest.raises(RefusedError, match=r"off the nominal.*the vehicle rocks at .* Hz.*waves of [\d.]+ mm"):
         inverted(worn(300e-6, 8e-3, seed=1))
 
 

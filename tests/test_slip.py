@@ -92,6 +92,19 @@ def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell) -> None
         world.scene = scene
 
 
+def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    virtual, before, _ = cell
+    render = virtual.world.render
+
+    def up_to_200(camera: str, t_mid: float, exposure: float) -> np.ndarray:
+        image = render(camera, t_mid, exposure).astype(float)
+        return np.clip(image * np.clip(200.0 / np.percentile(image, 99.9), 0.2, 8.0), 0, 255).astype(np.uint8)
+
+    monkeypatch.setattr(virtual.world, "render", up_to_200)
+    with pytest.raises(RefusedError, match=r"times as bright.*auto gain.*off"):
+        looked(virtual, before)
+
+
 def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
     virtual, before, since = cell
     world, scene = virtual.world, virtual.world.scene

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cell.inversion.rocking import Rocking, also
+from cell.inversion.causes import Cause, likeliest
 from cell.lab.bench.realism import verdict
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_joints import JointErrors
@@ -189,5 +189,5 @@ def test_only_a_refusal_that_names_the_effect_is_excused(effect: str) -> None:
 
 
 def test_a_refusal_that_names_rocking_is_one_by_its_name() -> None:
-    reason = f"the parts do not agree {also(Rocking(4.0, 5e-5, 5e-3))}"
+    reason = f"the parts do not agree {likeliest([Cause('sway', 'the vehicle rocks at 4 Hz', 'line', 0.0, 0.9)])}"
     assert verdict({"outcome": "refused", "effect": "rocking", "reason": reason}) == "named"

@@ -49,13 +49,15 @@ MOST_STEPS = 8
 class SurfaceMotion:
     """By what `motion` (6,) (shift m, turn rad; base axes, about the surface's origin) the surface seems to have moved.
 
-    Its `covariance` (6, 6); `matched`, the share of the second scan's points beside the surface as it was found, in
-    units of the first one's. `found` is where one that has moved lies, as `motion`; None where it was not found.
+    Its `covariance` (6, 6), and `scatter` (6, 6), the same of an arm that has not moved at all; `matched`, the share of
+    the second scan's points beside the surface as it was found, in units of the first one's. `found` is where one
+    that has moved lies, as `motion`; None where it was not found.
     """
 
     motion: Array
     covariance: Array
     matched: float
+    scatter: Array
     found: Array | None = None
 
     @property
@@ -131,7 +133,7 @@ def _compared(before: _Beside, tree: scipy.spatial.cKDTree, now: _Beside, radius
     # As far as the gate lets it be told, where the points tell nothing.
     free = np.array([GATE_M] * 3 + [GATE_M / radius] * 3)
     if not (len(now.heights) and len(before.heights) >= NEIGHBOURS):
-        return SurfaceMotion(np.zeros(6), np.diag(free**2), 0.0)
+        return SurfaceMotion(np.zeros(6), np.diag(free**2), 0.0, np.diag(free**2))
     apart, pairs = map(np.asarray, tree.query(now.feet, k=NEIGHBOURS))
     near = apart[:, -1] <= max(BESIDE_M, SPREAD * float(np.median(apart[:, -1])))
     matched = now.share * float(near.mean()) / before.share
@@ -140,16 +142,19 @@ def _compared(before: _Beside, tree: scipy.spatial.cKDTree, now: _Beside, radius
     rows, lines = now.jacobian[near], now.lines[near]
     poses = np.concatenate([now.by_poses[near], before.by_poses[pairs].mean(axis=1)], axis=1)
     kept = np.ones(len(risen), dtype=np.bool_)
-    motion, covariance = np.zeros(6), np.diag(free**2)
+    motion, covariance, scatter = np.zeros(6), np.diag(free**2), np.diag(free**2)
     for _ in range(ROUNDS):
-        motion, covariance = _fitted(rows[kept], risen[kept], lines[kept], poses[kept], free)
+        motion, covariance, scatter = _fitted(rows[kept], risen[kept], lines[kept], poses[kept], free)
         left = risen - rows @ motion
         kept = np.abs(left) <= OUTLIER * float(np.median(np.abs(left))) + 1e-9
-    return SurfaceMotion(motion, covariance, matched)
+    return SurfaceMotion(motion, covariance, matched, scatter)
 
 
-def _fitted(rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, free: Array) -> tuple[Array, Array]:
-    """The motion (6,) and its covariance (6, 6) from how far points (n,) have `risen`, by their derivatives (n, 6).
+def _fitted(
+    rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, free: Array
+) -> tuple[Array, Array, Array]:
+    """The motion (6,), its covariance (6, 6), and the same without the arm's poses, from how far points (n,) have
+    `risen`, by their derivatives (n, 6).
 
     `free` (6,) is one standard deviation of a motion that the points tell nothing of. What is left is of single points
     and of whole `lines` (n,); the `poses` (n, m) of the arm move all of a scan.
@@ -164,8 +169,10 @@ def _fitted(rows: Array, risen: Array, lines: NDArray[np.intp], poses: Array, fr
     covariance = np.asarray(np.linalg.inv(scaled.T @ scaled / point**2 + np.eye(6)))
     motion = covariance @ scaled.T @ risen / point**2
     by_line = line * np.stack([np.bincount(lines, column) for column in scaled.T])
-    spread = covariance @ np.hstack([by_line, scaled.T @ poses]) / point**2
-    return free * motion, np.outer(free, free) * (covariance + spread @ spread.T)
+    lines_spread, poses_spread = (covariance @ each / point**2 for each in (by_line, scaled.T @ poses))
+    scatter = covariance + lines_spread @ lines_spread.T
+    unit = np.outer(free, free)
+    return free * motion, unit * (scatter + poses_spread @ poses_spread.T), unit * scatter
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,14 +192,6 @@ def words(rocking: Rocking) -> str:
     )
 
 
-def also(rocking: Rocking) -> str:
-    """For people, beside the reason why a scan was refused. It fits rocking as well: too little to accept anything."""
-    return (
-        f"(or the vehicle rocks at {rocking.hz:.1f} Hz, by ±{1e3 * rocking.height:.3f} mm at the surface: wait until "
-        f"it is quiet and run the job again; if that says the same, {_instead(rocking)})"
-    )
-
-
 def _instead(rocking: Rocking) -> str:
     return f"the surface has waves of {1e3 * rocking.wave:.1f} mm"
 

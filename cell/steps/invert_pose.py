@@ -10,7 +10,8 @@ import pinocchio as pin
 from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
-from cell.inversion.rocking import Rocking, also, find_rocking, rocking_covariance, rocking_motions, words
+from cell.inversion.causes import find_causes, likeliest
+from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
 from cell.job import Job
 from cell.reconstruction.cloud import Indices
 from cell.reconstruction.seams import Motions
@@ -70,21 +71,19 @@ def invert_pose(
             sweeps=sweeps,
         )
 
-    def rocks(pose: object) -> Rocking | None:
-        if taken is None or not isinstance(pose, pin.SE3):
-            return None
-        return find_rocking(scan.cloud, nominal, pose, taken.times)
-
     try:
         found = registered(scan.by_poses, kinematic)
     except RefusedError as refused:
-        # Never accepted for it: a worn surface looks like this too, and its pose would be wrong.
-        if (rocking := rocks(refused.seen.get("pose"))) is None:
+        pose = refused.seen.get("pose")
+        if taken is None or not isinstance(pose, pin.SE3) or isinstance(refused, NotObservable):
             raise
-        told = type(refused)(f"{refused} {also(rocking)}", *refused.numbers)
+        # Never accepted for it: the next likely looks much the same, and the pose would be wrong.
+        text = likeliest(find_causes(scan.cloud, nominal, pose, taken.times, taken.base_from_vehicle))
+        told = type(refused)(f"{refused}{text and '. '}{text}".replace("?.", "?"), *refused.numbers)
         raise told.showing(seen=refused.seen) from refused
-    rocking = rocks(found.base_from_surface)
-    if rocking is None or taken is None:
+    if taken is None:
+        return found
+    if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 

@@ -10,9 +10,12 @@ import pinocchio as pin
 
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.inversion import PlacePose
+from cell.inversion.creep import Creep
 from cell.inversion.standing import highest_standing, require_bare
 from cell.job import Job
 from cell.motion.bodies import TOUCHES
+from cell.reconstruction.cloud import Indices
+from cell.steps.invert_pose import inverted
 from cell.steps.moves import HOME, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.photograph import BoardFix
@@ -24,10 +27,12 @@ from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
 from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
-from drivers.interfaces import Arm, Claw
+from drivers.interfaces import Arm, Claw, Vector
 from statemachine.policy import OnFailure, Step
 from statemachine.runner import StepContext
 
+APPROACH_S = 3.0
+"""About what the arm takes from the scan pose to the approach pose."""
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
 
@@ -36,13 +41,15 @@ FAST_FORCE = 3.0
 class PlaceResult:
     """Where the flange was when the part was let go, how far that was from where it was expected, in m, pressed on as
     it was, and where the part had touched first; None from an arm that tells too few states. `look` is what was seen of
-    the surface between its sweep and the descent; None where it was measured without a sweep."""
+    the surface between its sweep and the descent; None where it was measured without a sweep. `pose` is where it was
+    placed to: the inverted one, carried on where something creeps."""
 
     base_from_flange: pin.SE3
     contact: bool
     depth_error: float
     touch: TouchCheck | None = None
     look: SecondLook | None = None
+    pose: PlacePose | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -165,11 +172,14 @@ def require_held(part: PartProgress) -> None:
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
     pose = context.made(PlacePose)
     require_held(here.part)
-    expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
     look = _looked_again(here, pose, context)
     # Whoever has the run held may be about to reach in.
     while context.was_held():
         look = _looked_again(here, pose, context)
+    if look is not None and look.creep is not None:
+        swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
+        pose = carried_on(here, *swept, look.creep)
+    expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
     done = place(
         here.job,
         pose.base_from_surface,
@@ -182,10 +192,26 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         context.progress,
         lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )
-    done = replace(done, look=look)
+    done = replace(done, look=look, pose=pose)
     for note in done.notes:
         context.note(text=note)
     return done
+
+
+def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep) -> PlacePose:
+    """The place when the part touches it, of a surface that creeps, from the sweep freed of that.
+
+    Raises what `inverted` raises: what is not known of the rate may be too much.
+    """
+
+    def by_poses(lines: Indices, rows: Indices) -> Vector:
+        moved = creep.motions(scan.cloud, lines, rows, sweep.times)
+        return np.concatenate([scan.by_poses(lines, rows), moved], axis=2)
+
+    still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=by_poses)
+    plan = here.job.place
+    until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
+    return creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until)
 
 
 def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from cell.calibration.collect.witness import configure_fast
 from cell.inversion import PlacePose
+from cell.inversion.creep import Creep
 from cell.inversion.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
 from cell.inversion.observability import Tolerance
 from cell.job import ScanSection
@@ -39,17 +40,20 @@ NEXT_STEP = "See what pushed it, then run the job again from its sweep"
 @dataclass(frozen=True, eq=False)
 class SecondLook:
     """By how much the surface seemed to have `moved`, and in words what is `hidden`: motions that could be larger than
-    the place's tolerance unseen."""
+    the place's tolerance unseen. `creep` is how it moves on, where that shows."""
 
     moved: SurfaceMotion
     hidden: tuple[str, ...]
+    creep: Creep | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
+        creeps = () if self.creep is None else (self.creep.words,)
         if not self.hidden:
-            return ()
+            return creeps
         return (
+            *creeps,
             "a motion of the surface alone since it was swept could be larger than place.tolerance unseen: "
             f"{', '.join(self.hidden)}. Let nobody touch it meanwhile",
         )
@@ -63,18 +67,18 @@ def require_in_place(
     Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
     place = here.job.place
-    found = _swept_again(here, fix, sweep, scan, pose, context)
+    found, creep = _swept_again(here, fix, sweep, scan, pose, context)
     require_unmoved(found)
     tolerance = Tolerance(place.tolerance, place.tolerance_angle)
     hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
     if hidden or pose.verdict.unseen:
         require_board_unmoved(here, fix, "before the sweep", lambda _, text: context.progress(0.04, text))
-    return SecondLook(found, hidden)
+    return SecondLook(found, hidden, creep)
 
 
 def _swept_again(
     here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
-) -> SurfaceMotion:
+) -> tuple[SurfaceMotion, Creep | None]:
     # The arm is not moved from where it stands already.
     stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
     head = here.calibration.scan
@@ -94,13 +98,15 @@ def _swept_again(
     spread, spread_now = sweep.swaths[0].covariance, again.swaths[0].covariance
     if stood:
         spread, spread_now = by_times(sweep.swaths[0]), here.settling + by_times(again.swaths[0])
-    return surface_motion(
-        before,
-        now,
-        here.nominal,
-        pose.base_from_surface,
-        (partial(flange_motions, before, covariances=[spread]), partial(flange_motions, now, covariances=[spread_now])),
-    )
+    by_poses = [
+        partial(flange_motions, cloud, covariances=[each]) for cloud, each in ((before, spread), (now, spread_now))
+    ]
+    moved = surface_motion(before, now, here.nominal, pose.base_from_surface, (by_poses[0], by_poses[1]))
+    if not stood:
+        return moved, None
+    unsure = by_times(sweep.swaths[0]) + by_times(again.swaths[0])
+    middles = float(sweep.times.mean()), float(again.times.mean())
+    return moved, Creep.of(moved, unsure, pose.base_from_surface.translation, *middles)
 
 
 def by_times(swath: Swath) -> Vector:

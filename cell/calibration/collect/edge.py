@@ -42,6 +42,8 @@ GAP = 1.5
 """Pictures so many times further apart than usual have lost one between them."""
 OPEN_M = 4e-6
 """What lost pictures may leave open of where the line leaves the plate: 2 ms."""
+BRIGHTENS = 1.25
+"""Surroundings that become so many times as bright as the line leaves the plate follow it: gain is not fixed."""
 PASSES = 3
 """So often the rail takes the line over the edge when pictures are lost there."""
 
@@ -125,7 +127,7 @@ def _passed(
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
-    times, light = [], []
+    times, light, dark = [], [], []
     with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
         sweep, over = rail.sweep(*ends, speed), np.inf
         for frame in frames:
@@ -138,10 +140,12 @@ def _passed(
             keep("witness-edge", frame)
             times.append(frame.mid_exposure)
             light.append(_light(frame.image, witness))
+            dark.append(_surroundings(frame.image))
     begin, end = sweep.window
     inside = np.flatnonzero((np.array(times) >= begin) & (np.array(times) <= end))
     if len(inside) < LEAST_FRAMES:
         return np.zeros(0), np.zeros(0)
+    _require_fixed_gain(np.array(dark)[inside])
     places = np.array([sweep.position_at(times[k]) for k in inside])
     lit = np.array(light)[inside]
     # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
@@ -150,6 +154,25 @@ def _passed(
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
     order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
+
+
+def _surroundings(image: NDArray[np.generic]) -> float:
+    """How bright a picture is beside the line and what it lights, DN."""
+    some = np.sort(image[::8, ::8].astype(np.float64), axis=None)
+    return float(some[: len(some) * 3 // 4].mean())
+
+
+def _require_fixed_gain(dark: Array) -> None:
+    """Raise `RefusedError` where the surroundings (n,), DN, of a rail's passage follow the line's light."""
+    low, high = max(1.0, float(dark.min())), float(dark.max())
+    if high > BRIGHTENS * low:
+        raise RefusedError(
+            f"the scan camera's pictures become {high / low:.1f} times as bright beside the laser's line as that "
+            f"leaves the plate on the claw, allowed are {BRIGHTENS:g} times: gain or exposure follow the picture, or "
+            "the room's light changes. Switch the camera's auto gain and auto exposure off; only then look whether the "
+            "scan head has slipped",
+            Measured("pictures brighter beside the line", high / low, "times", most=BRIGHTENS),
+        )
 
 
 def _light(image: NDArray[np.generic], witness: Witness) -> Array:
