@@ -92,10 +92,20 @@ def write_json(path: Path, data: Any) -> None:
 
 def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
     """The data with their digest; with `parts` also the digests of what lies one and two levels deep."""
-    content = {key: value for key, value in data.items() if key not in (DIGEST, PARTS)}
+    content = unsealed(data)
     # As a reader gets it: JSON knows neither tuples nor keys that are numbers.
     kept = json.loads(json.dumps(content))
     return {**content, DIGEST: digest(kept), **({PARTS: _parts(kept)} if parts else {})}
+
+
+def unsealed(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a sealed file."""
+    return {key: value for key, value in data.items() if key not in (DIGEST, PARTS)}
+
+
+def is_intact(data: Mapping[str, Any]) -> bool:
+    """Whether data have the digest that they were sealed with, or none."""
+    return DIGEST not in data or data[DIGEST] == digest(unsealed(data))
 
 
 def digest(data: Any) -> str:
@@ -110,7 +120,7 @@ def _undated(data: Any) -> Any:
 
 
 def _parts(data: dict[str, Any]) -> dict[str, str]:
-    made = {}
+    made: dict[str, str] = {}
     for key, value in data.items():
         below = {f"{key}.{name}": part for name, part in value.items()} if isinstance(value, dict) else {key: value}
         made |= {name: digest(part)[:16] for name, part in below.items()}
@@ -140,12 +150,12 @@ def read_json(path: Path) -> Stored:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(data, dict):
         raise ValueError(f"it holds no table, but {str(data)[:40]}")
-    told, parts = data.pop(DIGEST, None), data.pop(PARTS, None)
-    if told is None or told == digest(data):
-        return Stored(data, told is not None, ())
-    before, now = parts if isinstance(parts, dict) else {}, _parts(data)
+    parts, has_digest, content = data.get(PARTS), DIGEST in data, unsealed(data)
+    if is_intact(data):
+        return Stored(content, has_digest, ())
+    before, now = parts if isinstance(parts, dict) else {}, _parts(content)
     changed = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
-    return Stored(data, True, tuple(changed) if before and changed else ("its content or its digest",))
+    return Stored(content, True, tuple(changed) if before and changed else ("its content or its digest",))
 
 
 def _no_number(text: str) -> Any:
@@ -166,7 +176,7 @@ def sealed_arrays(arrays: Mapping[str, Any]) -> str:
 
 
 def require_unchanged(arrays: dict[str, Any]) -> None:
-    """Take the digests out of an archive's arrays; `EditedError` that names what does not fit, or that there is none."""
+    """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
     if DIGEST not in arrays:
         raise EditedError("its digest is missing")
     told = json.loads(str(arrays.pop(DIGEST)))

@@ -23,7 +23,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         return _from_journal(folder)
     try:
-        report: Any = read_json(path).require()
+        report = read_json(path).require()
     except EditedError as error:
         raise CellError(f"{path}: {error}; it is not what the run reported. The journal is beside it") from error
     except (OSError, ValueError) as error:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cell.calibration.recorded.yaml_subset import read_yaml
 from cell.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.storage import EditedError, is_intact
 from drivers.errors import ConfigError
 
 FORM = "it needs width, height, fx, fy, cx, cy and k1 … k3, or camera_matrix and distortion coefficients"
@@ -43,6 +44,9 @@ def read_camera(path: Path) -> CameraModel:
     try:
         text = path.read_text(encoding="utf-8")
         data = json.loads(text) if path.suffix.lower() == ".json" else read_yaml(text)
+        # A result of `cell calibrate --from`; files of others have none.
+        if isinstance(data, dict) and not is_intact(data):
+            raise EditedError("it was changed after `cell calibrate --from` wrote it; use the result as it was")
     except (OSError, ValueError) as error:
         raise ConfigError(f"--camera {path}: it cannot be read: {error}") from error
     if isinstance(data, dict) and isinstance(data.get("intrinsics"), dict):
