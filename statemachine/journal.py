@@ -1,16 +1,19 @@
 """The durable record of a run: one SQLite file in the run's folder.
 
 Every row is on the disk when the call that wrote it returns (WAL, synchronous FULL, one transaction a row), so a run
-that is killed or loses power can be read up to its last row. Other processes read it live and put requests into it
-(`request`), which the runner takes out. Times are seconds since the epoch; durations are given by the caller.
+that is killed or loses power can be read up to its last row. Each row has a CRC of its values. Other processes read it
+live and put requests into it (`request`), which the runner takes out. Times are seconds since the epoch; durations are
+given by the caller.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 import threading
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +29,14 @@ REQUESTS = ("abort", "pause", "go-on", "confirm")
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS runs (
-    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL, pid INTEGER);
+    id TEXT PRIMARY KEY, started REAL NOT NULL, ended REAL, outcome TEXT, reason TEXT, info TEXT NOT NULL, pid INTEGER,
+    crc INTEGER);
 CREATE TABLE IF NOT EXISTS steps (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, name TEXT NOT NULL, attempt INTEGER NOT NULL,
-    started REAL NOT NULL, ended REAL, state TEXT NOT NULL, duration_s REAL, result TEXT, error TEXT);
+    started REAL NOT NULL, ended REAL, state TEXT NOT NULL, duration_s REAL, result TEXT, error TEXT, crc INTEGER);
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY, run TEXT NOT NULL REFERENCES runs, at REAL NOT NULL, kind TEXT NOT NULL, step TEXT,
-    data TEXT NOT NULL);
+    data TEXT NOT NULL, crc INTEGER);
 CREATE TABLE IF NOT EXISTS requests (
     id INTEGER PRIMARY KEY, at REAL NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL, number INTEGER);
 """
@@ -114,39 +118,43 @@ class Journal:
             raise JournalError(f"the journal {self.path} cannot be opened: {error}. Is the folder writable?") from error
         about = dict(info or {})
         pid = about.pop("pid", None)
-        self._write(
-            "INSERT INTO runs (id, started, info, pid) VALUES (?, ?, ?, ?)", run, time.time(), _dump(about), pid
-        )
+        self._begun = run, time.time(), None, None, None, _dump(about), pid
+        self._begun_steps: dict[int, tuple[str, int, float]] = {}
+        self._insert("runs", "id, started, ended, outcome, reason, info, pid", *self._begun)
 
     def step_started(self, name: str, attempt: int) -> int:
         """Record that an attempt (counted from 1) at a step begins; returns the key for `step_ended`."""
-        return self._write(
-            "INSERT INTO steps (run, name, attempt, started, state) VALUES (?, ?, ?, ?, 'running')",
-            self.run, name, attempt, time.time(),
-        )  # fmt: skip
+        begun = name, attempt, time.time()
+        row = *begun, None, "running", None, None, None
+        key = self._insert(
+            "steps", "run, name, attempt, started, ended, state, duration_s, result, error", self.run, *row
+        )
+        self._begun_steps[key] = begun
+        return key
 
     def step_ended(
         self, key: int, duration_s: float, result: Mapping[str, object] | None = None, error: str | None = None
     ) -> None:
         """Record how the attempt ended: with the summary of its result, or with an error text."""
+        summary, state = None if result is None else _dump(result), "done" if error is None else "failed"
+        ended = time.time(), state, float(duration_s), summary, error
         self._write(
-            "UPDATE steps SET ended = ?, state = ?, duration_s = ?, result = ?, error = ? WHERE id = ?",
-            time.time(), "done" if error is None else "failed", duration_s,
-            None if result is None else _dump(result), error, key,
+            "UPDATE steps SET ended = ?, state = ?, duration_s = ?, result = ?, error = ?, crc = ? WHERE id = ?",
+            *ended, _crc(self.run, *self._begun_steps[key], *ended), key,
         )  # fmt: skip
 
     def event(self, kind: str, step: str | None = None, data: Mapping[str, object] | None = None) -> None:
         """Record something that happened; `data` is JSON-ready."""
-        self._write(
-            "INSERT INTO events (run, at, kind, step, data) VALUES (?, ?, ?, ?, ?)",
-            self.run, time.time(), kind, step, _dump(data or {}),
-        )  # fmt: skip
+        self._insert("events", "run, at, kind, step, data", self.run, time.time(), kind, step, _dump(data or {}))
 
     def run_ended(self, outcome: str, reason: str) -> None:
         """Record the end of the run."""
+        run, started, _, _, _, *rest = self._begun
+        ended = time.time(), outcome, reason
         self._write(
-            "UPDATE runs SET ended = ?, outcome = ?, reason = ? WHERE id = ?", time.time(), outcome, reason, self.run
-        )
+            "UPDATE runs SET ended = ?, outcome = ?, reason = ?, crc = ? WHERE id = ?",
+            *ended, _crc(run, started, *ended, *rest), run,
+        )  # fmt: skip
 
     def take_requests(self) -> list[Request]:
         """What other processes have asked for since the last call, oldest first; asked by one thread.
@@ -168,6 +176,10 @@ class Journal:
         with self._lock:
             self._asked.close()
             self._base.close()
+
+    def _insert(self, table: str, columns: str, *values: object) -> int:
+        marks = ", ".join("?" * (len(values) + 1))
+        return self._write(f"INSERT INTO {table} ({columns}, crc) VALUES ({marks})", *values, _crc(*values))
 
     def _write(self, statement: str, *values: object) -> int:
         with self._lock:
@@ -201,47 +213,86 @@ class Record:
         return {step.name: step.result or {} for step in self.steps if step.state == "done"}
 
 
-def read(folder: Path) -> Record:
-    """Read the journal in a run's folder, also while it is being written; `JournalError` if there is none."""
+def read(folder: Path, *, whole: bool = False) -> Record:
+    """Read the journal in a run's folder, also while it is being written.
+
+    With `whole` the file's structure is checked as well, which takes longer. `JournalError` if there is none, or one
+    with a row that is not as it was written.
+    """
 
     def rows(base: sqlite3.Connection) -> Record:
-        columns = "id, started, ended, outcome, reason, info, " + ("pid" if _tells_pid(base) else "NULL")
+        if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
+            raise JournalError(f"the journal in {folder} is damaged: {found[0] if found else 'no word of it'}")
         runs = tuple(
-            RunRow(key, started, ended, outcome, reason, json.loads(info), pid)
-            for key, started, ended, outcome, reason, info, pid in base.execute(
-                f"SELECT {columns} FROM runs ORDER BY rowid"
+            RunRow(_text(key), _real(started), _real(ended, None), _text(outcome, None), _text(reason, None),
+                   _table(info), None if pid is None else int(pid))
+            for key, started, ended, outcome, reason, info, pid in _checked(
+                base, "runs", "id, started, ended, outcome, reason, info, pid", "ORDER BY rowid"
             )
-        )
+        )  # fmt: skip
         if not runs:
             raise JournalError(f"the journal in {folder} holds no run")
-        steps = base.execute(
-            "SELECT name, attempt, started, ended, state, duration_s, result, error FROM steps WHERE run = ? "
-            "ORDER BY id", (runs[-1].id,),
+        own = "WHERE run = ? ORDER BY id", runs[-1].id
+        steps = tuple(
+            StepRow(_text(name), int(attempt), _real(started), _real(ended, None), _text(state), _real(duration, None),
+                    None if result is None else _table(result), _text(error, None))
+            for _, name, attempt, started, ended, state, duration, result, error in _checked(
+                base, "steps", "run, name, attempt, started, ended, state, duration_s, result, error", *own
+            )
         )  # fmt: skip
-        events = base.execute("SELECT at, kind, step, data FROM events WHERE run = ? ORDER BY id", (runs[-1].id,))
-        return Record(
-            runs,
-            tuple(
-                StepRow(
-                    name,
-                    attempt,
-                    started,
-                    ended,
-                    state,
-                    duration,
-                    None if result is None else json.loads(result),
-                    error,
-                )
-                for name, attempt, started, ended, state, duration, result, error in steps
-            ),
-            tuple(EventRow(at, kind, step, json.loads(data)) for at, kind, step, data in events),
+        events = tuple(
+            EventRow(_real(at), _text(kind), _text(step, None), _table(data))
+            for _, at, kind, step, data in _checked(base, "events", "run, at, kind, step, data", *own)
         )
+        return Record(runs, steps, events)
 
-    return _in_existing(folder, rows)
+    try:
+        return _in_existing(folder, rows)
+    except (ValueError, TypeError, RecursionError, OverflowError, MemoryError) as error:
+        raise JournalError(f"the journal in {folder} is damaged: {type(error).__name__}: {error}") from error
 
 
-def _tells_pid(base: sqlite3.Connection) -> bool:
-    return "pid" in (row[1] for row in base.execute("PRAGMA table_info(runs)"))
+def _checked(base: sqlite3.Connection, table: str, columns: str, rest: str, *values: object) -> list[tuple[Any, ...]]:
+    """The rows of a table; `JournalError` for one that does not fit its CRC. Journals of older versions have none."""
+    there = {row[1] for row in base.execute(f"PRAGMA table_info({table})")}
+    # Older ones do not tell the process either.
+    wanted = ", ".join("NULL" if name == "pid" and name not in there else name for name in columns.split(", "))
+    if "crc" not in there:
+        return base.execute(f"SELECT {wanted} FROM {table} {rest}", values).fetchall()
+    rows = base.execute(f"SELECT {wanted}, crc FROM {table} {rest}", values).fetchall()
+    for number, (*row, crc) in enumerate(rows, 1):
+        if crc != _crc(*row):
+            raise JournalError(f"row {number} of its {table} is not as it was written: {str(row)[:200]}")
+    return [tuple(row) for *row, _ in rows]
+
+
+def _crc(*values: object) -> int:
+    """Of a row as SQLite gives it back."""
+    return zlib.crc32(json.dumps(values, default=str).encode())
+
+
+_NEEDED = object()
+
+
+def _text(value: Any, otherwise: Any = _NEEDED) -> Any:
+    if isinstance(value, str) or (value is None and otherwise is None):
+        return value
+    raise ValueError(f"{str(value)[:40]} is no text")
+
+
+def _real(value: Any, otherwise: Any = _NEEDED) -> Any:
+    if value is None and otherwise is None:
+        return None
+    if isinstance(value, int | float) and math.isfinite(value):
+        return float(value)
+    raise ValueError(f"{str(value)[:40]} is no number")
+
+
+def _table(text: Any) -> dict[str, Any]:
+    data = json.loads(_text(text))
+    if not isinstance(data, dict):
+        raise ValueError(f"{str(data)[:40]} is no table")
+    return data
 
 
 def request(folder: Path, kind: str, reason: str, number: int | None = None) -> None:

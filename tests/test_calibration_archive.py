@@ -104,6 +104,8 @@ def _of_version_9(about):
         ({"scan_ids": lambda ids: ids + 1000}, "lie outside 0 to 98"),
         ({"stripe_centres": lambda centres: centres[:-1]}, "20 profiles of one length"),
         ({"scan_rail": lambda rail: rail[:4]}, "scan_rail must have shape"),
+        ({"scan_rail": lambda rail: rail + 1e-6}, "changed after it was written: scan_rail;"),
+        ({"sha256": None}, "its digest is missing"),
     ],
 )
 def test_a_bad_archive_is_refused_with_its_reason(archived, tmp_path, changes, says):

@@ -10,6 +10,7 @@ from cell.calibration.recorded.known_camera import read_camera
 from cell.calibration.recorded.solution import camera_of
 from cell.calibration.solve.intrinsics import choose_lens
 from cell.geometry.camera import CameraModel
+from cell.storage import sealed, write_json
 from drivers.errors import ConfigError, RefusedError
 from tests import recorded_scenes
 from tests.recorded_scenes import LENS, MATRIX, SIZE, scene
@@ -49,6 +50,16 @@ def test_other_lenses_are_refused_by_name(tmp_path, model, lens, words):
     with pytest.raises(ConfigError, match=words) as refused:
         read_camera(file_of(tmp_path, model, lens))
     assert "--camera out" in str(refused.value)
+
+
+def test_a_result_that_was_edited_after_it_was_written_is_refused(tmp_path):
+    path = tmp_path / "result.json"
+    lens = {"fx": 1400.0, "fy": 1410.0, "cx": 650.0, "cy": 470.0}
+    write_json(path, sealed({"intrinsics": {"width": 1280, "height": 960, **lens}}))
+    assert read_camera(path).fx == 1400.0
+    path.write_text(path.read_text().replace("1400.0", "1401.0"))
+    with pytest.raises(ConfigError, match="was changed after `cell calibrate --from` wrote it"):
+        read_camera(path)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from cell.cli import main
+from cell.cli import record as record_command
 from cell.devices.direct import VirtualCell
 from cell.lab.bench.whole_job import JobRecord
 from cell.reconstruction.ply import read_cloud
@@ -268,6 +269,45 @@ def test_a_record_cut_off_anywhere_is_closed_with_all_that_is_whole(
             message for message in put if message[2] in data[:size]
         ]
         assert repair(cut).whole
+
+
+def test_a_flipped_bit_anywhere_is_named_and_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record_file, "CHUNK_BYTES", 700)
+    put = written(tmp_path / "whole.mcap")
+    data, path = (tmp_path / "whole.mcap").read_bytes(), tmp_path / "record.mcap"
+    rng = np.random.default_rng(5)
+    for at in rng.choice(len(data), 400, replace=False).tolist():
+        bad = bytearray(data)
+        bad[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bad)
+        try:
+            told = information(path)
+            done = repair(path)
+        except CellError as error:
+            assert "MCAP" in str(error) and at < 8
+            continue
+        assert not told["whole"] and not done.whole, f"bit of byte {at}"
+        assert told["damaged"] or not told["closed"]
+        assert repair(path).whole
+        kept = [message for message in raw(path) if message[0] != "/record/end"]
+        # Nothing that stands in it is wrong, and no more than one chunk's worth is missing where that is named.
+        assert set(kept) <= set(put)
+        if told["closed"] and told["damaged"]:
+            assert len(kept) > len(put) - 20
+            assert (tmp_path / "record.mcap.damaged").read_bytes() == bad
+        (tmp_path / "record.mcap.damaged").unlink(missing_ok=True)
+
+
+def test_a_record_without_a_message_is_not_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "record.mcap"
+    path.write_bytes(b"")
+    assert not information(path)["whole"]
+    assert not repair(path).whole
+    told = information(path)
+    assert (told["whole"], told["closed"], told["messages"]) == (False, True, 0)
+    for command, says in (("info", "empty, it holds no message"), ("repair", "is closed and empty")):
+        record_command.app([command, str(path)], standalone_mode=False)
+        assert says in " ".join(capsys.readouterr().out.split())
 
 
 def test_what_is_no_record_is_left_as_it_is(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -18,16 +20,21 @@ from cell.calibration.slip import Slip
 from cell.calibration.witness import Pointing
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts
-from cell.job import load_job
+from cell.job import ScanSection, load_job
 from cell.lab.bench.whole_job import NoFrames
-from cell.run.resumption import UnfinishedRun, job_hash
+from cell.run.folder import is_going
+from cell.run.frames import FrameStore
+from cell.run.reading import run_row
+from cell.run.resumption import FACTS, UnfinishedRun, job_hash
+from cell.steps import stored_sweep
 from cell.steps.laser_sweep import STEP, SweepRecord
 from cell.steps.photograph import BoardFix
 from cell.steps.stored_sweep import FILE, StoredSweep, save_sweep
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import CalibrationStale, ConfigError, InterlockError, RefusedError
-from statemachine.journal import Journal
+from drivers.interfaces import Frame
+from statemachine.journal import FILE_NAME, Journal
 from statemachine.step import Event, StepContext
 
 CALIBRATION = made()
@@ -196,6 +203,165 @@ def test_a_sweep_that_was_begun_again_is_not_used(tmp_path: Path) -> None:
     journal.close()
     sweep, _ = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None
+
+
+def placing(folder: Path, *parts: str) -> Path:
+    """A run that was cut short as it placed, and what its journal says of the part."""
+    run, _ = cut_short(folder, seed=4, level="nominal", clock="wall", speed=1.0)
+    journal = Journal(run.folder, "later", run.info)
+    for name in ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose"):
+        journal.event("state", None, {"trigger": "next", "to": name})
+        journal.step_ended(journal.step_started(name, 1), 1.5, {"points": 61418, "residual_um": [1.7, 0.2]})
+    journal.step_started("place", 1)
+    for part in parts:
+        journal.event("note", "place", {"part": part, "base_from_part": [0.75, 0.0, 0.05, 0.0, 0.0, 1.5]})
+    journal.close()
+    return run.folder
+
+
+@pytest.mark.parametrize("parts", [("unknown",), ("unknown", "released"), ("lost",), ("unknown", "releaseb"), (None,)])
+def test_a_part_that_is_not_known_to_be_held_is_looked_at_first(tmp_path: Path, parts: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match=r"[Ll]ook (at the part|what has become)"):
+        UnfinishedRun.find(placing(tmp_path, *parts))
+
+
+def damaged(data: bytes, count: int) -> Iterator[bytes]:
+    """Copies of a file with a flipped byte, cut off, with lines exchanged, with a hole, or with more behind."""
+    rng = np.random.default_rng(11)
+    for k in range(count):
+        bad, at, other = bytearray(data), *rng.integers(0, len(data) - 512, 2).tolist()
+        if k % 8 < 5:
+            # Where something stands: most of a page is empty.
+            at = int(rng.choice(np.flatnonzero(np.frombuffer(data, np.uint8))))
+            bad[at] ^= int(rng.integers(1, 256))
+        elif k % 8 == 5:
+            bad = bad[:at]
+        elif k % 8 == 6:
+            at, other = at // 64 * 64, other // 64 * 64
+            bad[at : at + 64], bad[other : other + 64] = bad[other : other + 64], bad[at : at + 64]
+        else:
+            bad[at : at + 512] = bytes(512)
+        if bad != data:
+            yield bytes(bad)
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("parts", [(), ("unknown", "released")])
+def test_a_damaged_journal_is_an_error_in_our_words_and_never_a_part_that_is_held(
+    tmp_path: Path, parts: tuple[str, ...], older: bool
+) -> None:
+    folder = placing(tmp_path, *parts)
+    path = folder / FILE_NAME
+    base = sqlite3.connect(path, isolation_level=None)
+    if older:
+        for table in ("runs", "steps", "events"):
+            base.execute(f"ALTER TABLE {table} DROP COLUMN crc")
+    base.execute("PRAGMA journal_mode=DELETE")
+    base.execute("VACUUM")
+    base.close()
+    data, resumed, job = path.read_bytes(), 0, load_job(tmp_path / "pot.toml")[0]
+    for bad in damaged(data, 600):
+        path.write_bytes(bad)
+        for rest in ("-wal", "-shm", "-journal"):
+            Path(f"{path}{rest}").unlink(missing_ok=True)
+        try:
+            found = UnfinishedRun.find(folder)
+            found.sweep(job, CONFIG, CALIBRATION)
+        except ConfigError:
+            continue
+        resumed += 1
+        assert not parts or older, "of a part that was put down already"
+        assert older or found.info["job_hash"] == job_hash(tmp_path / "pot.toml")
+    # What is empty in the file may hold anything; all else was refused.
+    assert resumed < (600 if older else 60)
+
+
+@pytest.mark.parametrize("value", [None, 7, 7.5, "x", "[]", "{", '{"part": NaN}', b"\xff\xfe", "null", '{"part": []}'])
+@pytest.mark.parametrize(
+    "column",
+    [
+        *("runs.info", "runs.outcome", "runs.started", "runs.pid", "steps.name", "steps.result", "steps.ended"),
+        *("steps.state", "events.at", "events.kind", "events.data"),
+    ],
+)
+def test_a_journal_with_another_type_in_a_row_is_no_traceback(tmp_path: Path, column: str, value: object) -> None:
+    folder = placing(tmp_path, "unknown", "released")
+    table, name = column.split(".")
+    base = sqlite3.connect(folder / FILE_NAME, isolation_level=None)
+    base.execute("PRAGMA ignore_check_constraints=ON")
+    try:
+        base.execute(f"UPDATE {table} SET {name} = ?", (value,))
+    except sqlite3.IntegrityError:
+        return
+    finally:
+        base.close()
+    with pytest.raises(ConfigError):
+        UnfinishedRun.find(folder)
+    assert run_row(folder)["outcome"] in ("unreadable", "not ended")
+    assert not is_going(folder)
+
+
+@pytest.mark.parametrize("key", ["job_file", "job_hash", "simulated", "seed", "level", "clock", "speed", "until"])
+@pytest.mark.parametrize("value", [["x"], {"a": 1}, None, 7.5, "\0"])
+def test_facts_of_another_type_are_refused_by_name(tmp_path: Path, key: str, value: object) -> None:
+    run, _ = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", {**run.info, "simulated": True, "seed": 4, "level": "nominal", key: value})
+    journal.close()
+    try:
+        found = UnfinishedRun.find(run.folder)
+    except ConfigError as error:
+        assert any(part in str(error) for part in (key, "is neither a file", "cannot be read", "was changed since"))
+    else:
+        assert type(found.info[key]) in FACTS[key]
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, ScanSection]]:
+    """A small sweep on the disk, with the frames that it was made of."""
+    scan = load_job("pot")[0].scan
+    taken = sweep()
+    with FrameStore(tmp_path / "frames") as frames:
+        for frame_id in taken.seen:
+            image = np.full((480, 640), int(frame_id) % 200, dtype=np.uint8)
+            frames.keep("stripe", Frame(image, int(frame_id), 0.0, 0.0, 0.0, 0.0))
+        save_sweep(tmp_path, SweepRecord((taken,)), fix(BOARD), frames.settle())
+    # Whether a stripe is in these pictures is none of this test's business.
+    monkeypatch.setattr(stored_sweep, "_swath", lambda folder, stored, k, geometry, scan: taken)
+    yield tmp_path, scan
+
+
+def loaded(folder: Path, scan: ScanSection) -> StoredSweep:
+    return StoredSweep.load(folder, CALIBRATION.scan, scan, CONFIG.laser.exit_point)
+
+
+def test_a_sweep_is_read_again_and_not_once_two_of_its_frames_are_exchanged(kept: tuple[Path, ScanSection]) -> None:
+    folder, scan = kept
+    assert len(loaded(folder, scan).sweep.swaths) == 1
+    one, other = sorted((folder / "frames").iterdir())[3:5]
+    pictures = one.read_bytes(), other.read_bytes()
+    one.write_bytes(pictures[1])
+    other.write_bytes(pictures[0])
+    with pytest.raises(RefusedError, match=f"2 of its frames are not .*: {one.name}, {other.name}"):
+        loaded(folder, scan)
+
+
+def test_a_sweep_with_an_edited_figure_is_refused(kept: tuple[Path, ScanSection]) -> None:
+    folder, scan = kept
+    with np.load(folder / FILE) as file:
+        data = dict(file)
+    np.savez(folder / FILE, **{**data, "rail_0": data["rail_0"] + 1e-6})
+    with pytest.raises(RefusedError, match="was changed after it was written: rail_0"):
+        loaded(folder, scan)
+
+
+@pytest.mark.parametrize("name", ["rail", "times", "flanges", "line_spread", "covariance"])
+def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(tmp_path: Path, name: str) -> None:
+    taken = sweep()
+    values = getattr(taken, name).copy()
+    values.flat[1] = np.nan
+    save_sweep(tmp_path, SweepRecord((replace(taken, **{name: values}),)), fix(BOARD))
+    with pytest.raises(RefusedError, match=f"{name} of .* holds what is no number"):
+        StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point, as_written=False)
 
 
 @pytest.mark.parametrize("outcome", ["placed", "done", "refused"])

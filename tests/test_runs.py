@@ -15,8 +15,9 @@ from cell.cli.runs import abort
 from cell.config import CellConfig, default_toml, load_config
 from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
 from cell.run.lock import CellLock
-from cell.run.reading import Question, awaited_word, read_report
-from drivers.errors import ConfigError, InterlockError
+from cell.run.reading import Question, awaited_word, read_report, run_row
+from cell.storage import sealed
+from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.journal import Journal
 
 
@@ -124,6 +125,12 @@ def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> N
     assert report["steps"][0]["name"] == "drive_to_target"
     write_json(folder / "report.json", {"outcome": "placed"})
     assert read_report(folder) == {"outcome": "placed"}
+    write_json(folder / "report.json", sealed({"outcome": "refused", "reason": "too rough"}))
+    assert read_report(folder) == {"outcome": "refused", "reason": "too rough"}
+    (folder / "report.json").write_text((folder / "report.json").read_text().replace("refused", "placed"))
+    with pytest.raises(CellError, match=r"report\.json: it was changed after it was written"):
+        read_report(folder)
+    assert "it was changed" in run_row(folder)["reason"]
 
 
 def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: Path) -> None:

@@ -16,11 +16,20 @@ from cell.calibration.archive import _pose
 from cell.calibration.finding import find_calibration
 from cell.calibration.sessions import marked, serial_numbers
 from cell.calibration.solve.results import KEPT, Quality
-from cell.calibration.store import CellCalibration, nominal_camera, save_calibration
+from cell.calibration.store import (
+    CalibrationEdited,
+    CellCalibration,
+    accept_calibration,
+    nominal_camera,
+    read_calibration,
+    save_calibration,
+)
+from cell.calibration.validation import require_as_configured
+from cell.calibration.witness import ConfirmedTurn, Witness
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.light_plane import LightPlane
-from drivers.errors import CalibrationStale, NotConnectedError
+from drivers.errors import CalibrationStale, ConfigError, NotConnectedError
 
 DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}
 CONFIGURATION = "0123456789abcdef"
@@ -180,3 +189,135 @@ def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
     for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.001, 1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=1) * 1e-3):
         with pytest.raises(ValueError, match="view 1 is no rotation and translation"):
             _pose(wrong, "view 1")
+
+
+# --- edits and figures that cannot be ---
+
+
+def edited(path: Path, *keys: object, value: object) -> None:
+    """Change one value of a stored file, as an editor does."""
+    data = at = json.loads(path.read_text(encoding="utf-8"))
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = value
+    path.write_text(json.dumps(data), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "part"),
+    [
+        (("scan", "flange_from_camera", 0, 3), 0.001, "scan.flange_from_camera"),
+        (("target", "hand_eye_covariance", 0, 0), 1.5, "target.hand_eye_covariance"),
+        (("made",), 1.7e9, "made"),
+        (("date",), "yesterday", "date"),
+        (("scan", "further"), 1, "scan.further"),
+        (("sha256",), "0" * 64, "its content or its digest"),
+    ],
+)
+def test_an_edit_is_refused_by_name_until_a_person_accepts_it(
+    tmp_path: Path, keys: tuple[object, ...], value: object, part: str
+) -> None:
+    path = tmp_path / "own.json"
+    save_calibration(made(), path)
+    edited(path, *keys, value=value)
+    with pytest.raises(
+        CalibrationEdited, match=rf"changed after it was written: {part}\. .*`cell calibrate accept own"
+    ):
+        find_calibration(tmp_path, DEVICES, CONFIGURATION, 1e9)
+    accepted = accept_calibration(path, "ann", "measured by hand")
+    assert [(e["who"], e["why"], e["changed"]) for e in accepted.edits] == [("ann", "measured by hand", [part])]
+    save_calibration(read_calibration(path), path)
+    kept = find_calibration(tmp_path, DEVICES, CONFIGURATION, 1e9)
+    assert kept.edits == accepted.edits
+    assert kept.summary()["notes"][-1].startswith("edited by ann on 20")
+    with pytest.raises(ConfigError, match="is as it was written"):
+        accept_calibration(path, "ann", "again")
+
+
+def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    save_calibration(made(devices={**DEVICES, "arm": "B7"}), tmp_path / "other.json")
+    edited(tmp_path / "other.json", "made", value=1.7e9)
+    assert found(tmp_path).identities == DEVICES
+
+
+def test_one_without_its_digest_is_edited_and_one_from_before_is_read_with_a_note(tmp_path: Path) -> None:
+    path, own = tmp_path / "own.json", made()
+    path.write_text(json.dumps(own.as_dict()), encoding="utf-8")
+    with pytest.raises(CalibrationEdited, match="its digest, which is missing"):
+        found(tmp_path)
+    path.write_text(json.dumps({**own.as_dict(), "format": 1}), encoding="utf-8")
+    assert found(tmp_path).hash() == own.hash()
+    assert "before its file had a digest" in found(tmp_path).scan.unread[0]
+    accept_calibration(path, "ann", "the one of last week")
+    assert found(tmp_path).scan.unread == ()
+
+
+def _scan(**changes: object) -> CellCalibration:
+    stock = made()
+    return replace(stock, scan=replace(stock.scan, **changes))
+
+
+SKEW = np.eye(KEPT) + np.diag([0.5] * (KEPT - 1), 1)
+ROWS = np.full(480, np.nan)
+ROWS[100:200] = 300.0
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        (_scan(covariance=0.0 * np.eye(KEPT)), r"scan\.covariance has a variance of 0"),
+        (_scan(covariance=-np.eye(KEPT)), "has a variance of -1; all must be above 0"),
+        (_scan(covariance=np.ones((KEPT, KEPT))), "not positive definite"),
+        (_scan(covariance=SKEW), "not symmetric"),
+        (_scan(bow_sigma=-1e-3), r"bow_sigma: -0\.001, allowed 0 to 10"),
+        (_scan(rail_direction=np.array([1000.0, 0.0, 0.0])), r"its length: 1000, allowed 0\.98 to 1\.02"),
+        (_scan(flange_from_camera=pin.SE3(np.eye(3), np.array([90.0, 0, 0]))), "flange_from_camera, m: 90"),
+        (_scan(confirmed=ConfirmedTurn(0.0, 0.0, 1e-5, 4.07e9)), "confirmed.made lies .* hours in the future"),
+        (_scan(witness=Witness(0.0, ROWS, 0.0 * ROWS)), r"witness\.sigma"),
+        (replace(made(), target=replace(made().target, hand_eye_covariance=np.zeros((6, 6)))), "hand_eye_covariance"),
+        (replace(made(), made=4.07e9), "hours in the future"),
+        (replace(made(), made=0.0), "no date"),
+    ],
+)
+def test_figures_that_no_calibration_has_are_refused_whoever_wrote_them(
+    tmp_path: Path, spoilt: CellCalibration, says: str
+) -> None:
+    path = tmp_path / "own.json"
+    save_calibration(replace(spoilt, edits=({"who": "a", "when": "b", "why": "c", "changed": []},)), path)
+    with pytest.raises(CalibrationStale, match=says):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "1e999", "1e300", '"x"', "null", "[]"])
+@pytest.mark.parametrize("key", ["made", "covariance"])
+def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path: Path, text: str, key: str) -> None:
+    path = tmp_path / "own.json"
+    data = made().as_dict()
+    (data if key == "made" else data["scan"])[key] = "HERE"
+    path.write_text(json.dumps({**data, "format": 1}).replace('"HERE"', text), encoding="utf-8")
+    with pytest.raises(CalibrationStale, match="cannot be read as a calibration"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        (_scan(flange_from_camera=pin.SE3.Identity()), r"scan\.flange_from_camera against its drawing"),
+        (_scan(rail_direction=np.array([-1.0, 0.0, 0.0])), "rail_direction against"),
+        (_scan(light_plane=LightPlane.of((1.0, 0.0, -1 / 3.5), -0.135)), "exit off it"),
+        (_scan(camera=replace(nominal_camera(load_config(None).scan_camera), fx=800.0)), "fx over the drawn one"),
+    ],
+)
+def test_one_that_does_not_fit_the_drawing_is_not_used(spoilt: CellCalibration, says: str) -> None:
+    config = load_config(None)
+    drawn = {"flange_from_camera": config.scan_camera.flange_from_camera.se3()}
+    spoilt = replace(
+        spoilt, target=replace(spoilt.target, flange_from_camera=config.target_camera.flange_from_camera.se3())
+    )
+    fits = replace(spoilt, scan=replace(made().scan, **drawn))
+    require_as_configured(fits, config)
+    if "flange_from_camera" not in says:
+        spoilt = replace(spoilt, scan=replace(spoilt.scan, **drawn))
+    with pytest.raises(CalibrationStale, match=says):
+        require_as_configured(spoilt, config)

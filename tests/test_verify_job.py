@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.calibration.store import save_calibration
+from cell.calibration.store import accept_calibration, save_calibration
 from cell.lab.bench.whole_job import JobRecord
+from drivers.errors import CalibrationStale
 
 
 def test_verify_tells_a_disturbed_calibration_from_a_good_one(
@@ -24,6 +25,13 @@ def test_verify_tells_a_disturbed_calibration_from_a_good_one(
     stored = json.loads(file.read_text())
     stored["scan"]["flange_from_camera"][0][3] += 0.2e-3
     file.write_text(json.dumps(stored))
+    with Cell.open(sim="all", seed=2, clock="virtual") as cell:
+        for refused in (cell.verify, cell.run):
+            with pytest.raises(
+                CalibrationStale, match=r"was changed after it was written: scan\.flange_from_camera\. "
+            ):
+                refused()
+    accept_calibration(file, "the test", "a mount that slipped")
     with Cell.open(sim="all", seed=2, clock="virtual") as cell:
         found = dict(cell.verify().summary())
     assert not found["good"]

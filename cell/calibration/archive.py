@@ -7,7 +7,7 @@ the solution depends on. What is read is checked as if a stranger had written it
 from __future__ import annotations
 
 import json
-import os
+import logging
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -20,16 +20,20 @@ import pinocchio as pin
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
+from cell.calibration.validation import require_date
 from cell.calibration.witness import Witness, read_edge
 from cell.geometry.camera import Array, CameraModel
+from cell.storage import DIGEST, replacing, require_unchanged, sealed_arrays
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
 from cell.vision.stripe.extract import StripeProfile
 from drivers.errors import ConfigError
 
-FORMAT = 1
+FORMAT, UNSEALED = 2, 1
+"""Of the archives written now, and of those that had no digest."""
 SUFFIX = ".observations.npz"
 PRIORS = ("arm_translation", "arm_rotation", "rail")
+log = logging.getLogger(__name__)
 PROFILE = ("centres", "sigma", "amplitude", "width", "saturated", "double")
 
 
@@ -79,12 +83,10 @@ def write_archive(path: Path, observations: Observations) -> None:
         about["witness_rail"] = o.witness.rail
         about["witness_edge"] = None if o.witness.edge is None else vars(o.witness.edge)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    arrays["about"] = np.array(json.dumps(about))
+    arrays[DIGEST] = np.array(sealed_arrays(arrays))
+    with replacing(path) as file:
+        np.savez_compressed(file, **arrays)
 
 
 def read_archive(path: Path) -> Observations:
@@ -99,8 +101,8 @@ def read_archive(path: Path) -> Observations:
         raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
     try:
         about = json.loads(str(data["about"]))
-        if about["format"] != FORMAT:
-            raise ValueError(f"it has format {about['format']}, this program reads {FORMAT}")
+        if about["format"] not in (FORMAT, UNSEALED):
+            raise ValueError(f"it has format {about['format']}, this program reads {UNSEALED} and {FORMAT}")
         scan = _read_views(data, "scan")
         profiles = _read_profiles(data, len(scan))
         rails = _finite(data, "scan_rail", (len(scan),))
@@ -109,7 +111,8 @@ def read_archive(path: Path) -> Observations:
             raise ValueError(f"scan_same_rest must say yes or no for each of {len(scan)} views")
         shift, turn, along = (_positive(about["priors"], name) for name in PRIORS)
         priors = Priors(shift, turn, along)
-        return Observations(
+        require_date("made", float(about["made"]))
+        found = Observations(
             [
                 ScanObservation(view, profile, flange, float(rail), name, bool(same))
                 for (view, flange, name), profile, rail, same in zip(scan, profiles, rails, same_rest, strict=True)
@@ -129,6 +132,12 @@ def read_archive(path: Path) -> Observations:
             str(about.get("kinematics", "")),
             _read_witness(data, about),
         )
+        # Last: what is wrong with a figure says more than that something was changed.
+        if about["format"] == FORMAT or DIGEST in data:
+            require_unchanged(data)
+        else:
+            log.warning("%s was written before archives had a digest: an edit of it does not show", path)
+        return found
     except KeyError as error:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error
     except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
@@ -139,8 +148,8 @@ def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness 
     if "witness_rail" not in about:
         return None
     columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
-    if columns.ndim != 1 or columns.shape != sigma.shape:
-        raise ValueError("the witness needs a deviation for each of its columns")
+    if columns.ndim != 1 or columns.shape != sigma.shape or not (sigma[np.isfinite(columns)] > 0).all():
+        raise ValueError("the witness needs a deviation above 0 for each of its columns")
     return Witness(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
 
 

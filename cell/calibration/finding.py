@@ -5,11 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from cell.calibration.store import CellCalibration, read_calibration
+from cell.calibration.store import CalibrationEdited, CellCalibration, read_calibration
 from drivers.errors import CalibrationStale, NotConnectedError
-
-CLOCK_SLACK_S = 3600.0
-"""How far a calibration's date may lie in the future: clocks of two machines differ."""
 
 
 def find_calibration(
@@ -24,23 +21,27 @@ def find_calibration(
 
     `kinematics` names the arm's table, as of `kinematics_name`; `untold` says why the arm has not told it now, if so.
 
-    Raises `CalibrationStale` that says what is missing or what differs, `NotConnectedError` when the arm has to be
+    Raises `CalibrationStale` that says what is missing or what differs (`CalibrationEdited` where the file of these
+    devices was changed by somebody), `NotConnectedError` when the arm has to be
     asked again before anybody can tell.
     """
     found, unreadable = [], []
     for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
         try:
             found.append(read_calibration(path))
-        except CalibrationStale:
-            unreadable.append(path.name)
+        except CalibrationStale as error:
+            if isinstance(error, CalibrationEdited) and error.identities == identities:
+                raise
+            unreadable.append((path.name, str(error)))
     own = [entry for entry in found if entry.identities == identities]
     if not own:
         devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
         raise CalibrationStale(
             f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
-            + (f" and {len(unreadable)} unreadable ({', '.join(unreadable)})" if unreadable else "")
+            + (f" and {len(unreadable)} unreadable ({', '.join(name for name, _ in unreadable)})" if unreadable else "")
             + _exchanged(found, identities)
             + "; run `cell calibrate`"
+            + "".join(f". {why}" for _, why in unreadable)
         )
     current = [entry for entry in own if entry.configuration == configuration]
     if not current:
@@ -69,11 +70,6 @@ def find_calibration(
         raise CalibrationStale(
             f"the calibration of {newest.date} is {age / 86400:.1f} days old, allowed are {max_age / 86400:.1f}; run "
             "`cell calibrate`"
-        )
-    if age < -CLOCK_SLACK_S:
-        raise CalibrationStale(
-            f"the calibration of {newest.date} lies {-age / 3600:.1f} hours in the future, so its age is not known; "
-            "set this machine's clock, or run `cell calibrate`"
         )
     if newest.scan.refused:
         raise CalibrationStale(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from cell.calibration.store import (
     solve_observations,
 )
 from cell.calibration.timing_fit import TimesRefused
+from cell.calibration.validation import require_as_configured
 from cell.calibration.verify.confirm import keep_confirmed
 from cell.calibration.verify.verdict import Verification
 from cell.calibration.verify.views import collect_verification
@@ -34,6 +35,7 @@ from cell.motion.arm_models import kinematics_name
 from cell.opened import Opened
 from cell.run.recorded_work import Hands
 from cell.run.run import Run
+from drivers.errors import CalibrationStale
 from drivers.interfaces import Device, why_untold
 from statemachine.step import Event
 
@@ -66,7 +68,7 @@ def arm_table(config: CellConfig, devices: Devices) -> str:
 
 def stored(cell: Opened) -> CellCalibration:
     """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
-    return find_calibration(
+    found = find_calibration(
         cell.calibrations_folder,
         serial_numbers(cell.devices),
         cell.config.calibration_hash(),
@@ -74,6 +76,8 @@ def stored(cell: Opened) -> CellCalibration:
         arm_table(cell.config, cell.devices),
         why_untold(cell.devices.arm),
     )
+    require_as_configured(found, cell.config)
+    return found
 
 
 def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
@@ -121,7 +125,8 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         yield
     except TimesRefused as refused:
         path = folder / f"{name}.json"
-        if path.exists():
+        # One that cannot be read, or was edited, is not used anyway.
+        with suppress(CalibrationStale):
             old = read_calibration(path)
             save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
         raise

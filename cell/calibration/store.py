@@ -23,14 +23,24 @@ from cell.calibration.solve.cameras import adjust_scan, adjust_target
 from cell.calibration.solve.faults import refuse_wrong_lead
 from cell.calibration.solve.joint import Joint
 from cell.calibration.solve.results import Quality, sigmas
+from cell.calibration.validation import require_valid
 from cell.calibration.witness import Witness
 from cell.config import CameraConfig, CellConfig
 from cell.geometry.camera import CameraModel
 from cell.report.html import table
-from cell.run.folder import write_json
-from drivers.errors import CalibrationStale
+from cell.storage import read_json, sealed, write_json
+from drivers.errors import CalibrationStale, ConfigError
 
-FORMAT = 1
+FORMAT, UNSEALED = 2, 1
+"""Of the files written now, and of those that had no digest, which are read with a note."""
+
+
+class CalibrationEdited(CalibrationStale):
+    """A stored calibration is not as it was written; `identities` are the serial numbers that the file tells."""
+
+    def __init__(self, text: str, identities: dict[str, str]) -> None:
+        super().__init__(text)
+        self.identities = identities
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +49,7 @@ class CellCalibration:
 
     `made` is in seconds since the epoch; `identities` are serial numbers by device name. `kinematics` names the arm's
     table with which the flange's poses were reckoned, as of `kinematics_name`; "" in files that do not say so.
+    `edits` tell of each edit of its file that a person has accepted: `who`, `when`, `why` and `changed` (the parts).
     """
 
     scan: ScanCalibration
@@ -47,6 +58,7 @@ class CellCalibration:
     configuration: str
     made: float
     kinematics: str = ""
+    edits: tuple[dict[str, Any], ...] = ()
 
     @classmethod
     def solve(
@@ -95,11 +107,14 @@ class CellCalibration:
             "kinematics": self.kinematics,
             "scan": self.scan.as_dict(),
             "target": self.target.as_dict(),
+            **({"edits": list(self.edits)} if self.edits else {}),
         }
 
     def hash(self) -> str:
         """Hash of its content, for reports: of what it says, not of when it was made."""
-        content = {key: value for key, value in self.as_dict().items() if key not in ("made", "date")}
+        content = {key: value for key, value in self.as_dict().items() if key not in ("made", "date", "edits")}
+        # The first format's, so that a file has the hash that earlier runs tell of it.
+        content["format"] = UNSEALED
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, Any]:
@@ -137,7 +152,12 @@ class CellCalibration:
             },
             "target_quality": _quality(target.quality),
             "shutter": None if scan.shutter is None else scan.shutter.summary(),
-            "notes": [*scan.notes, *scan.unread, *((scan.refused,) if scan.refused else ())],
+            "notes": [
+                *scan.notes,
+                *scan.unread,
+                *((scan.refused,) if scan.refused else ()),
+                *(f"edited by {e['who']} on {e['when']} ({', '.join(e['changed'])}): {e['why']}" for e in self.edits),
+            ],
         }
 
 
@@ -203,7 +223,7 @@ def nominal_camera(config: CameraConfig) -> CameraModel:
 def save_calibration(calibration: CellCalibration, path: Path) -> None:
     """Write it; a reader finds the old file or the new one, never half of one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, calibration.as_dict())
+    write_json(path, sealed(calibration.as_dict(), parts=True))
 
 
 def archive_of(folder: Path, calibration: CellCalibration) -> Path:
@@ -218,21 +238,73 @@ def save_with_observations(calibration: CellCalibration, observations: Observati
 
 
 def read_calibration(path: Path) -> CellCalibration:
-    """Read a stored calibration; raises `CalibrationStale` when the file is none."""
+    """Read a stored calibration; raises `CalibrationStale` when the file is none, `CalibrationEdited` when it was
+    changed since it was written."""
+    made, changed, _ = _read(path)
+    if changed:
+        raise CalibrationEdited(
+            f"{path} was changed after it was written: {', '.join(changed)}. Put the old file back or run `cell "
+            f'calibrate`; if the edit is meant, `cell calibrate accept {path.stem} --why "…"` records it',
+            made.identities,
+        )
+    return made
+
+
+def accept_calibration(path: Path, who: str, why: str) -> CellCalibration:
+    """Take an edited file, or one without a digest, as it is now, and keep in it who did so, when and why.
+
+    `CalibrationStale` when what it says cannot be, `ConfigError` when nothing was changed.
+    """
+    made, changed, intact = _read(path)
+    if intact:
+        raise ConfigError(f"{path} is as it was written; there is no edit to accept")
+    edit = {
+        "who": who,
+        "when": time.strftime("%Y-%m-%d %H:%M:%S"),
+        "why": why,
+        "changed": list(changed) or ["it had no digest"],
+    }
+    accepted = replace(made, edits=(*made.edits, edit))
+    save_calibration(accepted, path)
+    return accepted
+
+
+def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...], bool]:
+    """A file's calibration, which of its parts were changed since it was written, and whether its digest fits."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data["format"] != FORMAT:
-            raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
-        return CellCalibration(
-            ScanCalibration.from_dict(data["scan"]),
+        stored = read_json(path)
+        data = stored.content
+        if data["format"] not in (FORMAT, UNSEALED):
+            raise ValueError(f"format {data['format']}, this program reads {UNSEALED} and {FORMAT}")
+        scan = ScanCalibration.from_dict(data["scan"])
+        changed = stored.changed
+        if data["format"] == FORMAT and not stored.sealed:
+            changed = ("its digest, which is missing",)
+        elif not stored.sealed:
+            note = (
+                "the stored calibration was made before its file had a digest: an edit of it would not show. Run `cell "
+                f'calibrate`, or `cell calibrate accept {path.stem} --why "…"`'
+            )
+            scan = replace(scan, unread=(*scan.unread, note))
+        made = CellCalibration(
+            scan,
             TargetCalibration.from_dict(data["target"]),
             {str(name): str(serial) for name, serial in data["identities"].items()},
             str(data["configuration"]),
             float(data["made"]),
             str(data.get("kinematics", "")),
+            tuple(
+                {
+                    **{key: str(edit[key]) for key in ("who", "when", "why")},
+                    "changed": [str(c) for c in edit["changed"]],
+                }
+                for edit in data.get("edits", ())
+            ),
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        require_valid(made)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
+    return made, changed, stored.sealed and not changed
 
 
 def _lens(camera: CameraModel) -> dict[str, float]:

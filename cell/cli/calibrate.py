@@ -145,12 +145,14 @@ def _laser(text: str | None) -> Laser | None:
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool) -> None:
     from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
+    from cell.storage import sealed
     from cell.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
     result = calibrate_folder(folder, None if board is None else parse_board(board), options)
     if json:
-        print_json(result)
+        # Kept in a file, it may come back with --camera.
+        print_json(sealed(result))
     else:
         print_recorded(result)
     if not any(frame["used"] for frame in result["frames"]):

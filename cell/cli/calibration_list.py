@@ -1,4 +1,4 @@
-"""`cell calibrate list` and `show`: the stored calibrations, and what was found out since they were made."""
+"""`cell calibrate list`, `show` and `accept`: the stored calibrations, what was found out since, and edits of them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ def register(group: typer.Typer) -> None:
     """Add the commands of this file to `cell calibrate`."""
     group.command(name="list")(list_calibrations)
     group.command()(show)
+    group.command()(accept)
 
 
 def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> None:
@@ -76,6 +77,34 @@ def show(
         print_json(summary)
     else:
         print_calibration(summary, str(chosen[-1]))
+
+
+def accept(
+    name: Annotated[str, typer.Argument(help="As `cell calibrate list` names it.")],
+    why: Annotated[str, typer.Option("--why", help="The reason for the edit; it is kept in the file.")],
+    by: Annotated[str | None, typer.Option(help="Who accepts it; without it the user of this shell.")] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Accept a stored calibration that was edited by hand: who, when, why and which parts are kept in its file.
+
+    Without it an edited calibration is refused. Every run with it names the edit in its report.
+    """
+    import getpass
+
+    from cell.calibration.store import accept_calibration
+    from drivers.errors import ConfigError
+
+    path = _folder(config) / f"{name}.json"
+    if not why.strip():
+        raise ConfigError("--why is empty; say in a few words what was edited, and for what reason")
+    if not path.is_file():
+        raise ConfigError(f"there is no calibration {path}; `cell calibrate list` names those that there are")
+    edit = accept_calibration(path, by or getpass.getuser(), why).edits[-1]
+    if json:
+        print_json({"file": str(path), **edit})
+    else:
+        typer.echo(f"{path} is accepted as it is by {edit['who']}: {', '.join(edit['changed'])}")
 
 
 def _since(row: dict[str, Any]) -> str:

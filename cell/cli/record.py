@@ -45,7 +45,16 @@ def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
     with _bar("repair") as progress:
         done = work.repair(path, progress)
     if json:
-        print_json({"file": str(path), "whole": done.whole, "messages": done.messages, "lost_bytes": done.lost})
+        whole = done.whole and done.messages > 0
+        told = {"file": str(path), "whole": whole, "messages": done.messages, "lost_bytes": done.lost}
+        print_json({**told, "damaged": done.damaged})
+    elif done.whole and not done.messages:
+        typer.echo(f"{path} is closed and empty: it holds no message; nothing was changed")
+    elif done.damaged:
+        typer.echo(
+            f"{path} was damaged: {'; '.join(done.damaged)}. {done.messages} messages kept, {done.lost} bytes let go; "
+            f"the old file is {path.name}{work.DAMAGED}"
+        )
     elif done.whole:
         typer.echo(f"{path} is whole, {done.messages} messages; nothing was changed")
     else:
@@ -73,12 +82,16 @@ def info(name: RunArgument = None, config: ConfigOption = None, json: JsonOption
         table.add_row(row["topic"], row["schema"], str(row["messages"]), f"{row['bytes'] / 1000:.1f}")
     console.print(table)
     whole = "whole" if data["whole"] else f"cut off, {data['lost_bytes']} bytes at its end are of no use"
+    if data["damaged"]:
+        whole = f"DAMAGED, it does not fit its CRC: {'; '.join(data['damaged'])}; `cell record repair` leaves that out"
+    elif data["closed"] and not data["messages"]:
+        whole = "empty, it holds no message"
     typer.echo(f"{path}: {data['bytes'] / 1e6:.1f} MB, {data['messages']} messages over {data['span_s']} s, {whole}")
     if data["cpu_s"] is not None and data["span_s"]:
         typer.echo(f"writing it took {data['cpu_s']:.2f} s of a core, {100 * data['cpu_s'] / data['span_s']:.1f} %")
     if data["dropped"] is None:
-        closing = "" if data["whole"] else "; `cell record repair` closes it"
-        typer.echo(f"it was cut off before it told what was let go{closing}")
+        closing = "" if data["closed"] else "; `cell record repair` closes it"
+        typer.echo(f"it does not tell what was let go: its last message is missing{closing}")
     for topic, count in (data["dropped"] or {}).items():
         typer.echo(f"let go, because too much came at once: {count} of {topic}")
 

@@ -179,9 +179,9 @@ def resume(
         Cell.open,
         config,
         sim="all" if whole else simulated or "none",
-        seed=before.info["seed"] if simulated else 1,
-        level=before.info["level"] if simulated else "nominal",
-        speed=before.info["speed"] if whole and clock == "wall" else None,
+        seed=before.info.get("seed") or 1,
+        level=before.info.get("level") or "nominal",
+        speed=before.info.get("speed") if whole and clock == "wall" else None,
         job=before.job if simulated else "pot",
         clock=clock,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
 import time
 from collections import Counter, deque
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.record.channels import BY_TOPIC, json_schema
+from cell.storage import sync_folder
 from drivers.errors import CellError
 
 FILE = "record.mcap"
@@ -88,6 +90,9 @@ class RecordFile:
         try:
             with self.path.open("wb") as stream:
                 self._write(_Out(stream, self._facts))
+                stream.flush()
+                os.fsync(stream.fileno())
+            sync_folder(self.path.parent)
         except Exception as error:
             # The run goes on without it.
             self.failure = f"{type(error).__name__}: {error}"
@@ -134,7 +139,9 @@ class _Out:
         from mcap.writer import CompressionType, Writer
 
         self.newest = 0
-        self.writer: Any = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self.writer: Any = Writer(
+            stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True
+        )
         self.writer.start(profile="", library="assembly-cell")
         self.writer.add_metadata("run", facts)
         self._channels: dict[str, int] = {}

@@ -7,12 +7,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from cell.record.reading import Parts, said
+from cell.record.reading import Parts, decoding, said
 from drivers.errors import CellError
 
 
 def information(path: Path) -> dict[str, Any]:
-    """Its channels with their messages and bytes, its span in s, whether it was closed, what was let go, by topic.
+    """Its channels with their messages and bytes, its span in s, whether it is whole, what was let go, by topic.
+
+    It is `whole` when it was closed, its CRCs fit (`damaged` names what does not) and it holds a message.
 
     `dropped` is None where the record was cut off before it could tell. `cpu_s` of a core were taken to write it: None
     then, and on the virtual clock. Raises as `said` does.
@@ -30,13 +32,16 @@ def information(path: Path) -> dict[str, Any]:
             schemas[message.topic] = message.schema
             times = [min([message.at, *times]), max([message.at, *times])]
             if message.topic == "/record/end":
-                end = json.loads(message.data)
+                with decoding(told):
+                    end = dict(json.loads(message.data))
     except CellError as error:
         raise CellError(f"{path}: {error}") from error
     return {
         "file": str(path),
         "bytes": path.stat().st_size,
-        "whole": told.whole,
+        "whole": told.whole and counts.total() > 0,
+        "closed": told.closed,
+        "damaged": told.damaged,
         "lost_bytes": told.lost,
         "messages": counts.total(),
         "begun_ns": times[0] if times else None,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import struct
+import zlib
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -24,11 +26,19 @@ LONGEST = 1 << 32
 
 @dataclass
 class Parts:
-    """What a file holds, in its order: each record's kind and content. `whole` once its proper end was reached; else
-    `lost` bytes at the end are of no use."""
+    """How a file ended: `closed` once its proper end was reached; else `lost` bytes at the end are of no use.
 
-    whole: bool = False
+    `damaged` names what does not fit its CRC, and where; chunks among it are left out, `lost` counts their bytes.
+    """
+
+    closed: bool = False
     lost: int = 0
+    damaged: list[str] = field(default_factory=list)
+
+    @property
+    def whole(self) -> bool:
+        """Closed, and every byte as it was written, as far as CRCs tell."""
+        return self.closed and not self.damaged
 
 
 def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
@@ -41,24 +51,82 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
     start = stream.read(len(MAGIC))
     if not MAGIC.startswith(start):
         raise CellError("it does not begin as an MCAP file does")
-    good = stream.tell()
+    good, crc, summary = stream.tell(), zlib.crc32(start), False
     while len(head := stream.read(_HEAD.size)) == _HEAD.size:
         kind, length = _HEAD.unpack(head)
         content = stream.read(min(length, LONGEST))
         if kind == 0 or len(content) < length:
-            if kind == CHUNK:
+            stream.seek(max(0, size - len(MAGIC)))
+            if good > len(MAGIC) and stream.read() == MAGIC:
+                told.damaged.append(f"the record at byte {good} says that it is {length} bytes long")
+            elif kind == CHUNK:
                 good += _HEAD.size + (yield from _inside(content))
             break
-        good = stream.tell()
-        if kind == CHUNK:
+        here, good = good, stream.tell()
+        if kind == CHUNK and _crc_fits(content):
             yield from _inside(content)
+        elif kind == CHUNK:
+            told.damaged.append(f"the chunk at byte {here}, {len(content)} bytes long")
+            told.lost += len(content)
+            index = _summary(stream, size)
+            stream.seek(good)
+            # Later messages need the channels that stood in it; the index repeats them.
+            for kept, inner in _records(BytesIO(index)):
+                if kept in (SCHEMA, CHANNEL):
+                    yield kept, inner
+        elif kind == DATA_END:
+            # 0: not reckoned, in records of older versions.
+            expected = int.from_bytes(content[:4], "little")
+            if expected not in (0, crc) and not told.damaged:
+                told.damaged.append(f"something between its chunks, before byte {here}")
+            crc, summary = 0, True
+            continue
         elif kind == FOOTER:
-            told.whole = stream.read(len(MAGIC)) == MAGIC
+            if content[16:20] not in (bytes(4), zlib.crc32(head + content[:16], crc).to_bytes(4, "little")):
+                told.damaged.append(f"the index that ends at byte {here}")
+            told.closed = stream.read(len(MAGIC)) == MAGIC
             good = stream.tell()
             break
-        else:
+        elif not summary:
             yield kind, content
-    told.lost = size - good
+        crc = zlib.crc32(content, zlib.crc32(head, crc))
+    told.lost += size - good
+
+
+@contextmanager
+def decoding(told: Parts) -> Iterator[None]:
+    """A record that cannot be decoded is damage: one of an older version, where no CRC showed it before."""
+    try:
+        yield
+    except (CellError, OSError):
+        raise
+    except Exception as error:
+        # The library raises whatever its bytes lead it to.
+        told.damaged.append(f"a record that cannot be decoded ({type(error).__name__}: {error})")
+
+
+def _crc_fits(chunk: bytes) -> bool:
+    """Whether the records of a chunk fit its CRC; one that is compressed is not looked into."""
+    if len(chunk) < _CHUNK.size + 12:
+        return False
+    expected, name = struct.unpack_from("<I", chunk, _CHUNK.size - 4)[0], chunk[_CHUNK.size : _CHUNK.size + 8]
+    if name[:4] != bytes(4):
+        return name[4:].startswith((b"zstd", b"lz4"))
+    return expected in (0, zlib.crc32(chunk[_CHUNK.size + 12 :]))
+
+
+def _summary(stream: IO[bytes], size: int) -> bytes:
+    """The section with the index, which repeats schemas and channels; empty where the file was cut off."""
+    end = len(MAGIC) + _HEAD.size + 20
+    stream.seek(max(0, size - end))
+    foot = stream.read()
+    if len(foot) < end or foot[0] != FOOTER or not foot.endswith(MAGIC):
+        return b""
+    begin = int.from_bytes(foot[_HEAD.size : _HEAD.size + 8], "little")
+    stream.seek(min(begin, size))
+    index = stream.read()[:-end]
+    fits = zlib.crc32(index + foot[: _HEAD.size + 16]).to_bytes(4, "little") == foot[_HEAD.size + 16 : _HEAD.size + 20]
+    return index if fits else b""
 
 
 def _inside(chunk: bytes) -> Generator[tuple[int, bytes], None, int]:
@@ -70,10 +138,14 @@ def _inside(chunk: bytes) -> Generator[tuple[int, bytes], None, int]:
     inside.seek(_CHUNK.size + 4 + name + 8)
     if name:
         raise CellError("its chunks are compressed: another program wrote it, which has to repair it")
+    return (yield from _records(inside))
+
+
+def _records(inside: BytesIO) -> Generator[tuple[int, bytes], None, int]:
     good = inside.tell()
     while len(head := inside.read(_HEAD.size)) == _HEAD.size:
         kind, length = _HEAD.unpack(head)
-        content = inside.read(length)
+        content = inside.read(min(length, LONGEST))
         if len(content) < length:
             break
         good = inside.tell()
@@ -116,18 +188,21 @@ def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[
     with path.open("rb") as stream:
         for kind, content in parts(stream, told):
             data = ReadDataStream(BytesIO(content))
-            if kind == SCHEMA:
-                schema = Schema.read(data)
-                schemas[schema.id] = schema
-            elif kind == CHANNEL:
-                channel = Channel.read(data)
-                channels[channel.id] = channel
-            elif kind == MESSAGE:
-                of = channels.get(int.from_bytes(content[:2], "little"))
-                if of is not None and of.topic.startswith(topics):
-                    message = Message.read(data, len(content))
-                    schema = schemas[of.schema_id]
-                    yield Said(of.topic, schema.name, of.message_encoding, message.log_time, message.data)
+            found: Said | None = None
+            with decoding(told):
+                if kind == SCHEMA:
+                    schema = Schema.read(data)
+                    schemas[schema.id] = schema
+                elif kind == CHANNEL:
+                    channel = Channel.read(data)
+                    channels[channel.id] = channel
+                elif kind == MESSAGE:
+                    of = channels.get(int.from_bytes(content[:2], "little"))
+                    if of is not None and of.schema_id in schemas and of.topic.startswith(topics):
+                        message, name = Message.read(data, len(content)), schemas[of.schema_id].name
+                        found = Said(of.topic, name, of.message_encoding, message.log_time, message.data)
+            if found is not None:
+                yield found
 
 
 def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:

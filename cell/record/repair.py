@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import os
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 from cell.record.file import CHUNK_BYTES, require_packages
-from cell.record.reading import CHANNEL, MESSAGE, METADATA, SCHEMA, Parts, parts
+from cell.record.reading import CHANNEL, MESSAGE, METADATA, SCHEMA, Parts, decoding, parts
+from cell.storage import replacing
 from drivers.errors import CellError, ConfigError
+
+DAMAGED = ".damaged"
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """What became of a file: it was `whole` already, or so many `messages` were kept and `lost` bytes let go."""
+    """What became of a file: it was `whole` already (one without a message too), or so many `messages` were kept and
+    `lost` bytes let go. Where `damaged` names anything, the old file is kept beside it, with `DAMAGED` at its end."""
 
     whole: bool
     messages: int
     lost: int
+    damaged: tuple[str, ...] = ()
 
 
 def repair(path: Path, progress: Callable[[float, str], None] = lambda fraction, text: None) -> Repaired:
@@ -28,30 +34,31 @@ def repair(path: Path, progress: Callable[[float, str], None] = lambda fraction,
     if not path.is_file():
         raise ConfigError(f"there is no {path}; a run of an older version leaves none")
     require_packages()
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
     told, copied = Parts(), 0
     try:
-        with path.open("rb") as stream, temporary.open("wb") as out:
+        with path.open("rb") as stream, suppress(_WholeError), replacing(path) as out:
             copy = _Copy(out)
             size = max(1, path.stat().st_size)
             for kind, content in parts(stream, told):
-                copy.take(kind, content)
+                with decoding(told):
+                    copy.take(kind, content)
                 if copy.messages % 1000 == 0:
                     progress(stream.tell() / size, f"{copy.messages} messages")
             copied = copy.messages
-            if not told.whole:
-                copy.finish()
-                out.flush()
-                os.fsync(out.fileno())
-        if not told.whole:
-            temporary.replace(path)
+            if told.whole:
+                raise _WholeError
+            copy.finish()
+            if told.damaged:
+                shutil.copyfile(path, path.with_name(path.name + DAMAGED))
     except CellError as error:
         raise CellError(f"{path} cannot be repaired: {error}") from error
     except OSError as error:
         raise CellError(f"{path} cannot be repaired: {error}; it is as it was") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return Repaired(told.whole, copied, 0 if told.whole else told.lost)
+    return Repaired(told.whole, copied, 0 if told.whole else told.lost, tuple(told.damaged))
+
+
+class _WholeError(Exception):
+    """Nothing is to be replaced."""
 
 
 class _Copy:
@@ -61,7 +68,7 @@ class _Copy:
         from mcap.writer import CompressionType, Writer
 
         self.messages = 0
-        self._writer: Any = Writer(out, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer: Any = Writer(out, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True)
         self._writer.start(profile="", library="assembly-cell")
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}

@@ -127,7 +127,9 @@ def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix
 
 
 def _sweep(here: Workplace, folder: Path, fix: BoardFix, *, resumed: bool) -> SweepRecord:
-    stored = StoredSweep.load(folder, here.calibration.scan, here.job.scan, here.config.laser.exit_point)
+    head, exit_point = here.calibration.scan, here.config.laser.exit_point
+    # What was changed comes out otherwise, which is what a replay is to show.
+    stored = StoredSweep.load(folder, head, here.job.scan, exit_point, as_written=False)
     return stored.confirmed_by(fix) if resumed else stored.sweep
 
 

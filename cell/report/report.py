@@ -20,10 +20,11 @@ from cell.job import Job
 from cell.report.bound import stated_bound
 from cell.report.evidence import last_frames, measured, refusal
 from cell.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
-from cell.run.folder import REPORT, timeless, when, write_json
+from cell.run.folder import REPORT, timeless, when
 from cell.run.frames import FrameStore
 from cell.steps.reconstruct import Reconstruction
 from cell.steps.sweep_record import SweepRecord
+from cell.storage import sealed, write_json
 from cell.version import release
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
@@ -83,7 +84,7 @@ def make_report(
     report["measured"] = measured(result, job, None, report["place_bound_95"])
     if frames.failure is not None:
         report["frames_missing"] = frames.failure
-    _write(folder, strict(timeless(report)))
+    _write(folder, sealed(strict(timeless(report))))
     if witness is not None:
         try:
             _add_truth(report, job, nominal, repeatability, result, witness)
@@ -97,7 +98,7 @@ def make_report(
         draw_run(folder / "picture.png", job, nominal, result, report, frames)
     except Exception as error:
         report["picture_missing"] = f"{type(error).__name__}: {error}"
-    report = strict(timeless(report))
+    report = sealed(strict(timeless(report)))
     _write(folder, report)
     return report
 

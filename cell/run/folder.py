@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import secrets
@@ -10,7 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import CellError, ConfigError
+from cell.storage import write_json as write_json
+from drivers.errors import ConfigError
 from statemachine.journal import JournalError, read
 
 REPORT = "report.json"
@@ -116,20 +116,3 @@ def timeless(report: dict[str, Any]) -> dict[str, Any]:
         return report
     steps = [{**step, "wall_s": None} for step in report["steps"]] if "steps" in report else None
     return {**report, "wall_s": None, "pid": None, **({} if steps is None else {"steps": steps})}
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write strict JSON so that a reader finds the old file or the new one, never half of one.
-
-    Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
-    """
-    try:
-        text = json.dumps(data, indent=2, allow_nan=False)
-    except ValueError as error:
-        raise CellError(f"{path} is not written: {error}; one of its figures is no number") from error
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(f"{text}\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)

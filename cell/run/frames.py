@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import queue
 import threading
 from collections import deque
@@ -12,6 +13,7 @@ from types import TracebackType
 import cv2
 import numpy as np
 
+from cell.storage import sync_files
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 
@@ -20,6 +22,8 @@ CAPACITY = 64
 
 
 WRITE_TIMEOUT_S = 5.0
+SETTLE_S = 60.0
+"""Wall seconds that a full queue has to reach the disk."""
 RECENT = 12
 """Names of a step's frames that are remembered, the newest."""
 PNG = (
@@ -64,8 +68,9 @@ class FrameStore:
         self.found: tuple[Frame, Vector] | None = None
         self._folder = folder
         self._listener = listener
-        self._waiting: queue.Queue[tuple[Picture, Frame] | None] = queue.Queue(CAPACITY)
+        self._waiting: queue.Queue[tuple[Picture, Frame] | threading.Event | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
+        self._digests: dict[str, str] = {}
         self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
         self._thread.start()
 
@@ -90,6 +95,24 @@ class FrameStore:
             self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
             raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
 
+    def settle(self) -> dict[str, str]:
+        """Wait until all frames so far are on the disk: the SHA-256 of each file by its name.
+
+        Raises `CellError` when one could not be written.
+        """
+        written = threading.Event()
+        try:
+            self._waiting.put(written, timeout=WRITE_TIMEOUT_S)
+            if not written.wait(SETTLE_S):
+                self._failure = f"frames were still to be written after {SETTLE_S:.0f} s"
+            elif self._folder.is_dir():
+                sync_files(self._folder)
+        except (queue.Full, OSError) as error:
+            self._failure = str(error) or f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
+        if self._failure is not None:
+            raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
+        return dict(self._digests)
+
     @property
     def failure(self) -> str | None:
         """Why frames are missing, or None."""
@@ -97,6 +120,9 @@ class FrameStore:
 
     def _write(self) -> None:
         while (item := self._waiting.get()) is not None:
+            if isinstance(item, threading.Event):
+                item.set()
+                continue
             picture, frame = item
             path, data = self._folder / picture.name, None
             try:
@@ -105,6 +131,7 @@ class FrameStore:
                 if made:
                     data = np.asarray(png).tobytes()
                     path.write_bytes(data)
+                    self._digests[picture.name] = hashlib.sha256(data).hexdigest()
                 else:
                     self._failure = f"{path} could not be written"
             except Exception as error:  # the writer must go on emptying the queue

@@ -246,6 +246,7 @@ class JobRun:
             "configuration_hash": self.config.calibration_hash(),
             "calibration_hash": self.calibration.hash(),
             "calibration_date": self.calibration.date,
+            **({"calibration_edits": list(self.calibration.edits)} if self.calibration.edits else {}),
         }
 
     def _keep_inputs(self, folder: Path) -> None:

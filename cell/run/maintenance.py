@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cell.run.folder import REPORT, new_run, when, write_json
+from cell.run.folder import REPORT, new_run, when
 from cell.run.logs import run_log
+from cell.storage import sealed, write_json
 from cell.version import release
 from drivers.errors import CellError
 from statemachine.journal import Journal, JournalError
@@ -38,4 +39,4 @@ def recorded_maintenance(root: Path, facts: Mapping[str, Any], reason: str, lift
         journal.close()
         ended = {"started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2)}
         report = {"run": folder.name, "version": release(), "outcome": outcome, "reason": said, **ended, **facts}
-        write_json(folder / REPORT, report)
+        write_json(folder / REPORT, sealed(report))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.run.folder import REPORT, when
+from cell.storage import EditedError, read_json
 from drivers.errors import CellError, ConfigError
 from statemachine.journal import JournalError, Record, read
 
@@ -23,13 +23,15 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         return _from_journal(folder)
     try:
-        report: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        report = read_json(path).require()
+    except EditedError as error:
+        raise CellError(f"{path}: {error}; it is not what the run reported. The journal is beside it") from error
+    except (OSError, ValueError) as error:
         raise CellError(
             f"{path} cannot be read ({error}): it was cut off or is none of ours; what else is left of the run lies "
             "beside it"
         ) from error
-    if not isinstance(report, dict) or not isinstance(report.get("outcome"), str) or not all(
+    if not isinstance(report.get("outcome"), str) or not all(
         _rows(report.get(key)) for key in ("steps", "measured", "faults")
     ):  # fmt: skip
         raise CellError(f"{path} is not the report of a run: it does not tell an outcome, or not as a report does")

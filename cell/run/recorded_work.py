@@ -18,10 +18,11 @@ from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
 from cell.record.recorder import begin_record
-from cell.run.folder import REPORT, new_run, timeless, when, write_json
+from cell.run.folder import REPORT, new_run, timeless, when
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.run import Run
+from cell.storage import sealed, write_json
 from cell.version import release
 from drivers.errors import Aborted, CellError, Interrupted, RefusedError
 from drivers.interfaces import Frame
@@ -112,7 +113,7 @@ class RecordedWork:
                 report["frames_missing"] = frames.failure
             for action in (
                 lambda: journal.run_ended(outcome, reason), journal.close,
-                lambda: write_json(folder / REPORT, timeless(report)),
+                lambda: write_json(folder / REPORT, sealed(timeless(report))),
             ):  # fmt: skip
                 _last(action, ended)
             self.run.folder = outer or folder

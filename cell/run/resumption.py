@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from cell.calibration.store import CellCalibration
@@ -36,9 +37,12 @@ class UnfinishedRun:
         A run that a script looked at is only found for one that is `scripted` as well.
         """
         try:
-            record = read(folder)
+            record = read(folder, whole=True)
         except JournalError as error:
-            raise ConfigError(f"{folder} cannot be resumed: {error}") from error
+            raise ConfigError(
+                f"{folder} cannot be resumed: {error}. What became of its part is not known: look at it, fold the arm "
+                "with `cell home`, then run the job anew"
+            ) from error
         run = record.run
         if run.outcome in ("placed", "done", "refused"):
             raise ConfigError(
@@ -51,10 +55,13 @@ class UnfinishedRun:
                 f"run {folder.name} was looked at by a script between its steps: without it, it is not resumed. Call "
                 "Cell.resume with that script, or run the job again"
             )
-        if "job_file" not in run.info:
-            raise ConfigError(f"run {folder.name} does not say which file its job was; run the job again")
+        _require_facts(folder, run.info)
         job, told = run.info["job_file"], run.info["job_hash"]
-        if job_hash(job) != told:
+        try:
+            changed = job_hash(job) != told
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"the job of run {folder.name} cannot be read: {error}; run a job anew") from error
+        if changed:
             raise ConfigError(f"{job} or its mesh was changed since run {folder.name}; run the job again")
         return cls(folder, job, run.info, _swept(record))
 
@@ -66,7 +73,7 @@ class UnfinishedRun:
             return None, "the simulated world of that run has ended"
         now = {"configuration_hash": config.calibration_hash(), "calibration_hash": calibration.hash()}
         for name, value in now.items():
-            if self.info[name] != value:
+            if self.info.get(name) != value:
                 return None, f"the {name.removesuffix('_hash')} was changed since run {self.folder.name}"
         try:
             stored = StoredSweep.load(self.folder, calibration.scan, job.scan, config.laser.exit_point)
@@ -75,21 +82,44 @@ class UnfinishedRun:
         return stored, f"the sweep of run {self.folder.name} is used if the board has not moved"
 
 
+FACTS: dict[str, tuple[type, ...]] = {
+    "job_file": (str,), "job_hash": (str,), "configuration_hash": (str,), "calibration_hash": (str,),
+    "simulated": (bool, str, list), "seed": (int, NoneType), "level": (str, NoneType), "clock": (str,),
+    "speed": (int, float, NoneType), "until": (str,), "scripted": (bool,),
+}  # fmt: skip
+"""What a journal tells of a run that a resumed one goes by, where it is there."""
+
+
+def _require_facts(folder: Path, info: dict[str, Any]) -> None:
+    """`ConfigError` when the journal does not tell which job it was, or tells anything as what it cannot be."""
+    for name in ("job_file", "job_hash", "simulated"):
+        if name not in info:
+            raise ConfigError(f"run {folder.name} does not tell its {name}; run the job again")
+    for name, kinds in FACTS.items():
+        if name in info and type(info[name]) not in kinds:
+            raise ConfigError(f"the journal of run {folder.name} tells its {name} as {info[name]!r}; run the job again")
+
+
 def _require_held(folder: Path, record: Record) -> None:
     """`ConfigError` when the part is not in the claw any more, or may not be."""
-    told = [event for event in record.events if event.kind == "note" and "part" in event.data]
+    told = [event for event in record.events if "part" in event.data]
     match told[-1].data["part"] if told else PartState.HELD.value:
+        case PartState.HELD.value:
+            return
         case PartState.RELEASED.value:
             failed = "what came after that" if told[-1].step in record.done else "only the retreat"
             raise ConfigError(
                 f"run {folder.name} had put its part down already, {failed} failed: there is nothing to resume. Look "
                 "at the part, fold the arm with `cell home`, then run the job with the next part"
             )
-        case PartState.UNKNOWN.value:
+        case state:
+            how = f"tells of its part {str(state)[:40]!r}, which is neither held nor released"
+            if state == PartState.UNKNOWN.value:
+                how = "ended while the claw was releasing its part"
             raise ConfigError(
-                f"run {folder.name} ended while the claw was releasing its part: whether it did is not known, and it "
-                "is not resumed. Look what has become of the part, fold the arm with `cell home`, then run the job "
-                "with a part in the claw"
+                f"run {folder.name} {how}: whether the claw still has it is not known, and the run is not resumed. "
+                "Look what has become of the part, fold the arm with `cell home`, then run the job with a part in the "
+                "claw"
             )
 
 

@@ -104,7 +104,7 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
             context.note(text=f"the board has not moved: the sweep of run {here.earlier.folder.name} holds")
             return sweep
     sweep = _sweep(here, context, fix)
-    save_sweep(here.folder, sweep, fix)
+    save_sweep(here.folder, sweep, fix, here.frames.settle())
     return sweep
 
 

@@ -6,8 +6,10 @@ long as arm base and station have not moved against each other, which a new phot
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import zipfile
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import pinocchio as pin
 
 from cell.calibration import ScanCalibration
 from cell.calibration.slip import Slip
+from cell.calibration.validation import require_covariance
 from cell.calibration.witness import Pointing
 from cell.geometry.poses import difference, from_matrix
 from cell.job import ScanSection
@@ -24,12 +27,14 @@ from cell.reconstruction import ScanGeometry
 from cell.steps.photograph import BoardFix
 from cell.steps.swath import Collector, Swath
 from cell.steps.sweep_record import SweepRecord
+from cell.storage import DIGEST, replacing, require_unchanged, sealed_arrays, sync_files
 from drivers.camera.folder import read_image
-from drivers.errors import CalibrationStale, RefusedError
+from drivers.errors import CalibrationStale, CellError, RefusedError
 from drivers.interfaces import Frame, Vector
 
 FILE = "sweep.npz"
-FORMAT = 4
+FORMAT, UNSEALED = 5, 4
+"""Of the sweeps written now, and of those that had no digest, which a replay reads, and no run goes on with."""
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
@@ -41,8 +46,11 @@ def frame_path(folder: Path, frame_id: int) -> Path:
     return folder / "frames" / f"stripe-{frame_id:06d}.png"
 
 
-def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
-    """Write what a sweep was taken with, and where the board was seen before it, into the run's `folder`."""
+def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix, frames: Mapping[str, str] = {}) -> None:
+    """Write what a sweep was taken with, and where the board was seen before it, into the run's `folder`.
+
+    `frames` are the SHA-256 of the frames' files by name; each is one that is on the disk.
+    """
     data: dict[str, Any] = {
         "format": np.array(FORMAT),
         "base_from_board": fix.base_from_board.homogeneous,
@@ -57,7 +65,10 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix) -> None:
     for k, swath in enumerate(sweep.swaths):
         data |= {f"{name}_{k}": getattr(swath, name) for name in _ARRAYS}
         data[f"figures_{k}"] = np.array([swath.lost, swath.residual, swath.shift])
-    with (folder / FILE).open("wb") as file:
+        names = [frame_path(folder, int(frame_id)).name for frame_id in swath.seen]
+        data[f"frames_{k}"] = np.array([frames.get(name, "") for name in names], dtype=np.str_)
+    data[DIGEST] = np.array(sealed_arrays(data))
+    with replacing(folder / FILE) as file:
         np.savez(file, **data)
 
 
@@ -71,23 +82,34 @@ class StoredSweep:
     board_covariance: Vector
 
     @classmethod
-    def load(cls, folder: Path, head: ScanCalibration, scan: ScanSection, exit_point: Vector) -> StoredSweep:
-        """Read it, and extract the stripe from the frames again; `RefusedError` when anything of it is missing."""
+    def load(
+        cls, folder: Path, head: ScanCalibration, scan: ScanSection, exit_point: Vector, *, as_written: bool = True
+    ) -> StoredSweep:
+        """Read it, and extract the stripe from the frames again.
+
+        `RefusedError` when anything of it is missing, no number, or, with `as_written`, was changed: a figure or a
+        frame.
+        """
         path = folder / FILE
         try:
             with np.load(path, allow_pickle=False) as data:
                 stored = {name: data[name] for name in data.files}
-            if stored["format"] != FORMAT:
+            if stored["format"] != FORMAT and (as_written or stored["format"] != UNSEALED):
                 raise ValueError(f"format {stored['format']}, this program reads {FORMAT}")
+            if as_written:
+                require_unchanged(stored)
             pointing = Pointing(*map(float, stored["pointing"])) if "pointing" in stored else None
             slip = _slip(*map(float, stored["slip"])) if "slip" in stored else None
             geometry = (head if pointing is None else head.pointed(pointing, exit_point)).geometry()
             count = sum(name.startswith("frame_ids_") for name in stored)
+            if as_written:
+                _require_frames(folder, stored, count)
             swaths = tuple(_swath(folder, stored, k, geometry, scan) for k in range(count))
             if not swaths:
                 raise ValueError("it holds no sweep")
             base_from_board, covariance = from_matrix(stored["base_from_board"]), stored["board_covariance"]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            require_covariance("board_covariance", covariance.reshape(6, 6), range(0))
+        except (OSError, ValueError, KeyError, EOFError, TypeError, IndexError, zipfile.BadZipFile, CellError) as error:
             raise RefusedError(f"{path} cannot be read as a sweep: {error}") from error
         return cls(folder, SweepRecord(swaths, pointing, slip=slip), base_from_board, covariance)
 
@@ -115,7 +137,9 @@ class StoredSweep:
         for swath in self.sweep.swaths:
             for frame_id in swath.seen:
                 shutil.copyfile(frame_path(self.folder, frame_id), frame_path(folder, frame_id))
-        shutil.copyfile(self.folder / FILE, folder / FILE)
+        sync_files(folder)
+        with replacing(folder / FILE) as file:
+            file.write((self.folder / FILE).read_bytes())
 
 
 def moved_by(fix: BoardFix, base_from_board: pin.SE3, covariance: Vector) -> str | None:
@@ -130,9 +154,38 @@ def _slip(along: float, across: float, lag: float, depth: float, hidden: float) 
     return Slip(along, across, lag, bool(hidden), depth)
 
 
+def _require_frames(folder: Path, stored: dict[str, Any], count: int) -> None:
+    """Raise `ValueError` that names the frames which are not those of the sweep: exchanged, edited or never kept."""
+    other = []
+    for k in range(count):
+        for frame_id, told in zip(stored[f"seen_{k}"], stored[f"frames_{k}"], strict=True):
+            path = frame_path(folder, int(frame_id))
+            if hashlib.sha256(path.read_bytes()).hexdigest() != str(told):
+                other.append(path.name)
+    if other:
+        listed = ", ".join(other[:4]) + (", …" if len(other) > 4 else "")
+        raise ValueError(f"{len(other)} of its frames are not those that the sweep took: {listed}")
+
+
+def _require_arrays(arrays: dict[str, Any]) -> None:
+    """Raise `ValueError` where the arrays of a sweep have other shapes than one has, or hold what is no number."""
+    n, m = len(arrays["lines"]), len(arrays["seen"])
+    shapes = {"flanges": (n, 4, 4), "line_spread": (n, 3), "covariance": (6, 6), "seen": (m,)}
+    for name, array in arrays.items():
+        if array.shape != shapes.get(name, (n,)) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+            raise ValueError(f"{name} of {n} lines has shape {array.shape}, or holds what is no number")
+    for name in ("lines", "seen", "frame_ids"):
+        if arrays[name].dtype.kind not in "iu" or (arrays[name] < 0).any():
+            raise ValueError(f"{name} must be numbers from 0")
+    require_covariance("covariance", arrays["covariance"], range(0))
+
+
 def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeometry, scan: ScanSection) -> Swath:
     arrays: dict[str, Any] = {name: stored[f"{name}_{k}"] for name in _ARRAYS}
+    _require_arrays(arrays)
     lost, residual, shift = stored[f"figures_{k}"]
+    if not np.isfinite([lost, residual, shift]).all():
+        raise ValueError(f"its figures are {lost}, {residual}, {shift}")
     shape = (geometry.camera.height, geometry.camera.width)
     collector = Collector(geometry, scan, lambda frame: None, lambda fraction, text: None)
     for frame_id in arrays["seen"]:

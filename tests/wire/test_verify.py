@@ -26,6 +26,10 @@ def test_verify_tells_a_disturbed_calibration_from_a_good_one(place: Path, tmp_p
     stored["scan"]["flange_from_camera"][0][3] += 0.2e-3
     file.write_text(json.dumps(stored))
     done = cell("calibrate", "verify", *world, folder=tmp_path, timeout=400.0)
+    assert (done.returncode, "changed after it was written: scan.flange_from_camera" in done.stderr) == (1, True)
+    done = cell("calibrate", "accept", file.stem, "--why", "a mount that slipped", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = cell("calibrate", "verify", *world, folder=tmp_path, timeout=400.0)
     assert done.returncode == 1, done.stderr
     found = json.loads(done.stdout)
     assert not found["good"]

@@ -10,6 +10,7 @@ import numpy as np
 
 from cell.calibration.recorded.texts import decoded, stored_matrix, structured
 from cell.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.storage import EditedError, is_intact
 from drivers.errors import ConfigError
 
 FORM = "it needs width, height, fx, fy, cx, cy and k1 … k3, or camera_matrix and distortion coefficients"
@@ -41,6 +42,9 @@ def read_camera(path: Path) -> CameraModel:
     """The camera of a file. Raises ConfigError that says what is missing."""
     try:
         data = structured(path.suffix.lower(), decoded(path.read_bytes()))
+        # A result of `cell calibrate --from`; files of others have no digest.
+        if isinstance(data, dict) and not is_intact(data):
+            raise EditedError("it was changed after `cell calibrate --from` wrote it; use the result as it was")
     except (OSError, ValueError) as error:
         raise ConfigError(f"--camera {path}: it cannot be read: {error}") from error
     if not isinstance(data, dict):

@@ -51,6 +51,10 @@ class NoFrames(FrameStore):
     def keep(self, what: str, frame: Frame) -> None:
         """Let it go."""
 
+    def settle(self) -> dict[str, str]:
+        """There is none."""
+        return {}
+
 
 @dataclass(eq=False)
 class JobRecord:

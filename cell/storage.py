@@ -1,0 +1,185 @@
+"""Files that must survive: whole or not at all, on the disk when the call returns, and with a digest of their content.
+
+The digest is a SHA-256. It shows accidents and edits by hand; it protects from no attacker. Names and dates of runs
+(`UNDATED`) do not count: the same seed gives the same digest.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from drivers.errors import CellError
+
+DIGEST, PARTS = "sha256", "sha256_of"
+"""Keys of a file: the digest of all the rest, and short ones of its parts, by which an edit can be located."""
+UNDATED = ("run", "started", "ended", "at", "calibration_date")
+
+
+class EditedError(ValueError):
+    """A file's content is not what its writer put there."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Write a file in the place of `path`: a reader finds the old one or the new one, after a power cut as well.
+
+    Whatever fails, `OSError` of a full disk for one, leaves the old file and no other.
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(3)}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        sync_folder(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk; a file system that cannot do that is left alone."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(handle)
+
+
+def sync_files(folder: Path) -> None:
+    """Have all files below `folder` on the disk by one call: an fsync for each of a sweep's frames takes 20 times as
+    long. Raises `OSError`."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
+        if syncfs is None:
+            os.sync()
+        elif syncfs(handle) != 0:
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code), str(folder))
+    finally:
+        os.close(handle)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write strict JSON by `replacing`. A digest that `data` has is made anew, so that it fits.
+
+    Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
+    """
+    if isinstance(data, dict) and DIGEST in data:
+        data = sealed(data, parts=PARTS in data)
+    try:
+        text = json.dumps(data, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise CellError(f"{path} is not written: {error}; one of its figures is no number") from error
+    with replacing(path) as file:
+        file.write(f"{text}\n".encode())
+
+
+def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
+    """The data with their digest; with `parts` also the digests of what lies one and two levels deep."""
+    content = unsealed(data)
+    # As a reader gets it: JSON knows neither tuples nor keys that are numbers.
+    kept = json.loads(json.dumps(content))
+    return {**content, DIGEST: digest(kept), **({PARTS: _parts(kept)} if parts else {})}
+
+
+def unsealed(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a sealed file."""
+    return {key: value for key, value in data.items() if key not in (DIGEST, PARTS)}
+
+
+def is_intact(data: Mapping[str, Any]) -> bool:
+    """Whether data have the digest that they were sealed with, or none."""
+    return DIGEST not in data or data[DIGEST] == digest(unsealed(data))
+
+
+def digest(data: Any) -> str:
+    """SHA-256 of JSON data, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(_undated(data), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _undated(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _undated(value) for key, value in data.items() if key not in UNDATED}
+    return [_undated(value) for value in data] if isinstance(data, list) else data
+
+
+def _parts(data: dict[str, Any]) -> dict[str, str]:
+    made: dict[str, str] = {}
+    for key, value in data.items():
+        below = {f"{key}.{name}": part for name, part in value.items()} if isinstance(value, dict) else {key: value}
+        made |= {name: digest(part)[:16] for name, part in below.items()}
+    return made
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a JSON file holds without its digest; whether it had one, and which parts were `changed` since."""
+
+    content: dict[str, Any]
+    sealed: bool
+    changed: tuple[str, ...]
+
+    def require(self) -> dict[str, Any]:
+        """The content; `EditedError` where it is not as it was written."""
+        if self.changed:
+            raise EditedError(f"it was changed after it was written: {', '.join(self.changed)}")
+        return self.content
+
+
+def read_json(path: Path) -> Stored:
+    """Read a file of `write_json`. Raises `OSError`, and `ValueError` for what is no JSON object, or has NaN in it."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"it holds no table, but {str(data)[:40]}")
+    parts, has_digest, content = data.get(PARTS), DIGEST in data, unsealed(data)
+    if is_intact(data):
+        return Stored(content, has_digest, ())
+    before, now = parts if isinstance(parts, dict) else {}, _parts(content)
+    changed = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
+    return Stored(content, True, tuple(changed) if before and changed else ("its content or its digest",))
+
+
+def _no_number(text: str) -> Any:
+    raise ValueError(f"it holds {text}, which is no number")
+
+
+def array_digests(arrays: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of each NumPy array by its name: of its type, its shape and its numbers."""
+    return {
+        name: hashlib.sha256(f"{array.dtype.str} {array.shape} ".encode() + array.tobytes()).hexdigest()
+        for name, array in arrays.items()
+    }
+
+
+def sealed_arrays(arrays: Mapping[str, Any]) -> str:
+    """What a NumPy archive keeps under `DIGEST` beside these arrays."""
+    return json.dumps(array_digests(arrays))
+
+
+def require_unchanged(arrays: dict[str, Any]) -> None:
+    """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
+    if DIGEST not in arrays:
+        raise EditedError("its digest is missing")
+    told = json.loads(str(arrays.pop(DIGEST)))
+    now = array_digests(arrays)
+    if changed := sorted(name for name in told.keys() | now.keys() if told.get(name) != now.get(name)):
+        raise EditedError(f"it was changed after it was written: {', '.join(changed)}")
