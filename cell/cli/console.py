@@ -81,6 +81,7 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     import threading
 
     from cell.console.console import Console
+    from drivers.errors import CellError
     from statemachine.watch import SignalWatch
 
     gone = threading.Event()
@@ -89,7 +90,10 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
             pass
         if gone.is_set():
             typer.echo("the page's server has ended, so nobody sees the cell any more: it is stopped", err=True)
-            cell.stop()
+            try:
+                cell.stop()
+            except CellError as error:
+                typer.echo(str(error), err=True)
             return 1
         return 0 if cell.current is None else 130
 

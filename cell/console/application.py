@@ -20,7 +20,9 @@ from starlette.websockets import WebSocket
 
 from cell.console.access import HEADERS, Access, Bucket
 from cell.console.archive import Archive
+from cell.console.commands import checked_command
 from cell.console.pages import Pages
+from drivers.errors import ConfigError
 
 MOST_BODY = 4096
 PAGE = Path(__file__).with_name("page")
@@ -179,6 +181,10 @@ class Application:
         page = self._pages.by_key(words.pop("key", None))
         if page is None:
             return _no("InterlockError", "this page has no live link to the cell; load it again", 403)
+        try:
+            checked_command(words)
+        except ConfigError as error:
+            return _no("ConfigError", str(error), 400)
         status, answer = await self._do(page.id, words)
         return _json(answer, status)
 

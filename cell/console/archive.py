@@ -23,6 +23,7 @@ TRACE = "trace.json"
 MOST_RUNS, MOST_PICTURES = 200, 60
 DRAW_S = 60.0
 _DRAW = "import sys; from pathlib import Path; from cell.report.page.make import write_page; "
+_DRAW += "from cell.console.rehearsal import end_with_parent; end_with_parent(); "
 _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
@@ -80,9 +81,13 @@ class Archive:
         return page
 
     def _drawn(self, folder: Path, page: Path) -> bool:
-        command = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)]
+        command, nowhere = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)], subprocess.DEVNULL
         try:
-            return subprocess.run(command, capture_output=True, timeout=DRAW_S).returncode == 0
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere) as process:
+                try:
+                    return process.wait(DRAW_S) == 0
+                finally:
+                    process.kill()
         except (OSError, subprocess.TimeoutExpired):
             return False
 

@@ -47,7 +47,7 @@ class Served:
                 self.tokens.put(token)
             case Do(number, _, words):
                 self.heard.put(message)
-                if words.get("do") != "nothing":
+                if words.get("do") != "diag":
                     self.process.tell(Answer(number, 200, {"ok": True, "text": str(words.get("do"))}))
             case AskCell(number, job):
                 self.process.tell(Answer(number, 200, {"job": job}))

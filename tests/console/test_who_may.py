@@ -172,7 +172,7 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
     with server.live() as page:
         key = json.loads(page.recv(timeout=10))["key"]
         links = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(30)]
-        body = json.dumps({"do": "nothing", "key": key})
+        body = json.dumps({"do": "diag", "key": key})
         head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
         head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
         for link in links:
@@ -193,7 +193,9 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
 
 @pytest.mark.parametrize(
     ("said", "code"),
-    [("x" * 1100, 1009), ("[]", 1007), ("{", 1007), ('{"type": 1}', 1007), ('{"type": "do"}', 1007), (b"\0\1", 1007),
+    [(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 10**400}), 1007),
+     ('{"type": "jog", "press": 1}', 1007), ('{"type": "jog_end", "press": -1}', 1007), ("x" * 1100, 1009),
+     ("[]", 1007), ("{", 1007), ('{"type": 1}', 1007), ('{"type": "do"}', 1007), (b"\0\1", 1007),
      ('{"type": ' + "[" * 900, 1007)],
 )  # fmt: skip
 def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes, code: int) -> None:
@@ -211,7 +213,7 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served) -> No
         client = json.loads(page.recv(timeout=10))["id"]
         with pytest.raises(ConnectionClosed):
             for _ in range(2000):
-                page.send('{"type": "jog", "press": 1}')
+                page.send('{"type": "jog_end", "press": 1}')
                 time.sleep(0.0005)
     heard: list[object] = []
     while not heard or heard[-1] != Left(client):
