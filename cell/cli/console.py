@@ -121,8 +121,6 @@ def run_shown(
 
 def page_teller(open_page: bool) -> Callable[[str], None]:
     """What is done with each new link: printed, and the first one opened."""
-    import webbrowser
-
     told: list[str] = []
 
     def tell(link: str) -> None:
@@ -130,7 +128,23 @@ def page_teller(open_page: bool) -> Callable[[str], None]:
             f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}", err=True
         )
         if not told and open_page:
-            webbrowser.open(link)
+            open_unseen(link)
         told.append(link)
 
     return tell
+
+
+def open_unseen(link: str) -> None:
+    """Open a link in the browser. Everybody on this computer sees a process's arguments, so these name a file that
+    nobody else may read, and that goes on to the link; it is removed when this program ends."""
+    import atexit
+    import shutil
+    import tempfile
+    import webbrowser
+
+    folder = Path(tempfile.mkdtemp(prefix="cell-console-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    page = folder / "open.html"
+    page.touch(0o600)
+    page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={link}">\n', encoding="utf-8")
+    webbrowser.open(page.as_uri())

@@ -19,6 +19,8 @@ from cell.console.messages import Beat, Joined, Left
 from drivers.errors import ConfigError
 
 VERSION = 1
+PROTOCOL = "cell"
+"""Of the live link; asked for together with the session's key."""
 BEAT_MS = 80
 MOST_PAGES = 16
 MOST_BYTES = 1024
@@ -86,9 +88,9 @@ class Pages:
                 mailbox.clear_cloud()
             mailbox.cloud(packed)
 
-    async def serve(self, socket: WebSocket) -> None:
-        """One page's live link, until it is closed."""
-        await socket.accept()
+    async def serve(self, socket: WebSocket, ticket: str) -> None:
+        """One page's live link, until it is closed; `ticket` is its session's."""
+        await socket.accept(PROTOCOL)
         if len(self._pages) >= MOST_PAGES:
             await socket.close(FULL, "too many pages are open; close one")
             return
@@ -97,9 +99,8 @@ class Pages:
             await socket.close(FULL, "too much is being asked at once; wait a moment")
             return
         self._pages[page.id] = page
-        page.mailbox.say(
-            json.dumps({"type": "hello", "id": page.id, "key": page.key, "version": VERSION, "beat_ms": BEAT_MS})
-        )
+        hello = {"type": "hello", "id": page.id, "key": page.key, "ticket": ticket}
+        page.mailbox.say(json.dumps({**hello, "version": VERSION, "beat_ms": BEAT_MS}))
         for part in self._cloud:
             page.mailbox.cloud(part)
         for camera, packed in self._pictures.items():
@@ -114,6 +115,7 @@ class Pages:
             self._pages.pop(page.id, None)
             self._tell(Left(page.id))
             sending.cancel()
+            await asyncio.wait([sending])
 
     async def _send(self, page: Page, socket: WebSocket) -> None:
         try:

@@ -123,11 +123,17 @@ class Rehearsals:
 
 def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
     """The dry run itself, in this process: name, outcome and reason of the run."""
+
+    def tell(fraction: float, text: str) -> None:
+        print(json.dumps({"fraction": round(fraction, 3), "text": text}), flush=True)
+
+    tell(0.0, "loading the program")
     from cell.console.trace import Trace
     from cell.job import load_job
     from cell.steps.kinds import find_kind
     from cell.supervisor import Cell
 
+    tell(0.0, "simulating the cell")
     with Cell.open(
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
@@ -138,9 +144,9 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
             trace(event)
             if event.step in names and event.kind in ("step_started", "progress"):
                 within = float(str(event.data.get("fraction", 0.0)))
-                fraction = (names.index(event.step) + within) / len(names)
-                print(json.dumps({"fraction": round(fraction, 3), "text": event.step.replace("_", " ")}), flush=True)
+                tell((names.index(event.step) + within) / len(names), event.step.replace("_", " "))
 
+        tell(0.0, "calibrating and planning")
         with trace.taken():
             outcome = cell.run(job, observe)
         trace.write(outcome.folder)

@@ -66,14 +66,19 @@ class Patient(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         """See `asyncio.Protocol`."""
         super().connection_made(transport)
-        self.loop.call_later(IDLE_S, self._look)
+        self.loop.call_later(IDLE_S, self._look, None)
 
-    def _look(self) -> None:
-        # Set with the first request; to its type it is there from the beginning.
-        asked: object = self.cycle
+    def _look(self, before: object) -> None:
+        """Every `IDLE_S`: has anything been asked for since `before`, or is it still being answered?"""
         # A live link has another protocol by now, which looks after itself.
-        if asked is None and self.transport.get_protocol() is self and not self.transport.is_closing():
+        if self.transport.get_protocol() is not self or self.transport.is_closing():
+            return
+        # Set with the first request; to its type it is there from the beginning.
+        cycle: Any = self.cycle
+        if cycle is before and (cycle is None or cycle.response_complete):
             self.transport.close()
+        else:
+            self.loop.call_later(IDLE_S, self._look, cycle)
 
 
 class Server:
@@ -242,7 +247,7 @@ def _entering(app: Any, renew: Callable[[], None]) -> Any:
 
     async def entered(scope: Any, receive: Any, send: Any) -> None:
         async def sent(message: Any) -> None:
-            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 303:
+            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 200:
                 renew()
             await send(message)
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 import json
 import queue
 import random
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection
 
 from cell.console.commands import COMMANDS, MESSAGES
@@ -26,8 +25,10 @@ ODD: list[Any] = [
     10**400, -(10**400), 1e308, float("nan"), float("inf"), -0.0, 2**63, True, None, "", "x" * 3000, "\ud800", "\x00",
     "../../etc/passwd", "/dev/zero", "pot.toml", "é" * 500, [], {}, [[[[]]]], {"a": {"b": []}}, "c1", "arm", 1, -1, 0.5,
 ]  # fmt: skip
-NAMES = ["job", "until", "at_start", "run", "seed", "name", "to", "by", "number", "choice", "step", "reason",
-         "device", "axis", "amount", "fraction", "share", "on", "press", "sign", "at", "key", "type", "do", "__class__"]  # fmt: skip
+NAMES = [
+    "job", "until", "at_start", "run", "seed", "name", "to", "by", "number", "choice", "step", "reason", "device",
+    "axis", "amount", "fraction", "share", "on", "press", "sign", "at", "key", "type", "do", "__class__",
+]  # fmt: skip
 # Those that begin something long, or begin it anew, are said with something wrong in them.
 HARMLESS = ["hold", "leave", "hand_over", "clear_stop", "pause", "go_on", "abort", "decide", "speed", "pace"]
 
@@ -83,13 +84,13 @@ def socket_hears(server: Served, count: int) -> None:
 
 
 def opened(server: Served) -> tuple[ClientConnection, str]:
-    """A live link, waited for while too many were opened."""
-    while True:
-        try:
-            page = server.live()
-            return page, json.loads(page.recv(timeout=10))["key"]
-        except Exception:
-            time.sleep(0.05)
+    """A live link; of a new session where this one has opened too many."""
+    try:
+        page = server.live()
+    except InvalidStatus:
+        server.enter()
+        page = server.live()
+    return page, json.loads(page.recv(timeout=10))["key"]
 
 
 def mutated(chance: random.Random, text: str) -> bytes | str:
