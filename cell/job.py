@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field, model_validator
 from cell.addresses import Name
 from cell.device_config import Exposure, Mounting, Pose, checked_board
 from cell.obstacles import StationObstacle, once_each
-from cell.toml_file import Table, read_toml, validate
+from cell.toml_file import Table, below, read_toml, validate
 from cell.units import number, quantity, shown, whole
 from drivers.errors import ConfigError
 
@@ -212,6 +212,19 @@ def job_path(name: str | Path) -> Path:
         f"job {shown(str(name))} is neither a file, nor {shown(f'{name}.toml')} in the present folder, nor one that "
         f"ships ({', '.join(shipped_jobs())})"
     )
+
+
+def require_job_name(name: str) -> None:
+    """`ConfigError` unless this names a job, never a path: `NAME.toml` of the present folder, or one that ships.
+
+    A file of the present folder is a regular one in it; a link to elsewhere and a pipe are none.
+    """
+    path = job_path(name) if re.fullmatch(r"[\w+-][\w.+-]{0,63}", name) else Path(name)
+    if not (ships(path) or (path == Path(f"{name}.toml") and below(Path(), path.name) is not None)):
+        raise ConfigError(
+            f"there is no job {shown(name)}; a job is named, never addressed: {shown(f'{name[:64]}.toml')} in the "
+            f"present folder, or one that ships ({', '.join(shipped_jobs())})"
+        )
 
 
 def ships(path: Path) -> bool:

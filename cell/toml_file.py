@@ -25,11 +25,23 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+def below(folder: Path, *names: str) -> Path | None:
+    """The regular file of these names below `folder`, or None: what a link leads elsewhere to, and a pipe, are none."""
+    path = folder.joinpath(*names)
+    try:
+        inside = path.resolve(strict=True) == folder.resolve().joinpath(*names)
+        return path if inside and path.is_file() else None
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
 def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, Any]:
     """Parse a TOML file; every way that this fails is a `ConfigError` that names the file."""
     try:
         if path.is_dir():
             raise ConfigError(f"{what} {path} is a folder; name the file in it")
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{what} {path} is no regular file (a pipe or a device); name a file")
         if path.stat().st_size > LARGEST_BYTES:
             raise ConfigError(f"{what} {path} is larger than 1 MB, that is no {what}; name another file")
         text = path.read_text(encoding="utf-8")

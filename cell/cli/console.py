@@ -81,6 +81,7 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     import threading
 
     from cell.console.console import Console
+    from drivers.errors import CellError
     from statemachine.watch import SignalWatch
 
     gone = threading.Event()
@@ -89,7 +90,10 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
             pass
         if gone.is_set():
             typer.echo("the page's server has ended, so nobody sees the cell any more: it is stopped", err=True)
-            cell.stop()
+            try:
+                cell.stop()
+            except CellError as error:
+                typer.echo(str(error), err=True)
             return 1
         return 0 if cell.current is None else 130
 
@@ -117,8 +121,6 @@ def run_shown(
 
 def page_teller(open_page: bool) -> Callable[[str], None]:
     """What is done with each new link: printed, and the first one opened."""
-    import webbrowser
-
     told: list[str] = []
 
     def tell(link: str) -> None:
@@ -126,7 +128,23 @@ def page_teller(open_page: bool) -> Callable[[str], None]:
             f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}", err=True
         )
         if not told and open_page:
-            webbrowser.open(link)
+            open_unseen(link)
         told.append(link)
 
     return tell
+
+
+def open_unseen(link: str) -> None:
+    """Open a link in the browser. Everybody on this computer sees a process's arguments, so these name a file that
+    nobody else may read, and that goes on to the link; it is removed when this program ends."""
+    import atexit
+    import shutil
+    import tempfile
+    import webbrowser
+
+    folder = Path(tempfile.mkdtemp(prefix="cell-console-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    page = folder / "open.html"
+    page.touch(0o600)
+    page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={link}">\n', encoding="utf-8")
+    webbrowser.open(page.as_uri())

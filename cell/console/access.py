@@ -1,7 +1,9 @@
-"""Who may talk to the server: exact lists of hosts and origins, a token that works once, a cookie, rates.
+"""Who may talk to the server: exact lists of hosts and origins, a token that works once, a cookie with a key, rates.
 
 A page of anybody else in the same browser must reach nothing, whatever name it gives this computer; nor may another
-user of this computer who does not know the token.
+user of this computer who does not know the token. A cookie is sent to every port of this address, so that another
+server here learns it: by itself it opens the empty page alone. What authorises is the key beside it, which the page
+keeps and sends with each request.
 """
 
 from __future__ import annotations
@@ -48,6 +50,23 @@ class Bucket:
         return True
 
 
+def _secret() -> str:
+    return secrets.token_urlsafe(32)
+
+
+@dataclass(eq=False)
+class Session:
+    """One browser's page that has opened the link. `key` goes with each request and each live link; `ticket` stands in
+    its place in the address of a picture or a report. What it may ask for is limited for each session by itself."""
+
+    cookie: str = field(default_factory=_secret)
+    key: str = field(default_factory=_secret)
+    ticket: str = field(default_factory=_secret)
+    requests: Bucket = field(default_factory=lambda: Bucket(100.0, 400.0))
+    commands: Bucket = field(default_factory=lambda: Bucket(10.0, 40.0))
+    links: Bucket = field(default_factory=lambda: Bucket(2.0, 40.0))
+
+
 class Access:
     """Of a server at `port`, that browsers reach by `hosts`. `secure` with TLS. `lasting` is a token that works again
     and again, for a server that is reached from elsewhere; without it each link works once."""
@@ -61,31 +80,31 @@ class Access:
         self._secure = secure
         self._lasting = lasting
         self._links: list[str] = []
-        self._sessions: list[str] = []
+        self._sessions: list[Session] = []
 
     def link(self) -> str:
         """A new token, which works once; those before it that nobody used work no more."""
-        self._links = [secrets.token_urlsafe(32)]
+        self._links = [_secret()]
         return self._links[0]
 
-    def enter(self, token: str) -> str | None:
-        """The cookie's value for whoever has the token, None for anybody else."""
+    def enter(self, token: str) -> Session | None:
+        """A session for whoever has the token, None for anybody else."""
         once = [known for known in self._links if _same(known, token)]
         if not once and not (self._lasting is not None and _same(self._lasting, token)):
             return None
         self._links = [known for known in self._links if known not in once]
-        session = secrets.token_urlsafe(32)
+        session = Session()
         self._sessions = [*self._sessions[-MOST_SESSIONS + 1 :], session]
         return session
 
-    def set_cookie(self, session: str) -> str:
-        """The header that gives it to the browser."""
+    def set_cookie(self, session: Session) -> str:
+        """The header that gives its cookie to the browser."""
         secure = "; Secure" if self._secure else ""
-        return f"{self.cookie}={session}; HttpOnly; SameSite=Strict; Path=/{secure}"
+        return f"{self.cookie}={session.cookie}; HttpOnly; SameSite=Strict; Path=/{secure}"
 
     def refusal(self, headers: Mapping[str, str], hosts: int, *, changes: bool, enters: bool) -> tuple[int, str] | None:
         """Status and words when a request is refused, by its headers (names in lower case); `hosts` is how many Host
-        headers it has. `changes` for whatever is no plain GET, and for the WebSocket; `enters` needs no cookie yet."""
+        headers it has. `changes` for whatever is no plain GET, and for the WebSocket; `enters` comes from a link."""
         if hosts != 1 or headers.get("host", "").lower() not in self.hosts:
             return 421, "this server is not reached by that name; use the link that `cell console` printed"
         origin = headers.get("origin")
@@ -98,18 +117,24 @@ class Access:
         # The link is opened from elsewhere: a terminal, a mail.
         if site is not None and site not in allowed and not enters:
             return 403, "another page may not talk to the cell"
-        if not enters and not self._knows(headers.get("cookie", "")):
-            return 401, "open the link that `cell console` printed in its terminal; it works once"
         return None
 
-    def _knows(self, cookie: str) -> bool:
+    def opened(self, key: str, ticket: str) -> Session | None:
+        """The session of this key or, where one suffices, of this ticket. Its cookie is another's once the same
+        browser has opened a second link."""
+        return next((own for own in self._sessions if _same(own.key, key) or _same(own.ticket, ticket)), None)
+
+    def session(self, cookie: str) -> Session | None:
+        """The session whose cookie this header has."""
         if len(cookie) > MOST_COOKIE_BYTES:
-            return False
+            return None
         try:
             morsel = SimpleCookie(cookie).get(self.cookie)
         except CookieError:
-            return False
-        return morsel is not None and any(_same(known, morsel.value) for known in self._sessions)
+            return None
+        if morsel is None:
+            return None
+        return next((known for known in self._sessions if _same(known.cookie, morsel.value)), None)
 
 
 def _same(known: str, given: str) -> bool:

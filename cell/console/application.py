@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import re
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,8 @@ from urllib.parse import parse_qs
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -20,9 +22,21 @@ from starlette.websockets import WebSocket
 
 from cell.console.access import HEADERS, Access, Bucket
 from cell.console.archive import Archive
-from cell.console.pages import Pages
+from cell.console.commands import checked_command
+from cell.console.pages import PROTOCOL, Pages
+from drivers.errors import ConfigError
 
-MOST_BODY = 4096
+MOST_BODY, MOST_PATH = 4096, 300
+BODY_S = 5.0
+"""Wall seconds in which a command has to be there as a whole."""
+KEY = "x-cell-key"
+"""The header with a session's key; a live link has it as its second subprotocol, beside `PROTOCOL`."""
+SHOWN = re.compile(r"/api/runs/[^/]+/(pictures/[^/]+|report\.html)")
+"""What a browser asks for by its address alone: there a ticket stands for the key."""
+ENTERED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Assembly cell</title>
+<meta http-equiv="refresh" content="0;url=/#key={key}"><a href="/#key={key}">To the cell</a></html>
+"""
+LOST = "open the link that `cell console` printed in its terminal; it works once, for one tab of the browser"
 PAGE = Path(__file__).with_name("page")
 ENTER = "/enter"
 REPORT_POLICY = (
@@ -39,7 +53,7 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
-        self._rate = Bucket(100.0, 400.0)
+        self._strangers = Bucket(100.0, 400.0)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """See ASGI."""
@@ -52,8 +66,8 @@ class Guard:
             dict(pairs), sum(name == "host" for name, _ in pairs), changes=not plain,
             enters=plain and scope["path"] == ENTER,
         )  # fmt: skip
-        if refusal is None and plain and not self._rate.take():
-            refusal = 429, "too many requests; wait a moment"
+        if refusal is None:
+            refusal = self._unknown(scope, dict(pairs), plain)
 
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -70,7 +84,29 @@ class Guard:
             # Before it is accepted this is an answer 403 to the upgrade.
             await send({"type": "websocket.close", "code": 1008})
         else:
-            await PlainTextResponse(refusal[1] + "\n", refusal[0])(scope, receive, sent)
+            await PlainTextResponse(refusal[1] + "\n", refusal[0], {"connection": "close"})(scope, receive, sent)
+
+    def _unknown(self, scope: Scope, headers: Mapping[str, str], plain: bool) -> tuple[int, str] | None:
+        """Status and words when this is no session's, or more than one session may ask for."""
+        path, live = scope["path"], scope["type"] == "websocket"
+        if len(path) > MOST_PATH:
+            return 400, f"this address has {len(path)} characters; at most {MOST_PATH} are allowed"
+        if plain and path == ENTER:
+            return None if self._strangers.take() else (429, "too many requests; wait a moment")
+        session = self._access.session(headers.get("cookie", ""))
+        asked = scope["subprotocols"] if live else ()
+        key = asked[1] if len(asked) == 2 and asked[0] == PROTOCOL else headers.get(KEY, "")
+        ticket = _asked(scope, "ticket") if plain and SHOWN.fullmatch(path) else ""
+        # The page itself and its files say nothing of the cell.
+        shell = plain and (path == "/" or path.startswith("/static/"))
+        if session is not None and not shell:
+            session = self._access.opened(key, ticket)
+        if session is None:
+            return 401, LOST
+        scope["session"] = session
+        if (plain and not session.requests.take()) or (live and not session.links.take()):
+            return 429, "too many requests; wait a moment"
+        return None
 
 
 class Application:
@@ -93,7 +129,6 @@ class Application:
         self._do = do
         self._stop = stop
         self._of_job = of_job
-        self._commands = Bucket(10.0, 40.0)
 
     def asgi(self) -> ASGIApp:
         """What is served."""
@@ -117,18 +152,21 @@ class Application:
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-store"})
 
     async def _enter(self, request: Request) -> Response:
-        # Not by Starlette's own parser, whose errors would show what was sent.
-        token = parse_qs(request.scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        session = self._access.enter(token)
+        session = self._access.enter(_asked(request.scope, "token"))
         if session is None:
             return PlainTextResponse("this link was used already, or is none; `cell console` shows a new one\n", 403)
-        return RedirectResponse("/", 303, {"set-cookie": self._access.set_cookie(session), "cache-control": "no-store"})
+        # The key stands behind #, which no browser sends to anybody; the page takes it out of the address. A page that
+        # goes on by itself, and no redirect: in a redirect that began elsewhere no browser sends this cookie.
+        headers = {"set-cookie": self._access.set_cookie(session), "cache-control": "no-store"}
+        return HTMLResponse(ENTERED.format(key=session.key), 200, headers)
 
     async def _tell_cell(self, request: Request) -> Response:
         job = request.query_params.get("job")
         if job is None:
             return _json(self._cell)
-        status, words = await self._of_job(job[:200])
+        if len(job) > MOST_PATH:
+            return _no("ConfigError", f"a job's name has at most {MOST_PATH} characters, this one {len(job)}", 400)
+        status, words = await self._of_job(job)
         return _json(words, status)
 
     async def _runs(self, request: Request) -> Response:
@@ -159,10 +197,16 @@ class Application:
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
             return _no("content", "commands are JSON (content-type application/json)", 415)
         body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > MOST_BODY:
-                return _no("content", f"a command has at most {MOST_BODY} bytes", 413)
+        try:
+            async with asyncio.timeout(BODY_S):
+                async for part in request.stream():
+                    body += part
+                    if len(body) > MOST_BODY:
+                        return _no("content", f"a command has at most {MOST_BODY} bytes", 413)
+        except (TimeoutError, ClientDisconnect):
+            answer = _no("content", f"the command did not come within {BODY_S:g} s; send it again", 408)
+            answer.headers["connection"] = "close"
+            return answer
         try:
             words = json.loads(body)
         except (ValueError, RecursionError):
@@ -174,16 +218,25 @@ class Application:
             return _json({"ok": True, "text": "the cell was stopped"}) if trouble is None else _no(
                 "DeviceFault", trouble, 500
             )  # fmt: skip
-        if not self._commands.take():
+        if not request.scope["session"].commands.take():
             return _no("rate", "too many commands; wait a moment", 429)
         page = self._pages.by_key(words.pop("key", None))
         if page is None:
             return _no("InterlockError", "this page has no live link to the cell; load it again", 403)
+        try:
+            checked_command(words)
+        except ConfigError as error:
+            return _no("ConfigError", str(error), 400)
         status, answer = await self._do(page.id, words)
         return _json(answer, status)
 
     async def _live(self, socket: WebSocket) -> None:
-        await self._pages.serve(socket)
+        await self._pages.serve(socket, socket.scope["session"].ticket)
+
+
+def _asked(scope: Scope, name: str) -> str:
+    """A value of the query. Not by Starlette's own parser, whose errors would show what was sent."""
+    return parse_qs(scope["query_string"].decode("latin-1")).get(name, [""])[0]
 
 
 def _json(words: Any, status: int = 200) -> Response:

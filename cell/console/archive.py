@@ -15,14 +15,17 @@ from typing import Any
 
 from cell.run.folder import list_runs
 from cell.run.reading import read_report, run_row
+from cell.toml_file import below
 from drivers.errors import CellError
 
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
 TRACE = "trace.json"
+READ = ("report.json", "journal.sqlite")
 MOST_RUNS, MOST_PICTURES = 200, 60
 DRAW_S = 60.0
 _DRAW = "import sys; from pathlib import Path; from cell.report.page.make import write_page; "
+_DRAW += "from cell.console.rehearsal import end_with_parent; end_with_parent(); "
 _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
@@ -37,7 +40,8 @@ class Archive:
 
     def runs(self) -> list[dict[str, Any]]:
         """Newest first; see docs/console.md."""
-        return [self._row(folder) for folder in reversed(list_runs(self._root)[-MOST_RUNS:])]
+        folders = reversed(list_runs(self._root)[-MOST_RUNS:])
+        return [self._row(folder) for folder in folders if self._folder(folder.name) is not None]
 
     def trend(self) -> list[dict[str, Any]]:
         """Jobs, oldest first."""
@@ -63,12 +67,13 @@ class Archive:
         folder = self._folder(run)
         if folder is None or not PICTURE.fullmatch(name):
             return None
-        return next((path for path in (folder / name, folder / "frames" / name) if path.is_file()), None)
+        return below(self._root, folder.name, name) or below(self._root, folder.name, "frames", name)
 
     def page(self, name: str) -> Path | None:
         """The report as one HTML file, drawn by a process of its own that gives way; None where it cannot be drawn."""
         folder = self._folder(name)
-        if folder is None:
+        # What draws it reads whatever lies there.
+        if folder is None or any(path.is_symlink() for path in folder.rglob("*")):
             return None
         page = Path(self._pages.name) / f"{name}.html"
         with self._drawing:
@@ -80,25 +85,33 @@ class Archive:
         return page
 
     def _drawn(self, folder: Path, page: Path) -> bool:
-        command = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)]
+        command, nowhere = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)], subprocess.DEVNULL
         try:
-            return subprocess.run(command, capture_output=True, timeout=DRAW_S).returncode == 0
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere) as process:
+                try:
+                    return process.wait(DRAW_S) == 0
+                finally:
+                    process.kill()
         except (OSError, subprocess.TimeoutExpired):
             return False
 
     def replay(self, name: str) -> dict[str, Any] | None:
         """How the cell moved in a run; None for one that left no trace."""
         folder = self._folder(name)
+        path = None if folder is None else below(self._root, folder.name, TRACE)
         try:
-            trace = json.loads((folder / TRACE).read_text(encoding="utf-8")) if folder is not None else None
-        except (OSError, ValueError):
+            trace = None if path is None else json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
             return None
         return {"run": name, **trace} if isinstance(trace, dict) else None
 
     def _folder(self, name: str) -> Path | None:
-        if not RUN.fullmatch(name) or not (self._root / name).is_dir():
+        """The folder of a run; none that is a link, or whose report or journal is no file of its own."""
+        folder = self._root / name
+        if not RUN.fullmatch(name) or folder.is_symlink() or not folder.is_dir():
             return None
-        return self._root / name
+        read = [folder / file for file in READ if (folder / file).is_symlink() or (folder / file).exists()]
+        return folder if all(below(self._root, name, path.name) for path in read) else None
 
     def _row(self, folder: Path) -> dict[str, Any]:
         if (known := self._rows.get(folder)) is not None:

@@ -198,10 +198,11 @@ class Console:
         return None
 
     def _left_alone(self) -> None:
-        """The server has ended: with it all pages are gone."""
+        """The server has ended, and with it all pages. The program hears of it first: no other thread can keep it
+        back."""
+        self._gone()
         for row in self.desk.holders.rows():
             self.desk.left(row["id"])
-        self._gone()
 
     def _say(self, client: str, words: dict[str, Any]) -> None:
         self._server.tell(Say(client, words))
@@ -210,7 +211,12 @@ class Console:
         """In the pipe's thread: nothing here may last."""
         match message:
             case Beat(client, words, end):
-                self.desk.jog_end(client) if end else self.desk.beat(client, words)
+                try:
+                    self.desk.jog_end(client) if end else self.desk.beat(client, words)
+                except Exception as error:
+                    log.exception("a held button")
+                    self.desk.jog_end(client)
+                    self._say(client, {"type": "jog", "press": 0, "state": "refused", "text": str(error)[:400]})
             case Joined(client):
                 self.desk.joined(client)
             case Left(client):
@@ -218,7 +224,7 @@ class Console:
             case Do(number, client, words):
                 self._begin(number, lambda: self.desk.do(client, words))
             case AskCell(number, job):
-                self._begin(number, lambda: cell_facts(self._cell, job))
+                self._begin(number, lambda: cell_facts(self._cell, self.desk.named_job(job)))
             case Ready(token):
                 self._new_link(token)
 

@@ -7,12 +7,12 @@ has a way of its own (`cell.console.link`), and asks nobody.
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from cell.calibration.verify.verdict import Verification
+from cell.console.commands import checked_command, checked_message
 from cell.console.holders import Holders
 from cell.console.holding import Press, Presses
 from cell.console.manual import Manual
@@ -21,10 +21,10 @@ from cell.console.rehearsal import Rehearsals
 from cell.devices.diagnosis import ask
 from cell.devices.gate import Gated
 from cell.devices.jogging import Jog
-from cell.job import job_path, load_job
+from cell.job import load_job, require_job_name
 from cell.run.run import Run
 from cell.steps.kinds import find_kind
-from drivers.errors import CellError, ConfigError, InterlockError
+from drivers.errors import CellError, InterlockError
 from statemachine.script import Script
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 FREE = ("hold",)
 """What a page may do that does not hold the cell."""
-LEAST_SPEED = 0.05
 
 Words = Mapping[str, Any]
 Answer = dict[str, Any]
@@ -62,13 +61,14 @@ class Desk:
         self._found: tuple[str, str] | None = None
         self.manual = Manual(cell, load_job(job)[0], self._pressed)
         self._doing: dict[str, Callable[[str, Words], Answer | str]] = {
-            "hold": lambda client, words: self.holders.hold(client, _text(words, "name", "")),
+            "hold": lambda client, words: self.holders.hold(client, words["name"]),
             "leave": lambda client, words: self.holders.leave(client),
-            "hand_over": lambda client, words: self.holders.hand_over(client, _text(words, "to")),
+            "hand_over": lambda client, words: self.holders.hand_over(client, words["to"]),
             "clear_stop": self._clear_stop,
             "start": self._start,
             "resume": self._resume,
             "dry_run": lambda client, words: self.rehearsals.begin(self._job(words), self._seed(words)),
+            "cancel_dry_run": lambda client, words: self.rehearsals.cancel(),
             "pause": lambda client, words: self._running("pause", Run.pause),
             "go_on": lambda client, words: self._running("go on", Run.go_on),
             "abort": self._abort,
@@ -96,29 +96,22 @@ class Desk:
 
     def do(self, client: str, words: Words) -> Answer:
         """Do what a page asks; its answer as docs/console.md has it. Raises `CellError` for what is refused."""
-        name = words.get("do")
-        act = self._doing.get(name) if isinstance(name, str) else None
-        if act is None:
-            raise ConfigError(f"there is nothing called {str(name)[:40]!r} to do; docs/console.md lists what there is")
+        checked, name = checked_command(words), str(words["do"])
         if name not in FREE:
             self.holders.require(client)
         log.info("%s (%s): %s", self.holders.name(client), client, name)
-        answer = act(client, words)
+        answer = self._doing[name](client, checked)
         return {"ok": True, **({"text": answer} if isinstance(answer, str) else answer)}
 
     def beat(self, client: str, words: Words) -> None:
-        """A page says that a button is held."""
-        number, sign = words.get("press"), words.get("sign")
-        if not (isinstance(number, int) and sign in (1, -1)):
-            return
-        at = words.get("at")
-        at_ms = float(at) if isinstance(at, int | float) and math.isfinite(at) else None
+        """A page says that a button is held; `ConfigError` for what is not understood."""
+        held = checked_message(words)
+        number = held["press"]
         if self.holders.holder != client or not self.manual.on:
             self.presses.end(client, "this page does not hold the cell")
             self._say(client, {"type": "jog", "press": number, "state": "refused", "text": self._why_not(client)})
             return
-        device, axis = str(words.get("device")), str(words.get("axis") or "")
-        press = self.presses.beat(client, number, device, axis, int(sign), at_ms)
+        press = self.presses.beat(client, number, held["device"], held["axis"], held["sign"], held["at"])
         if press is not None:
             self.manual.press(press)
 
@@ -142,6 +135,7 @@ class Desk:
     def close(self) -> None:
         """The console ends: what is held stops."""
         self.presses.end_all("the console ends")
+        self.rehearsals.close()
         self.manual.end()
         self.manual.join(5.0)
 
@@ -163,11 +157,9 @@ class Desk:
 
     def _start(self, client: str, words: Words) -> str:
         job = self._job(words)
-        until = words.get("until")
         kind = find_kind(load_job(job)[0].job.kind)
-        at_start = words.get("at_start") is True
         return self._begin(job, lambda script: self.cell.start(
-            job, at_start=at_start, until=None if until is None else str(until), script=script
+            job, at_start=words["at_start"], until=words["until"], script=script
         ), kind.names)  # fmt: skip
 
     def _begin(self, job: str, start: Callable[[Script], Run[Any]], steps: tuple[str, ...]) -> str:
@@ -178,14 +170,12 @@ class Desk:
         return f"job {job} has begun"
 
     def _resume(self, client: str, words: Words) -> str:
-        run = words.get("run")
         kind = find_kind(load_job(self.job)[0].job.kind)
         script = self.questions.script(kind.names)
-        return self._long("resumed job", lambda: self.cell.resume(None if run is None else str(run), script=script))
+        return self._long("resumed job", lambda: self.cell.resume(words["run"], script=script))
 
     def _home(self, client: str, words: Words) -> str:
-        device = words.get("device")
-        return self._long("homing", lambda: self.cell.home(None if device is None else str(device)))
+        return self._long("homing", lambda: self.cell.home(words["device"]))
 
     def _long(self, what: str, work: Callable[[], object]) -> str:
         """Begin work that lasts, and give what refuses it at once."""
@@ -230,48 +220,36 @@ class Desk:
         )
 
     def _abort(self, client: str, words: Words) -> str:
-        reason = _text(words, "reason", "asked for at the operator's screen")
-        return self._running("end", lambda run: run.abort(f"{self.holders.name(client)}: {reason}"))
+        return self._running("end", lambda run: run.abort(f"{self.holders.name(client)}: {words['reason']}"))
 
     def _decide(self, client: str, words: Words) -> str:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", "nothing is going on that waits for a decision")
-        number, step = words.get("number"), words.get("step")
-        if not isinstance(number, int):
-            raise ConfigError("a decision names the number of its question")
-        by = _text(words, "by", self.holders.name(client))
-        choice, reason = _text(words, "choice"), _text(words, "reason")
-        return self.questions.decide(run, number, choice, None if step is None else str(step), by, reason)
+        by = self.holders.name(client) if words["by"] is None else words["by"]
+        return self.questions.decide(run, words["number"], words["choice"], words["step"], by, words["reason"])
 
     def _clear_stop(self, client: str, words: Words) -> str:
-        by = _text(words, "by")
-        self.cell.clear_stop(by)
-        return f"the stop was cleared by {by}"
+        self.cell.clear_stop(words["by"])
+        return f"the stop was cleared by {words['by']}"
 
     # --- devices ---
 
     def _manual(self, client: str, words: Words) -> str:
-        if words.get("on") is True:
+        if words["on"]:
             with self._beginning:
                 return self.manual.begin(self.holders.name(client))
         return self.manual.end()
 
     def _jog_step(self, client: str, words: Words) -> Answer:
-        amount = words.get("amount")
-        if not isinstance(amount, int | float) or isinstance(amount, bool) or not math.isfinite(amount):
-            raise ConfigError("a step needs its amount, in m or rad")
-        told = self.manual.step(Jog(_text(words, "device"), _text(words, "axis", ""), float(amount)))
+        told = self.manual.step(Jog(words["device"], words["axis"], words["amount"]))
         return {"text": "  ".join(f"{name} {value}" for name, value in told.items())}
 
     def _speed(self, client: str, words: Words) -> str:
-        fraction = words.get("fraction")
-        if not isinstance(fraction, int | float) or not LEAST_SPEED <= fraction <= 1.0:
-            raise ConfigError(f"speed {fraction!r}: allowed are {LEAST_SPEED:g} to 1")
-        self.manual.speed = float(fraction)
-        return f"held buttons move at {100 * fraction:.0f} %"
+        self.manual.speed = words["fraction"]
+        return f"held buttons move at {100 * self.manual.speed:.0f} %"
 
     def _pace(self, client: str, words: Words) -> str:
-        self.cell.pace = words.get("share", 0.0)
+        self.cell.pace = words["share"]
         return f"arm and vehicle move at {100 * self.cell.pace:.0f} % of their planned speed, from the next motion on"
 
     def _diag(self) -> Answer:
@@ -291,24 +269,16 @@ class Desk:
 
     def _seed(self, words: Words) -> int:
         own = None if self.cell.simulated is None else self.cell.simulated.facts["seed"]
-        seed = words.get("seed", 1 if own is None else own)
-        if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= 999_999:
-            raise ConfigError("a seed is a whole number from 0 to 999999")
-        return seed
+        seed = words["seed"] if words["seed"] is not None else own
+        return 1 if seed is None else int(seed)
 
     def _job(self, words: Words) -> str:
         """The job that is named, one of those that `/api/cell` lists; the console's own without one."""
-        name = words.get("job")
+        return self.named_job(words["job"])
+
+    def named_job(self, name: str | None) -> str:
+        """One of the jobs that `/api/cell` lists; the console's own without one. `ConfigError` for any other."""
         if name is None or name == self.job:
             return self.job
-        if not isinstance(name, str) or "/" in name or "\\" in name:
-            raise ConfigError("a job is named by its name, as the page lists them")
-        job_path(name)
+        require_job_name(name)
         return name
-
-
-def _text(words: Words, key: str, otherwise: str | None = None) -> str:
-    value = words.get(key, otherwise)
-    if not isinstance(value, str):
-        raise ConfigError(f"this needs {key!r}, a text")
-    return value[:400]

@@ -12,7 +12,7 @@ from cell.devices.gate import Gated
 from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
 from cell.devices.rules import RULES
 from cell.devices.simulated import is_whole
-from cell.job import load_job, shipped_jobs
+from cell.job import load_job, require_job_name, shipped_jobs
 from cell.motion.arm_models import arm_kinematics
 from cell.steps.kinds import find_kind
 from drivers.errors import CellError
@@ -59,6 +59,7 @@ def jobs(own: str) -> list[str]:
     here = []
     for path in sorted(Path.cwd().glob("*.toml")):
         try:
+            require_job_name(path.stem)
             load_job(path.stem)
             here.append(path.stem)
         except CellError:

@@ -1,10 +1,11 @@
 """The cell's end of the pipes to its server: starts it, hears it, and tells it only as fast as it listens.
 
-The stop comes on a pipe of its own, to a thread that does nothing else.
+The stop comes on a pipe of its own, to a thread that does nothing else; another one waits for the server's end.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
@@ -15,12 +16,16 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from cell.console.messages import CloudPart, Happened, Picture, Ready, Setup, Show, Stop, Stopped
+from cell.console.messages import CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
 from drivers.errors import CellError
 
 START_S = 30.0
 END_S = 3.0
-MOST_EVENTS, MOST_CLOUDS = 200, 64
+MOST_EVENTS, MOST_CLOUDS, MOST_SAID = 200, 64, 200
+MOST_STOPS = 64
+"""That one stop answers."""
+
+log = logging.getLogger(__name__)
 
 
 class Outbox:
@@ -29,6 +34,7 @@ class Outbox:
     def __init__(self) -> None:
         self._news = threading.Condition()
         self._words: deque[object] = deque()
+        self._said: deque[object] = deque(maxlen=MOST_SAID)
         self._events: deque[object] = deque(maxlen=MOST_EVENTS)
         self._clouds: deque[object] = deque(maxlen=MOST_CLOUDS)
         self._newest: dict[str, object] = {}
@@ -44,6 +50,8 @@ class Outbox:
                     self._newest[header["camera"]] = message
                 case Happened():
                     self._events.append(message)
+                case Say():
+                    self._said.append(message)
                 case CloudPart():
                     self._clouds.append(message)
                 case _:
@@ -60,7 +68,7 @@ class Outbox:
         """The next; waits for it, None once it is closed."""
         with self._news:
             while not self._closed:
-                for waiting in (self._words, self._events, self._clouds):
+                for waiting in (self._words, self._said, self._events, self._clouds):
                     if waiting:
                         return waiting.popleft()
                 if self._newest:
@@ -100,10 +108,9 @@ class ServerProcess:
         for end in theirs:
             end.close()
         self._pipe, self._stops = (Connection(pair[0].detach()) for pair in pairs)
-        self._stop_lock = threading.Lock()
         self._pipe.send(setup(fds[0]))
         bound.close()
-        for work in (self._hear, self._hear_stops, self._tell):
+        for work in (self._hear, self._carry_out_stops, self._tell, self._wait_for_end):
             threading.Thread(target=work, name=f"console {work.__name__.strip('_')}", daemon=True).start()
         if not self._ready.wait(START_S):
             self.close()
@@ -140,19 +147,28 @@ class ServerProcess:
                 message = self._pipe.recv()
                 if isinstance(message, Ready):
                     self._ready.set()
-                self._heard(message)
+                try:
+                    self._heard(message)
+                # One message that goes wrong is no reason to hear no more.
+                except Exception:
+                    log.exception("a message of the console's server: %s", type(message).__name__)
         except (EOFError, OSError):
+            # Without this pipe it is of no use, whatever else it still does.
             if not self._closing:
-                self._gone()
+                self._process.kill()
 
-    def _hear_stops(self) -> None:
+    def _wait_for_end(self) -> None:
+        self._process.wait()
+        if not self._closing:
+            self._gone()
+
+    def _carry_out_stops(self) -> None:
+        """One after the other: those that come while one is carried out have the next one in common."""
         with suppress(EOFError, OSError):
             while True:
-                message: Stop = self._stops.recv()
-                # One that comes while another one is carried out waits for nothing, either.
-                threading.Thread(target=self._carry_out, args=(message,), name="console stop", daemon=True).start()
-
-    def _carry_out(self, message: Stop) -> None:
-        trouble = self._stop()
-        with self._stop_lock, suppress(OSError):
-            self._stops.send(Stopped(message.number, trouble))
+                asked: list[Stop] = [self._stops.recv()]
+                while len(asked) < MOST_STOPS and self._stops.poll():
+                    asked.append(self._stops.recv())
+                trouble = self._stop()
+                for message in asked:
+                    self._stops.send(Stopped(message.number, trouble))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.toml_file import below
 from drivers.errors import ConfigError
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -29,7 +30,7 @@ def link_meshes(folder: Path) -> list[dict[str, Any]]:
     mesh in metres.
     """
     try:
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        files = sorted(path for path in folder.iterdir() if below(folder, path.name) and not path.name.startswith("."))
     except OSError as error:
         raise ConfigError(
             f"cell.meshes: the folder {folder} cannot be read ({error.strerror}); create it or remove the line"

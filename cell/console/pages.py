@@ -13,10 +13,14 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cell.console.access import Bucket
+from cell.console.commands import checked_message
 from cell.console.mailbox import Mailbox
 from cell.console.messages import Beat, Joined, Left
+from drivers.errors import ConfigError
 
 VERSION = 1
+PROTOCOL = "cell"
+"""Of the live link; asked for together with the session's key."""
 BEAT_MS = 80
 MOST_PAGES = 16
 MOST_BYTES = 1024
@@ -40,9 +44,10 @@ class Page:
 
 
 class Pages:
-    """All of them. `tell` sends a message on to the cell, `stop` stops it. In the event loop's thread."""
+    """All of them. `tell` sends a message on to the cell unless too many wait, `stop` stops it; neither waits. In the
+    event loop's thread."""
 
-    def __init__(self, tell: Callable[[object], None], stop: Callable[[], object]) -> None:
+    def __init__(self, tell: Callable[[object], bool], stop: Callable[[], object]) -> None:
         self._tell = tell
         self._stop = stop
         self._numbers = itertools.count(1)
@@ -83,18 +88,19 @@ class Pages:
                 mailbox.clear_cloud()
             mailbox.cloud(packed)
 
-    async def serve(self, socket: WebSocket) -> None:
-        """One page's live link, until it is closed."""
-        await socket.accept()
+    async def serve(self, socket: WebSocket, ticket: str) -> None:
+        """One page's live link, until it is closed; `ticket` is its session's."""
+        await socket.accept(PROTOCOL)
         if len(self._pages) >= MOST_PAGES:
             await socket.close(FULL, "too many pages are open; close one")
             return
         page = Page(next(self._numbers))
+        if not self._tell(Joined(page.id)):
+            await socket.close(FULL, "too much is being asked at once; wait a moment")
+            return
         self._pages[page.id] = page
-        self._tell(Joined(page.id))
-        page.mailbox.say(
-            json.dumps({"type": "hello", "id": page.id, "key": page.key, "version": VERSION, "beat_ms": BEAT_MS})
-        )
+        hello = {"type": "hello", "id": page.id, "key": page.key, "ticket": ticket}
+        page.mailbox.say(json.dumps({**hello, "version": VERSION, "beat_ms": BEAT_MS}))
         for part in self._cloud:
             page.mailbox.cloud(part)
         for camera, packed in self._pictures.items():
@@ -109,6 +115,7 @@ class Pages:
             self._pages.pop(page.id, None)
             self._tell(Left(page.id))
             sending.cancel()
+            await asyncio.wait([sending])
 
     async def _send(self, page: Page, socket: WebSocket) -> None:
         try:
@@ -132,21 +139,21 @@ class Pages:
             if words is None:
                 await socket.close(MALFORMED, "not understood")
                 return
-            # Ahead of the rate: who has said too much may still say stop.
+            # Ahead of the rate: also the stop of one who says too much is carried out, before its link is closed.
             if words["type"] == "stop":
                 self._stop()
-                continue
             if not page.rate.take():
                 await socket.close(TOO_MANY, "too many messages")
                 return
-            match words["type"]:
-                case "jog":
-                    self._tell(Beat(page.id, words))
-                case "jog_end":
-                    self._tell(Beat(page.id, words, end=True))
-                case _:
-                    await socket.close(MALFORMED, "not understood")
-                    return
+            if words["type"] == "stop":
+                continue
+            try:
+                checked_message(words)
+            except ConfigError as error:
+                # A close says at most 123 bytes.
+                await socket.close(MALFORMED, str(error).encode()[:120].decode(errors="ignore"))
+                return
+            self._tell(Beat(page.id, words, end=words["type"] == "jog_end"))
 
 
 def _words(text: object) -> dict[str, Any] | None:

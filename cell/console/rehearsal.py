@@ -11,12 +11,15 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cell.config import CONFIGURATION
 from drivers.errors import CellError, InterlockError
+from statemachine.step import Event
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
@@ -32,66 +35,139 @@ class Rehearsals:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._cancelled = False
         self.present: dict[str, Any] | None = None
 
     def begin(self, job: str, seed: int) -> str:
         """Begin one; `InterlockError` while another one is computed."""
         with self._lock:
             if self.present is not None and self.present["state"] == "running":
-                raise InterlockError("cell", "another dry run is being computed; wait for it")
-            self.present = {"state": "running", "job": job, "seed": seed, "text": "computing", "run": None}
+                raise InterlockError("cell", "another dry run is being computed; wait for it or cancel it")
+            self._cancelled = False
+            self.present = {"state": "running", "job": job, "seed": seed, "text": "starting", "fraction": 0.0,
+                            "run": None}  # fmt: skip
         threading.Thread(target=self._perform, args=(job, seed), name="console dry run", daemon=True).start()
         return f"the dry run of {job} is being computed"
+
+    def cancel(self) -> str:
+        """End the one that is computed; `InterlockError` when there is none."""
+        with self._lock:
+            if self.present is None or self.present["state"] != "running" or self._cancelled:
+                raise InterlockError("cell", "no dry run is being computed; there is nothing to cancel")
+        self.close()
+        return "the dry run is cancelled"
+
+    def close(self) -> None:
+        """End the process that computes one, if there is one; idempotent."""
+        with self._lock:
+            self._cancelled = True
+            if self._process is not None:
+                self._process.kill()
 
     def _perform(self, job: str, seed: int) -> None:
         about = {"state": "done", "job": job, "seed": seed, "run": None}
         try:
             self.present = {**about, **self._computed(job, seed)}
         except CellError as error:
-            log.warning("dry run of %s: %s", job, error)
-            self.present = {**about, "outcome": "failed", "reason": str(error)}
+            outcome = "cancelled" if self._cancelled else "failed"
+            log.warning("dry run of %s: %s: %s", job, outcome, error)
+            self.present = {**about, "outcome": outcome, "reason": "" if self._cancelled else str(error)}
 
     def _computed(self, job: str, seed: int) -> dict[str, Any]:
         cell = self._cell
         config = cell.folder / CONFIGURATION
         level = "nominal" if cell.simulated is None else str(cell.simulated.facts["level"])
         command = [sys.executable, "-m", __name__, job, str(seed), level, str(config) if config.is_file() else ""]
-        try:
-            # Gives way: the cell beside it may be moving.
-            done = subprocess.run(
-                ["nice", "-n", "10", *command],
-                capture_output=True, text=True, timeout=LONGEST_S, stdin=subprocess.DEVNULL,
-                env=dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path)),
-            )  # fmt: skip
-            told: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise CellError(f"it could not be computed: {error}") from error
-        except (IndexError, ValueError):
-            raise CellError(f"it could not be computed: {done.stderr.strip()[-300:]}") from None
+        with tempfile.TemporaryFile("w+") as complaints:
+            try:
+                with self._lock:
+                    if self._cancelled:
+                        raise CellError("it was cancelled")
+                    # Gives way: the cell beside it may be moving. It ends when its input does, with this program.
+                    process = self._process = subprocess.Popen(
+                        ["nice", "-n", "10", *command],
+                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, text=True,
+                        env=dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path)),
+                    )  # fmt: skip
+            except OSError as error:
+                raise CellError(f"it could not be computed: {error}") from error
+            watchdog = threading.Timer(LONGEST_S, process.kill)
+            watchdog.daemon = True
+            watchdog.start()
+            try:
+                told = self._heard(process)
+            finally:
+                watchdog.cancel()
+                process.kill()
+                process.communicate()
+                with self._lock:
+                    self._process = None
+            complaints.seek(0)
+            if told is None:
+                raise CellError(f"it could not be computed: {complaints.read().strip()[-300:] or 'its process ended'}")
         if "error" in told:
             raise CellError(str(told["error"]))
         return told
 
+    def _heard(self, process: subprocess.Popen[str]) -> dict[str, Any] | None:
+        """Show its progress until its last word, which is given; None when it ends without one."""
+        for line in process.stdout or ():
+            with suppress(ValueError):
+                told: dict[str, Any] = json.loads(line)
+                if "fraction" not in told:
+                    return told
+                self.present = {**(self.present or {}), **told}
+        return None
+
 
 def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
     """The dry run itself, in this process: name, outcome and reason of the run."""
+
+    def tell(fraction: float, text: str) -> None:
+        print(json.dumps({"fraction": round(fraction, 3), "text": text}), flush=True)
+
+    tell(0.0, "loading the program")
     from cell.console.trace import Trace
+    from cell.job import load_job
+    from cell.steps.kinds import find_kind
     from cell.supervisor import Cell
 
+    tell(0.0, "simulating the cell")
     with Cell.open(
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
     ) as cell:  # fmt: skip
-        trace = Trace(cell.devices, virtual=True)
+        trace, names = Trace(cell.devices, virtual=True), find_kind(load_job(job)[0].job.kind).names
+
+        def observe(event: Event) -> None:
+            trace(event)
+            if event.step in names and event.kind in ("step_started", "progress"):
+                within = float(str(event.data.get("fraction", 0.0)))
+                tell((names.index(event.step) + within) / len(names), event.step.replace("_", " "))
+
+        tell(0.0, "calibrating and planning")
         with trace.taken():
-            outcome = cell.run(job, trace)
+            outcome = cell.run(job, observe)
         trace.write(outcome.folder)
     return {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
 
 
+def end_with_parent() -> None:
+    """End this process when its input ends: so does the program that began it, in whatever way that ends."""
+
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with parent", daemon=True).start()
+
+
 if __name__ == "__main__":
+    end_with_parent()
     try:
         answer = rehearse(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4])
     except CellError as error:
         answer = {"error": str(error)}
-    print(json.dumps(answer))
+    print(json.dumps(answer), flush=True)

@@ -10,6 +10,7 @@ import itertools
 import json
 import logging
 import os
+import queue
 import resource
 import signal
 import socket
@@ -17,6 +18,7 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ from cell.console.messages import (
     CloudPart,
     Do,
     Happened,
+    Left,
     Picture,
     Ready,
     Say,
@@ -52,7 +55,9 @@ IDLE_S = 4.0
 PING_S = 5.0
 MOST_FILES = 2048
 WAITING = 256
-BUSY, SILENT = 503, 504
+BUSY, SILENT = 429, 504
+MOST_UNSENT = 64
+"""Messages that wait for the cell's program; more are refused."""
 
 
 class Patient(H11Protocol):
@@ -61,14 +66,19 @@ class Patient(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         """See `asyncio.Protocol`."""
         super().connection_made(transport)
-        self.loop.call_later(IDLE_S, self._look)
+        self.loop.call_later(IDLE_S, self._look, None)
 
-    def _look(self) -> None:
-        # Set with the first request; to its type it is there from the beginning.
-        asked: object = self.cycle
+    def _look(self, before: object) -> None:
+        """Every `IDLE_S`: has anything been asked for since `before`, or is it still being answered?"""
         # A live link has another protocol by now, which looks after itself.
-        if asked is None and self.transport.get_protocol() is self and not self.transport.is_closing():
+        if self.transport.get_protocol() is not self or self.transport.is_closing():
+            return
+        # Set with the first request; to its type it is there from the beginning.
+        cycle: Any = self.cycle
+        if cycle is before and (cycle is None or cycle.response_complete):
             self.transport.close()
+        else:
+            self.loop.call_later(IDLE_S, self._look, cycle)
 
 
 class Server:
@@ -77,13 +87,14 @@ class Server:
     def __init__(self, pipe: Connection, stops: Connection, setup: Setup) -> None:
         self._pipe, self._stops, self._setup = pipe, stops, setup
         self._numbers = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Any]] = {}
-        self._sending = threading.Lock()
+        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()
         self.access = Access(
             setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting
         )  # fmt: skip
-        self.pages = Pages(self._tell, self._stop_unasked)
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self.pages = Pages(self._tell, self._begin_stop)
+        self._under_way: asyncio.Future[str | None] | None = None
+        self._next: asyncio.Future[str | None] | None = None
 
     async def run(self) -> None:
         """Until the program at the other end is gone."""
@@ -107,8 +118,8 @@ class Server:
             ssl_certfile=self._setup.cert, ssl_keyfile=self._setup.key, backlog=WAITING,
         )  # fmt: skip
         server = uvicorn.Server(config)
-        for hear in (self._hear, self._hear_stops):
-            threading.Thread(target=hear, name=hear.__name__, daemon=True).start()
+        for work in (self._hear, self._hear_stops, self._send):
+            threading.Thread(target=work, name=work.__name__, daemon=True).start()
         # Who comes as soon as the link is known waits a moment, and is not turned away.
         listening = socket.socket(fileno=self._setup.fd)
         listening.listen(WAITING)
@@ -121,15 +132,24 @@ class Server:
 
     # --- to the cell ---
 
-    def _tell(self, message: object) -> None:
-        with self._sending:
-            self._pipe.send(message)
+    def _tell(self, message: object) -> bool:
+        """Never waits; False when too much waits already. What ends something is sent in any case."""
+        if self._unsent.qsize() >= MOST_UNSENT and not isinstance(message, Left | Ready):
+            return False
+        self._unsent.put(message)
+        return True
+
+    def _send(self) -> None:
+        with suppress(OSError):
+            while True:
+                self._pipe.send(self._unsent.get())
 
     async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, Any]]:
         number = next(self._numbers)
         answer: asyncio.Future[Answer] = self._loop.create_future()
+        if not self._tell(make(number)):
+            return BUSY, {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
         self._waiting[number] = answer
-        self._tell(make(number))
         try:
             told = await asyncio.wait_for(answer, ANSWER_S)
         except TimeoutError:
@@ -146,26 +166,38 @@ class Server:
 
     async def _stop(self) -> str | None:
         """On its own pipe, whatever else is under way; what could not be confirmed."""
-        number = -next(self._numbers)
-        answer: asyncio.Future[Stopped] = self._loop.create_future()
-        self._waiting[number] = answer
-        self._stops.send(Stop(number))
         try:
-            return (await asyncio.wait_for(answer, STOP_S)).trouble
+            return await asyncio.wait_for(asyncio.shield(self._begin_stop()), STOP_S)
         except TimeoutError:
             return f"the stop was not confirmed within {STOP_S:.0f} s: use the emergency stop"
-        finally:
-            self._waiting.pop(number, None)
 
-    def _stop_unasked(self) -> None:
-        task = self._loop.create_task(self._stop())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _begin_stop(self) -> asyncio.Future[str | None]:
+        """The stop that answers one who asks now. All who ask while one is under way have the next one in common."""
+        if self._next is not None:
+            return self._next
+        asked: asyncio.Future[str | None] = self._loop.create_future()
+        if self._under_way is None:
+            self._send_stop(asked)
+        else:
+            self._next = asked
+        return asked
+
+    def _send_stop(self, asked: asyncio.Future[str | None]) -> None:
+        self._under_way = asked
+        self._stops.send(Stop(next(self._numbers)))
+
+    def _stopped(self, message: Stopped) -> None:
+        done, following = self._under_way, self._next
+        self._under_way = self._next = None
+        if done is not None:
+            done.set_result(message.trouble)
+        if following is not None:
+            self._send_stop(following)
 
     # --- from the cell ---
 
     def _hear_stops(self) -> None:
-        _until_the_end(self._stops, lambda message: self._loop.call_soon_threadsafe(self._answered, message))
+        _until_the_end(self._stops, lambda message: self._loop.call_soon_threadsafe(self._stopped, message))
 
     def _hear(self) -> None:
         _until_the_end(self._pipe, self._take)
@@ -198,7 +230,7 @@ class Server:
             case (dict() as header, bytes() as part):
                 self.pages.cloud(header, part)
 
-    def _answered(self, message: Any) -> None:
+    def _answered(self, message: Answer) -> None:
         future = self._waiting.get(message.number)
         if future is not None and not future.done():
             future.set_result(message)
@@ -215,7 +247,7 @@ def _entering(app: Any, renew: Callable[[], None]) -> Any:
 
     async def entered(scope: Any, receive: Any, send: Any) -> None:
         async def sent(message: Any) -> None:
-            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 303:
+            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 200:
                 renew()
             await send(message)
 
@@ -227,8 +259,12 @@ def _entering(app: Any, renew: Callable[[], None]) -> Any:
 def _until_the_end(pipe: Connection, take: Callable[[Any], object]) -> None:
     try:
         while True:
-            take(pipe.recv())
-    except (EOFError, OSError, RuntimeError):
+            message = pipe.recv()
+            try:
+                take(message)
+            except Exception:
+                logging.getLogger(__name__).exception("a message of the cell: %s", type(message).__name__)
+    except (EOFError, OSError):
         # The program is gone, and the cell with it.
         os._exit(0)
 

@@ -87,8 +87,9 @@ class Screen:
         screen.page.on("pageerror", lambda error: screen.complaints.append(str(error)))
         screen.page.on("console", lambda said: screen._said(said.type, said.text))
         screen.page.goto(link)
-        # The link must not stay in the address, nor be offered again.
-        assert "token" not in screen.page.url
+        # The link leads on to the page. Neither it nor the page's key stays in the address.
+        screen.page.wait_for_url("**/")
+        assert "token" not in screen.page.url and "key" not in screen.page.url
         screen.page.wait_for_selector("body:not(.stale)")
         return screen
 

@@ -99,3 +99,16 @@ def test_a_point_has_the_colour_of_its_deviation_and_another_one_on_another_scal
     assert wide[1] == middle and wide[5] == fine[5], "zero and unknown are the same on every scale"
     assert fine[5] not in (blue, middle, red)
     assert fine[3] == wide[2]
+
+
+def test_a_dry_run_shows_how_far_it_is_and_is_cancelled(screen: Screen, watcher: Watcher) -> None:
+    screen.hold()
+    screen.page.click("#dry-run")
+    screen.shows("dry-said", "Dry run of pot: .+ …")
+    assert screen.page.locator("#dry-bar progress").is_visible()
+    assert screen.page.locator("#dry-run").is_disabled()
+    screen.page.click("#dry-cancel")
+    screen.shows("dry-said", "Dry run of pot: cancelled")
+    assert not screen.page.locator("#dry-bar").is_visible()
+    watcher.until(lambda state: state["dry_run"]["outcome"] == "cancelled")
+    leave(screen, watcher)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Callable
 from typing import Any
@@ -13,13 +12,7 @@ from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
-
-
-class _Stay(urllib.request.HTTPRedirectHandler):
-    """The cookie is in the answer that sends on."""
-
-    def redirect_request(self, *_: Any) -> None:
-        return None
+from websockets.typing import Subprotocol
 
 
 class Watcher:
@@ -29,15 +22,14 @@ class Watcher:
         self.state: dict[str, Any] = {}
         self._changed = threading.Condition()
         parts = urlsplit(link)
-        try:
-            urllib.request.build_opener(_Stay).open(link)
-            raise AssertionError("the link sends on to the page")
-        except urllib.error.HTTPError as answer:
+        with urllib.request.urlopen(link) as answer:
             cookie = answer.headers["set-cookie"].split(";")[0]
+            key = answer.read().decode().partition("#key=")[2].partition('"')[0]
         self._link = connect(
             f"ws://{parts.netloc}/live",
             origin=f"{parts.scheme}://{parts.netloc}",
             additional_headers={"Cookie": cookie},
+            subprotocols=[Subprotocol("cell"), Subprotocol(key)],
             compression=None,
         )
 

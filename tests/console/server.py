@@ -22,7 +22,10 @@ HOSTS = ("127.0.0.1", "localhost")
 
 
 class Served:
-    """The server, and this side of its pipes: `heard` are its messages, `stops` counts what its stop pipe asked for."""
+    """The server, and this side of its pipes: `heard` are its messages, `stops` counts what its stop pipe asked for.
+
+    `begun` says when, and each takes `stop_s`.
+    """
 
     def __init__(self, runs: Path, lasting: str | None = None) -> None:
         bound = socket.socket()
@@ -33,13 +36,15 @@ class Served:
         self.heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.tokens: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.stops = 0
+        self.stop_s = 0.0
+        self.begun: list[float] = []
         self.trouble: str | None = None
         facts = {"version": 1, "name": "test"}
         self.process = ServerProcess(
             lambda fd: Setup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts),
             bound, self._hear, self._stop, lambda: None,
         )  # fmt: skip
-        self._cookie: str | None = None
+        self._cookie = self._key = ""
 
     def _hear(self, message: object) -> None:
         match message:
@@ -47,7 +52,7 @@ class Served:
                 self.tokens.put(token)
             case Do(number, _, words):
                 self.heard.put(message)
-                if words.get("do") != "nothing":
+                if words.get("do") != "diag":
                     self.process.tell(Answer(number, 200, {"ok": True, "text": str(words.get("do"))}))
             case AskCell(number, job):
                 self.process.tell(Answer(number, 200, {"job": job}))
@@ -55,19 +60,31 @@ class Served:
                 self.heard.put(message)
 
     def _stop(self) -> str | None:
+        self.begun.append(time.monotonic())
         self.stops += 1
+        time.sleep(self.stop_s)
         return self.trouble
 
     # --- clients ---
 
+    def enter(self, token: str | None = None) -> tuple[str, str]:
+        """Cookie and key of a browser that has opened the link."""
+        token = self.tokens.get(timeout=20) if token is None else token
+        answer = self.ask("GET", f"/enter?token={token}", cookie=None, x_cell_key=None)
+        assert answer.status == 200, answer.text
+        self._cookie = answer.headers["set-cookie"].partition(";")[0]
+        self._key = answer.text.partition("#key=")[2].partition('"')[0]
+        return self._cookie, self._key
+
     @property
     def cookie(self) -> str:
-        """Of a browser that has opened the link."""
-        if self._cookie is None:
-            answer = self.ask("GET", f"/enter?token={self.tokens.get(timeout=20)}", cookie=None)
-            assert answer.status == 303
-            self._cookie = answer.headers["set-cookie"].partition(";")[0]
-        return self._cookie
+        """Of the browser that opened the link last."""
+        return self._cookie or self.enter()[0]
+
+    @property
+    def key(self) -> str:
+        """Of its page."""
+        return self._key or self.enter()[1]
 
     def ask(
         self, method: str, path: str, body: str | bytes | None = None, *, cookie: str | None = "", **headers: str | None
@@ -75,6 +92,7 @@ class Served:
         """One request by the standard library's client; headers of None are left out."""
         sent: dict[str, str | None] = {"host": self.host, "origin": self.origin if method == "POST" else None}
         sent |= {"cookie": self.cookie if cookie == "" else cookie}
+        sent |= {"x-cell-key": self._key if cookie == "" else None}
         sent |= {"content-type": "application/json"} if method == "POST" else {}
         sent |= {name.replace("_", "-"): value for name, value in headers.items()}
         link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
@@ -100,7 +118,8 @@ class Served:
         headers = {"cookie": self.cookie} | options.pop("headers", {})
         origin = options.pop("origin", self.origin)
         url = options.pop("url", f"ws://{self.host}/live")
-        return connect(url, additional_headers=headers, origin=origin, max_size=None, compression=None, **options)
+        options = {"subprotocols": ["cell", self.key], "max_size": None, "compression": None} | options
+        return connect(url, additional_headers=headers, origin=origin, **options)
 
     def raw(self, request: bytes) -> bytes:
         """What comes back to these bytes, until the other side has nothing more to say."""
@@ -116,6 +135,17 @@ class Served:
             except TimeoutError:
                 pass
             return said
+
+
+class Browser(Served):
+    """A stranger's client at the address of a console's link."""
+
+    def __init__(self, link: str) -> None:
+        self.host = link.split("/")[2]
+        self.port = int(self.host.rpartition(":")[2])
+        self.origin = f"http://{self.host}"
+        self.token = link.partition("token=")[2]
+        self.enter(self.token)
 
 
 class Reply:

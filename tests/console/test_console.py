@@ -13,21 +13,11 @@ from typing import Any
 
 import pytest
 
+from cell.cli.console import page_teller
 from cell.console.console import Address, Console
 from cell.supervisor import Cell
 from drivers.errors import ConfigError
-from tests.console.server import Served, until
-
-
-class Browser(Served):
-    """A stranger's client at the address of a console's link."""
-
-    def __init__(self, link: str) -> None:
-        self.host = link.split("/")[2]
-        self.port = int(self.host.rpartition(":")[2])
-        self.origin = f"http://{self.host}"
-        entered = self.ask("GET", link.split(self.host)[1], cookie=None)
-        self._cookie = entered.headers["set-cookie"].partition(";")[0]
+from tests.console.server import Browser, until
 
 
 @pytest.fixture
@@ -94,6 +84,23 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         assert console.desk.holders.holder is None
 
 
+def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever a handler raises: the next message is heard, and the held button is let go of."""
+
+    def fail(*_: object) -> None:
+        raise OverflowError("int too large to convert to float")
+
+    ann = Browser(console.link)
+    for name in ("beat", "joined"):
+        monkeypatch.setattr(console.desk, name, fail)
+    with ann.live() as page:
+        key = json.loads(page.recv(timeout=20))["key"]
+        page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))
+        while (said := page.recv(timeout=20)) is None or '"refused"' not in str(said)[:200]:
+            pass
+        assert ann.do(do="leave", key=key).status == 403
+
+
 def test_the_server_ends_with_its_program(cell: Cell, console: Console) -> None:
     """Its pipes end, as they do when it is killed. While it was there, nobody else could have its port."""
     with pytest.raises(ConfigError, match="cannot listen"):
@@ -102,6 +109,19 @@ def test_the_server_ends_with_its_program(cell: Cell, console: Console) -> None:
     for pipe in (server._pipe, server._stops):
         socket.socket(fileno=os.dup(pipe.fileno())).shutdown(socket.SHUT_RDWR)
     assert server._process.wait(5) is not None
+
+
+def test_the_link_is_in_no_process_s_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The browser is given a file that nobody else may read, in a folder that nobody else may enter."""
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    tell = page_teller(open_page=True)
+    for link in ("http://127.0.0.1:1/enter?token=first", "http://127.0.0.1:1/enter?token=second"):
+        tell(link)
+    (url,) = opened
+    page = Path(url.removeprefix("file://"))
+    assert "token" not in url and "token=first" in page.read_text()
+    assert [path.stat().st_mode & 0o077 for path in (page, page.parent)] == [0, 0]
 
 
 # --- where it listens ---

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 
 from cell.console.messages import CloudPart, Picture, Show
-from cell.lab.bench.pages import READING, cpu
+from cell.lab.bench.pages import cpu, looking
 from tests.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign
@@ -26,9 +24,7 @@ def test_states_pictures_and_cloud_take_at_most_a_twentieth_of_a_core(tmp_path: 
     noise = np.random.default_rng(0).normal(60.0, 4.0, (480, 640)).clip(0, 255).astype(np.uint8)
     noise[:, 300:306] = 220
     with serving(tmp_path) as server:
-        client = subprocess.Popen(
-            [sys.executable, "-c", READING, server.host, server.cookie, str(pages)], stdin=subprocess.PIPE
-        )
+        client = looking(server.host, server.cookie, server.key, pages)
         try:
             time.sleep(3.0)
             before, begun = cpu(server.process.pid), time.monotonic()

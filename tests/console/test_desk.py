@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import Any
 import pytest
 
 from cell.console.desk import Desk
-from cell.console.facts import cell_facts
+from cell.console.facts import cell_facts, jobs
 from cell.console.mailbox import MOST_CLOUDS, Mailbox
 from cell.console.questions import Questions
 from cell.console.run_view import RunView
+from cell.job import job_path, load_job, shipped_jobs
 from cell.run.run import Run
 from cell.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, LimitError, Measured, RefusedError
@@ -65,7 +67,14 @@ def test_one_holds_the_others_see(desk: Desk) -> None:
         ({"do": "start", "job": 3}, ConfigError),
         ({"do": "pause"}, InterlockError),
         ({"do": "abort", "reason": "x"}, InterlockError),
-        ({"do": "decide", "number": 1}, InterlockError),
+        ({"do": "decide", "number": 1}, ConfigError),
+        ({"do": "decide", "number": 1, "choice": "abort", "reason": "x"}, InterlockError),
+        ({"do": "decide", "number": 10**400, "choice": "abort", "reason": "x"}, ConfigError),
+        ({"do": "jog_step", "device": "arm", "axis": "z", "amount": 10**400}, ConfigError),
+        ({"do": "home", "device": "rail", "by": "Ann"}, ConfigError),
+        ({"do": "abort", "reason": "x" * 5000}, ConfigError),
+        ({"do": "resume", "run": "../elsewhere"}, ConfigError),
+        ({"do": "cancel_dry_run"}, InterlockError),
         ({"do": "clear_stop", "by": " "}, ConfigError),
         ({"do": "speed", "fraction": 2}, ConfigError),
         ({"do": "speed", "fraction": float("nan")}, ConfigError),
@@ -264,6 +273,60 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
     assert run is not None and run["pictures"] == ["board-01-000001.png"]
     assert archive.picture(folder.name, "board-01-000001.png") is not None
     assert archive.replay(folder.name) is None
-    for name in ("../secret.png", "..", "secret.png"):
+    (folder / "linked.png").symlink_to(tmp_path / "secret.png")
+    (folder / "trace.json").symlink_to(tmp_path / "secret.png")
+    for name in ("../secret.png", "..", "secret.png", "linked.png"):
         assert archive.picture(folder.name, name) is None
     assert archive.run("..") is None
+    assert archive.replay(folder.name) is None and archive.page(folder.name) is None
+    # A pipe would keep whoever reads it waiting, and a linked run lies elsewhere.
+    piped = tmp_path / "20260102T000000-abcd"
+    piped.mkdir()
+    os.mkfifo(piped / "report.json")
+    (tmp_path / "20260103T000000-abcd").symlink_to(folder)
+    assert [row["run"] for row in archive.runs()] == [folder.name]
+    assert archive.run(piped.name) is None and archive.run("20260103T000000-abcd") is None
+
+
+def test_jobs_are_named_never_addressed(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of a file's text is told, and a pipe keeps nobody waiting."""
+    elsewhere, here = tmp_path / "elsewhere", tmp_path / "here"
+    for folder in (elsewhere, here):
+        folder.mkdir()
+    text = job_path("pot").read_text()
+    for path in (elsewhere / "mine.toml", here / "mine.toml", here / "plain"):
+        path.write_text(text + "# secret")
+    (here / "pot.stl").write_bytes(job_path("pot").with_suffix(".stl").read_bytes())
+    (here / "linked.toml").symlink_to(elsewhere / "mine.toml")
+    os.mkfifo(here / "pipe.toml")
+    monkeypatch.chdir(here)
+    assert desk.named_job("mine") == "mine" and desk.named_job("seat") == "seat"
+    wrong = [
+        "../elsewhere/mine",
+        "../elsewhere/mine.toml",
+        str(here / "mine.toml"),
+        "mine.toml",
+        "plain",
+        "linked",
+        "pipe",
+    ]
+    for name in [*wrong, "pipe", "pipe.toml", "/dev/zero", "/etc/passwd", "", ".", "..", "x" * 300]:
+        with pytest.raises(ConfigError) as refused:
+            desk.named_job(name)
+        assert "secret" not in str(refused.value)
+    assert jobs("pot") == ["pot", "mine", *(name for name in shipped_jobs() if name != "pot")]
+    with pytest.raises(ConfigError, match="no regular file"):
+        load_job("pipe.toml")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"at": 10**400}, {"at": float("nan")}, {"at": float("inf")}, {"press": 1.5}, {"press": -1}, {"sign": 2},
+     {"device": "claw"}, {"axis": "x" * 900}, {"surplus": 1}],
+    ids=str,
+)  # fmt: skip
+def test_a_beat_that_is_not_understood_moves_nothing(desk: Desk, wrong: dict[str, Any]) -> None:
+    beat = {"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 1.0}
+    with pytest.raises(ConfigError, match="not understood"):
+        desk.beat("c1", beat | wrong)
+    desk.beat("c1", beat)

@@ -35,7 +35,7 @@ def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Serv
     _ = server.cookie
     link = server.tokens.get(timeout=10)
     first = server.ask("GET", f"/enter?token={link}", cookie=None)
-    assert (first.status, first.headers["location"]) == (303, "/")
+    assert first.status == 200 and 'content="0;url=/#key=' in first.text
     cookie = first.headers["set-cookie"]
     assert cookie.startswith(f"cell_console_{server.port}=")
     assert all(word in cookie for word in ("HttpOnly", "SameSite=Strict", "Path=/"))
@@ -49,6 +49,62 @@ def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Serv
 @pytest.mark.parametrize("cookie", [None, "cell_console=x", "a=b; cell_console_1=z", "\xff=\xfe", "x" * 5000])
 def test_without_the_cookie_there_is_nothing(server: Served, path: str, cookie: str | None) -> None:
     assert server.ask("GET", path, cookie=cookie).status == 401
+
+
+def test_a_cookie_alone_authorises_nothing(server: Served) -> None:
+    """Another server on this address is sent the cookie; the key it is not. A second link leaves the first one be."""
+    cookie, key = server.enter()
+    second = server.enter()
+    for path in ("/api/cell", "/api/runs", "/api/runs/20260101T000000-abcd/replay", "/api/runs/x/report.html?ticket="):
+        for wrong in (None, "", "x", "none", key[:-1], cookie.partition("=")[2]):
+            assert server.ask("GET", path, cookie=cookie, x_cell_key=wrong).status == 401
+    before = server.stops
+    assert server.ask("POST", "/api/do", '{"do": "stop"}', x_cell_key=None).status == 401
+    assert server.ask("POST", "/api/do", '{"do": "stop"}', cookie=None, x_cell_key=key).status == 401
+    for subprotocols in (None, ["cell"], ["cell", "x"], ["cell", key, "x"], [key]):
+        with pytest.raises(InvalidStatus):
+            server.live(subprotocols=subprotocols)
+    assert server.stops == before
+    # The cookie is the second's by now, as in a browser with two tabs.
+    assert server.ask("GET", "/api/cell", cookie=second[0], x_cell_key=key).status == 200
+    with server.live() as page:
+        ticket = json.loads(page.recv(timeout=10))["ticket"]
+    # A ticket shows pictures and reports, and nothing else; here there is none of that name.
+    path = "/api/runs/20260101T000000-abcd"
+    assert server.ask("GET", f"{path}/report.html?ticket={ticket}", x_cell_key=None).status == 404
+    assert server.ask("GET", f"{path}/pictures/a.png?ticket={ticket}", x_cell_key=None).status == 404
+    for other in (f"{path}?ticket={ticket}", f"{path}/replay?ticket={ticket}", f"/api/cell?ticket={ticket}"):
+        assert server.ask("GET", other, x_cell_key=None).status == 401
+
+
+def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
+    long, run = "x" * 5000, "/api/runs/20260101T000000-abcd"
+    for path in (f"/api/runs/{long}", f"{run}/pictures/{long}.png", f"/static/{long}", f"/api/cell?job={long}"):
+        assert server.ask("GET", path).status == 400
+    with server.live() as page:
+        key = json.loads(page.recv(timeout=10))["key"]
+        for words in ({"do": "hold", "name": "x" * 3000}, {"do": "pace", "share": 10**400}, {"do": "start", "job": 3}):
+            refused = server.do(key=key, **words)
+            assert (refused.status, refused.words["error"]) == (400, "ConfigError")
+
+
+@pytest.mark.parametrize(
+    "sent", [b"GET /api/cell HTTP/1.1\r\nHost:", b"Content-Length: 100\r\n\r\n{", b"second", b"refused"], ids=str
+)
+def test_what_is_half_said_is_closed_within_ten_seconds(server: Served, sent: bytes) -> None:
+    """Half a head, half a body, half a second request, a refused one's body that never comes."""
+    head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
+    head += f"Content-Type: application/json\r\nX-Cell-Key: {server.key}\r\n"
+    if sent == b"second":
+        sent = head.encode() + b'Content-Length: 13\r\n\r\n{"do": "stop"}' + head.encode()
+    elif sent == b"refused":
+        sent = head.replace("POST", "PUT").encode() + b"Content-Length: 100\r\n\r\n{"
+    elif sent.startswith(b"Content"):
+        sent = head.encode() + sent
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as link:
+        link.sendall(sent)
+        while link.recv(4096):
+            pass
 
 
 @pytest.mark.parametrize("token", ["", "x", "é", "%00", "..%2f", "a" * 3000])
@@ -71,7 +127,8 @@ def test_another_name_is_not_answered(server: Served, host: str | None) -> None:
 
 
 def test_two_names_at_once_are_not_answered(server: Served) -> None:
-    request = f"GET /api/cell HTTP/1.1\r\nHost: {server.host}\r\nHost: {server.host}\r\nCookie: {server.cookie}\r\n\r\n"
+    request = f"GET /api/cell HTTP/1.1\r\nHost: {server.host}\r\nHost: {server.host}\r\nCookie: {server.cookie}\r\n"
+    request += f"X-Cell-Key: {server.key}\r\n\r\n"
     assert server.raw(request.encode()).startswith((b"HTTP/1.1 421", b"HTTP/1.1 400"))
 
 
@@ -103,6 +160,7 @@ def test_a_browser_that_says_that_another_site_asks_is_refused(server: Served) -
 @pytest.mark.parametrize("headers", [{"cookie": "x=y"}, {"host": "evil.example"}])
 def test_the_live_link_asks_the_same(server: Served, headers: dict[str, str]) -> None:
     request = {"Host": server.host, "Cookie": server.cookie, "Origin": server.origin}
+    request["Sec-WebSocket-Protocol"] = f"cell, {server.key}"
     request |= {name.title(): value for name, value in headers.items()}
     lines = [f"{name}: {value}" for name, value in request.items()]
     upgrade = ["GET /live HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
@@ -144,7 +202,7 @@ def test_what_is_not_understood_is_refused(server: Served, body: bytes) -> None:
 def test_a_command_has_a_largest_size_also_when_it_does_not_say_its_own(server: Served) -> None:
     assert server.ask("POST", "/api/do", json.dumps({"do": "x" * 5000})).status == 413
     head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-    head += "Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
+    head += f"X-Cell-Key: {server.key}\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
     assert server.raw(head.encode() + b"1000\r\n" + b"x" * 4096 + b"\r\n1000\r\n" + b"x" * 4096 + b"\r\n").startswith(
         b"HTTP/1.1 413"
     )
@@ -172,9 +230,9 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
     with server.live() as page:
         key = json.loads(page.recv(timeout=10))["key"]
         links = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(30)]
-        body = json.dumps({"do": "nothing", "key": key})
+        body = json.dumps({"do": "diag", "key": key})
         head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-        head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+        head += f"X-Cell-Key: {server.key}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
         for link in links:
             link.sendall((head + body).encode())
         begun = time.monotonic()
@@ -193,7 +251,9 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
 
 @pytest.mark.parametrize(
     ("said", "code"),
-    [("x" * 1100, 1009), ("[]", 1007), ("{", 1007), ('{"type": 1}', 1007), ('{"type": "do"}', 1007), (b"\0\1", 1007),
+    [(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 10**400}), 1007),
+     ('{"type": "jog", "press": 1}', 1007), ('{"type": "jog_end", "press": -1}', 1007), ("x" * 1100, 1009),
+     ("[]", 1007), ("{", 1007), ('{"type": 1}', 1007), ('{"type": "do"}', 1007), (b"\0\1", 1007),
      ('{"type": ' + "[" * 900, 1007)],
 )  # fmt: skip
 def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes, code: int) -> None:
@@ -211,7 +271,7 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served) -> No
         client = json.loads(page.recv(timeout=10))["id"]
         with pytest.raises(ConnectionClosed):
             for _ in range(2000):
-                page.send('{"type": "jog", "press": 1}')
+                page.send('{"type": "jog_end", "press": 1}')
                 time.sleep(0.0005)
     heard: list[object] = []
     while not heard or heard[-1] != Left(client):
@@ -307,7 +367,7 @@ def test_the_token_is_in_no_output_and_no_error(tmp_path: Path, capfd: pytest.Ca
             assert TOKEN not in server.ask("GET", path, cookie=None).text
         # That of a file works again and again.
         for _ in range(2):
-            assert server.ask("GET", f"/enter?token={TOKEN}", cookie=None).status == 303
+            assert server.ask("GET", f"/enter?token={TOKEN}", cookie=None).status == 200
         server.raw(f"GET /enter?token={TOKEN} HTP/9\r\n\r\n".encode())
     out, error = capfd.readouterr()
     assert TOKEN not in out + error

@@ -4,6 +4,14 @@ const STALE_MS = 500;
 const AGAIN_MS = 700;
 const ANSWER_MS = 1500;
 
+// What authorises this tab: it came behind the # of the link, and is in no cookie.
+const [, entered] = location.hash.match(/^#key=([\w-]+)$/) ?? [];
+if (entered) {
+  sessionStorage.setItem('key', entered);
+  history.replaceState(null, '', '/');
+}
+const KEY = sessionStorage.getItem('key') ?? 'none';
+
 export class Link extends EventTarget {
   constructor() {
     super();
@@ -26,7 +34,7 @@ export class Link extends EventTarget {
 
   connect() {
     const scheme = location.protocol === 'https:' ? 'wss' : 'ws';
-    const socket = new WebSocket(`${scheme}://${location.host}/live`);
+    const socket = new WebSocket(`${scheme}://${location.host}/live`, ['cell', KEY]);
     this.socket = socket;
     socket.binaryType = 'arraybuffer';
     socket.onmessage = ({ data }) => (typeof data === 'string' ? this.text(JSON.parse(data)) : this.binary(data));
@@ -41,7 +49,7 @@ export class Link extends EventTarget {
 
   // Why there is no link: a server that knows this browser no more says so in words.
   async why() {
-    const answer = await fetch('/api/cell').catch(() => null);
+    const answer = await fetch('/api/cell', { headers: { 'X-Cell-Key': KEY } }).catch(() => null);
     this.refused = answer?.status === 401 ? await answer.text() : '';
   }
 
@@ -49,6 +57,7 @@ export class Link extends EventTarget {
     if (message.type === 'state') {
       this.heard = performance.now();
       this.state = message;
+      if (message.question?.picture) message.question.picture = this.ticketed(message.question.picture);
       this.look();
     } else if (message.type === 'hello') {
       this.hello = message;
@@ -86,7 +95,7 @@ export class Link extends EventTarget {
     try {
       const answer = await fetch('/api/do', {
         method: 'POST',
-        headers: { 'Content-Type': 'application/json' },
+        headers: { 'Content-Type': 'application/json', 'X-Cell-Key': KEY },
         body: JSON.stringify({ do: name, ...key, ...values }),
         keepalive: name === 'stop',
         signal: name === 'stop' ? AbortSignal.timeout(ANSWER_MS) : undefined,
@@ -103,8 +112,13 @@ export class Link extends EventTarget {
     return this.do('stop');
   }
 
+  // The address of a picture or a report, which the browser itself asks for.
+  ticketed(path) {
+    return `${path}?ticket=${this.hello?.ticket ?? ''}`;
+  }
+
   async get(path) {
-    const answer = await fetch(path);
+    const answer = await fetch(path, { headers: { 'X-Cell-Key': KEY } });
     if (!answer.ok) throw new Error(`${path}: ${answer.status} ${(await answer.text()).slice(0, 300)}`);
     return answer;
   }

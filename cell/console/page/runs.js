@@ -45,9 +45,9 @@ export class Runs {
     return [
       el('h2', { textContent: run }),
       el('p', { className: `outcome ${report?.outcome}`, textContent: `${report?.outcome ?? 'going on'}${report?.reason ? `: ${report.reason}` : ''}` }),
-      el('div', { className: 'buttons' }, replay, el('a', { href: `${base}/report.html`, target: '_blank', rel: 'noopener', textContent: 'Report' })),
+      el('div', { className: 'buttons' }, replay, el('a', { href: this.link.ticketed(`${base}/report.html`), target: '_blank', rel: 'noopener', textContent: 'Report' })),
       el('ol', { className: 'plain' }, ...steps),
-      ...(pictures ?? []).map((name) => el('img', { src: `${base}/pictures/${encodeURIComponent(name)}`, alt: words(name), loading: 'lazy' })),
+      ...(pictures ?? []).map((name) => el('img', { src: this.link.ticketed(`${base}/pictures/${encodeURIComponent(name)}`), alt: words(name), loading: 'lazy' })),
     ];
   }
 }

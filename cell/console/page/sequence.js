@@ -19,6 +19,7 @@ export class Sequence {
       this.begin();
     };
     byId('dry-run').onclick = () => this.rehearse(byId('job').value);
+    byId('dry-cancel').onclick = () => ask('cancel_dry_run');
     document.querySelectorAll('[data-do]').forEach((button) => {
       button.onclick = () => this.work(button.dataset.do);
     });
@@ -110,8 +111,10 @@ export class Sequence {
   // How that goes; when it has ended, whoever asked for it is shown its motion.
   dry(dry) {
     const said = byId('dry-said');
+    const computed = dry?.state !== 'running';
+    show(byId('dry-bar'), !computed);
+    byId('dry-fraction').value = dry?.fraction ?? 0;
     if (!dry) return say(said, '');
-    const computed = dry.state !== 'running';
     say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
     if (!computed && this.awaited === 'asked') this.awaited = 'computing';
     if (computed && this.awaited === 'computing') {

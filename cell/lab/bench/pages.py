@@ -7,6 +7,7 @@ pictures a second. A bare loop beside it shows what this machine lets anybody do
 from __future__ import annotations
 
 import http.client
+import json
 import os
 import subprocess
 import sys
@@ -31,19 +32,20 @@ START_S = 20.0
 TICKS = os.sysconf("SC_CLK_TCK")
 
 READING = """
-import sys, threading
+import json, sys, threading
 from websockets.sync.client import connect
-host, cookie, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+host, cookie, key, count = json.loads(sys.stdin.readline())
 def look():
     with connect(f"ws://{host}/live", additional_headers={"cookie": cookie}, origin=f"http://{host}",
-                 max_size=None, compression=None) as page:
+                 subprotocols=["cell", key], max_size=None, compression=None) as page:
         for _ in page:
             pass
 for _ in range(count):
     threading.Thread(target=look, daemon=True).start()
 sys.stdin.read()
 """
-"""A program of its own that looks as so many pages do: host, cookie, count."""
+"""A program of its own that looks as so many pages do. Its input, which nobody else sees as they do its arguments, is
+a line of JSON: host, cookie, key, count."""
 
 
 def measure(seconds: float, rounds: int, seed: int, progress: Callable[[float, str], None]) -> dict[str, Any]:
@@ -104,9 +106,11 @@ def _looking(console: Console | None, pages: int) -> Iterator[None]:
     host, link = console.link.split("/", 3)[2:]
     asked = http.client.HTTPConnection(host, timeout=START_S)
     asked.request("GET", f"/{link}")
-    cookie = asked.getresponse().headers["set-cookie"].partition(";")[0]
+    answer = asked.getresponse()
+    cookie = answer.headers["set-cookie"].partition(";")[0]
+    key = answer.read().decode().partition("#key=")[2].partition('"')[0]
     asked.close()
-    client = subprocess.Popen([sys.executable, "-c", READING, host, cookie, str(pages)], stdin=subprocess.PIPE)
+    client = looking(host, cookie, key, pages)
     try:
         end = time.monotonic() + START_S
         while len(console.desk.holders.rows()) < pages:
@@ -117,6 +121,15 @@ def _looking(console: Console | None, pages: int) -> Iterator[None]:
     finally:
         client.kill()
         client.communicate()
+
+
+def looking(host: str, cookie: str, key: str, pages: int) -> subprocess.Popen[bytes]:
+    """So many pages in a process of their own, which is to be killed."""
+    client = subprocess.Popen([sys.executable, "-c", READING], stdin=subprocess.PIPE)
+    assert client.stdin is not None
+    client.stdin.write(json.dumps([host, cookie, key, pages]).encode() + b"\n")
+    client.stdin.flush()
+    return client
 
 
 def cpu(pid: int) -> float:

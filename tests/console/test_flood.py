@@ -1,0 +1,117 @@
+"""Nobody can deny a STOP: pages that say anything a thousand times a second, and another one's STOP meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from tests.console.server import Served, serving
+
+WITHIN_S = 0.5
+SESSIONS, PER_S = 4, 250.0
+SAID = ['{"type": "stop"}', '{"type": "stop"}', json.dumps({"type": "jog_end", "press": 1}), "[]", "x" * 2000,
+        json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 1.0})]  # fmt: skip
+
+
+class Flood:
+    """`SESSIONS` browsers, each with its own link, that say `PER_S` things a second each; a context."""
+
+    def __init__(self, server: Served) -> None:
+        self.said = 0
+        self._server, self._over = server, threading.Event()
+        keys = [server.enter() for _ in range(SESSIONS)]
+        self._threads = [threading.Thread(target=self._say, args=session) for session in keys]
+
+    def _say(self, cookie: str, key: str) -> None:
+        """On the live link; by commands while that is refused."""
+        page, due = None, time.monotonic()
+        headers = {"cookie": cookie}
+        while not self._over.wait(max(0.0, due - time.monotonic())):
+            due, self.said = due + 1.0 / PER_S, self.said + 1
+            try:
+                if page is None:
+                    page = self._server.live(headers=headers, subprotocols=["cell", key])
+                page.send(SAID[self.said % len(SAID)])
+            except ConnectionClosed:
+                page = None
+            except (InvalidStatus, OSError):
+                page = None
+                self._server.ask("POST", "/api/do", '{"do": "stop"}', cookie=cookie, x_cell_key=key)
+
+    def __enter__(self) -> Flood:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        for thread in self._threads:
+            thread.join(20)
+
+
+def status(pid: int, what: str) -> int:
+    """Threads, or VmRSS in kB, of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith(what)))
+
+
+def flooded(folder: Path, seconds: float) -> None:
+    """Presses STOP three times a second during a flood; each is carried out, and begun, in time."""
+    with serving(folder) as server:
+        server.stop_s = 0.1
+        with Flood(server) as flood:
+            cookie, key = server.enter()
+            time.sleep(1.0)
+            pids = {"Threads": (server.process.pid, os.getpid()), "VmRSS": (server.process.pid,)}
+            before = {what: [status(pid, what) for pid in of] for what, of in pids.items()}
+            late, answered, end, said = [], [], time.monotonic() + seconds, flood.said
+            while time.monotonic() < end:
+                pressed = time.monotonic()
+                assert server.ask("POST", "/api/do", '{"do": "stop"}', cookie=cookie, x_cell_key=key).status == 200
+                answered.append(time.monotonic() - pressed)
+                late.append(next(begun for begun in server.begun if begun >= pressed) - pressed)
+                time.sleep(0.23)
+            after = {what: [status(pid, what) for pid in of] for what, of in pids.items()}
+            rate = (flood.said - said) / seconds
+    print(f"{rate:.0f} a second; begun after {max(late):.3f} s, answered after {max(answered):.3f} s; {before} {after}")
+    assert rate > 0.5 * SESSIONS * PER_S
+    assert max(late) < WITHIN_S
+    assert max(after["Threads"]) <= max(before["Threads"]) + 8
+    assert after["VmRSS"][0] - before["VmRSS"][0] < 20_000
+
+
+@pytest.mark.flaky(reruns=2, reruns_delay=5)
+def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path) -> None:
+    flooded(tmp_path, 4.0)
+
+
+@pytest.mark.campaign
+def test_a_stop_is_carried_out_in_a_flood_of_a_minute(tmp_path: Path) -> None:
+    flooded(tmp_path, 60.0)
+
+
+def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
+    """One is under way, all others wait for the next one; each is answered."""
+    with serving(tmp_path) as server:
+        server.stop_s = 0.3
+        _ = server.cookie
+        answers: list[int] = []
+        threads = [threading.Thread(target=lambda: answers.append(server.do(do="stop").status)) for _ in range(30)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(20)
+        assert answers == [200] * 30
+        assert 1 <= server.stops <= 6
+        with server.live() as page:
+            before = server.stops
+            for _ in range(40):
+                page.send('{"type": "stop"}')
+            assert server.do(do="stop").status == 200
+            assert before < server.stops <= before + 4
