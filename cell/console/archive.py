@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from cell.console.recorded import FILE, moves
 from cell.run.folder import list_runs
 from cell.run.reading import read_report, run_row
 from drivers.errors import CellError
@@ -56,7 +57,8 @@ class Archive:
         last = [str(name).rpartition("/")[2] for name in report.get("last_frames") or ()]
         kept = sorted(path.name for path in (folder / "frames").glob("*.png") if not path.name.startswith("stripe"))
         names = [name for name in dict.fromkeys((*own, *last, *kept)) if self.picture(folder.name, name) is not None]
-        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES]}
+        replay = bool((self._traced(folder / TRACE) or {}).get("times")) or moves(folder / FILE)
+        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES], "replay": replay}
 
     def picture(self, run: str, name: str) -> Path | None:
         """The file of a picture."""
@@ -87,13 +89,39 @@ class Archive:
             return False
 
     def replay(self, name: str) -> dict[str, Any] | None:
-        """How the cell moved in a run; None for one that left no trace."""
-        folder = self._folder(name)
+        """How the cell moved in a run, by its trace, else by its record; None where neither tells."""
+        if (folder := self._folder(name)) is None:
+            return None
+        trace = self._traced(folder / TRACE)
+        if not (trace or {}).get("times"):
+            trace = self._recorded(folder)
+        return {"run": name, **trace} if trace is not None and trace.get("times") else None
+
+    def _traced(self, file: Path) -> dict[str, Any] | None:
         try:
-            trace = json.loads((folder / TRACE).read_text(encoding="utf-8")) if folder is not None else None
+            trace = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return {"run": name, **trace} if isinstance(trace, dict) else None
+        return trace if isinstance(trace, dict) else None
+
+    def _recorded(self, folder: Path) -> dict[str, Any] | None:
+        """Read by a process of its own that gives way, and kept; a record has tens of megabytes."""
+        if not (folder / FILE).is_file():
+            return None
+        kept = Path(self._pages.name) / f"{folder.name}.{TRACE}"
+        command = ["nice", "-n", "10", sys.executable, "-m", "cell.console.recorded", str(folder / FILE)]
+        with self._drawing:
+            if not kept.exists():
+                try:
+                    read = subprocess.run(command, capture_output=True, timeout=DRAW_S, check=True).stdout
+                    trace: dict[str, Any] = json.loads(read)
+                except (OSError, subprocess.SubprocessError, ValueError):
+                    return None
+                if not (folder / "report.json").exists():
+                    # A run that goes on is read anew each time.
+                    return trace
+                kept.write_bytes(read)
+        return self._traced(kept)
 
     def _folder(self, name: str) -> Path | None:
         if not RUN.fullmatch(name) or not (self._root / name).is_dir():
@@ -108,13 +136,14 @@ class Archive:
             report = read_report(folder)
         except (CellError, OSError):
             report = {}
-        row |= {"d_mean_mm": _true(report), "expected_mm": _stated(report)}
+        row |= {"d_mean_mm": true_error_mm(report), "expected_mm": _stated(report)}
         if (folder / "report.json").exists():
             self._rows[folder] = row
         return row
 
 
-def _true(report: Mapping[str, Any]) -> float | None:
+def true_error_mm(report: Mapping[str, Any]) -> float | None:
+    """The true place error of a simulated run, mean of the part's points, mm; None where nobody knows it."""
     try:
         return float(report["truth"]["error_mm"]["d"]["mean"])
     except (KeyError, TypeError, ValueError):
