@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from cell.console.archive import true_error_mm
 from cell.console.desk import Desk
 from cell.console.messages import CloudPart, Happened, Picture, Show
 from cell.console.pictures import GrowingCloud, Pictures
@@ -103,6 +104,7 @@ class Look:
             "last": desk.told(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
+            "starting": desk.starting,
             "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
             "dry_run": desk.rehearsals.present, "behind": 0,
         }  # fmt: skip
@@ -125,8 +127,9 @@ class Look:
     def _end_view(self) -> None:
         if (view := self._view) is None:
             return
-        self._last = view.ended or self._last
-        self._faults = [*self._faults, *view.faults][-8:]
+        if view.ended is not None:
+            self._last = {**view.ended, "figure": _figure(view)}
+        self._faults = [*self._faults, *({**fault, "over": True} for fault in view.faults)][-8:]
         self._view = None
 
     def _viewed(self, run: Run[Any]) -> RunView:
@@ -168,3 +171,15 @@ class Look:
             if part is not None:
                 header, payload = part
                 self._tell(CloudPart({**header, "run": folder}, payload))
+
+
+def _figure(view: RunView) -> dict[str, Any] | None:
+    """A placed job's place error in mm: the true one where a simulated world tells it, else the stated bound."""
+    if view.ended is None or view.ended["outcome"] != "placed" or view.run.folder is None:
+        return None
+    with suppress(CellError, OSError, KeyError, TypeError, ValueError):
+        report = read_report(view.run.folder)
+        if (true := true_error_mm(report)) is not None:
+            return {"mm": true, "kind": "true"}
+        return {"mm": float(report["place_bound_95"]["d"]), "kind": "stated"}
+    return None
