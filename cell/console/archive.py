@@ -13,14 +13,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cell.console.recorded import FILE, moves
+from cell.console.recorded import moves
+from cell.record.file import FILE
 from cell.run.folder import list_runs
 from cell.run.reading import read_report, run_row
 from drivers.errors import CellError
 
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
-TRACE = "trace.json"
 MOST_RUNS, MOST_PICTURES = 200, 60
 DRAW_S = 60.0
 _DRAW = "import sys; from pathlib import Path; from cell.report.page.make import write_page; "
@@ -57,8 +57,8 @@ class Archive:
         last = [str(name).rpartition("/")[2] for name in report.get("last_frames") or ()]
         kept = sorted(path.name for path in (folder / "frames").glob("*.png") if not path.name.startswith("stripe"))
         names = [name for name in dict.fromkeys((*own, *last, *kept)) if self.picture(folder.name, name) is not None]
-        replay = bool((self._traced(folder / TRACE) or {}).get("times")) or moves(folder / FILE)
-        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES], "replay": replay}
+        pictures, replay = names[:MOST_PICTURES], moves(folder / FILE)
+        return {"run": folder.name, "report": report, "pictures": pictures, "replay": replay}
 
     def picture(self, run: str, name: str) -> Path | None:
         """The file of a picture."""
@@ -82,46 +82,35 @@ class Archive:
         return page
 
     def _drawn(self, folder: Path, page: Path) -> bool:
-        command = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)]
+        return self._printed("-c", _DRAW, str(folder), str(page)) is not None
+
+    def _printed(self, *arguments: str) -> bytes | None:
+        """What a process of its own, which gives way, prints; None when it fails."""
+        command = ["nice", "-n", "10", sys.executable, *arguments]
         try:
-            return subprocess.run(command, capture_output=True, timeout=DRAW_S).returncode == 0
-        except (OSError, subprocess.TimeoutExpired):
-            return False
+            return subprocess.run(command, capture_output=True, timeout=DRAW_S, check=True).stdout
+        except (OSError, subprocess.SubprocessError):
+            return None
 
     def replay(self, name: str) -> dict[str, Any] | None:
-        """How the cell moved in a run, by its trace, else by its record; None where neither tells."""
-        if (folder := self._folder(name)) is None:
-            return None
-        trace = self._traced(folder / TRACE)
-        if not (trace or {}).get("times"):
-            trace = self._recorded(folder)
-        return {"run": name, **trace} if trace is not None and trace.get("times") else None
+        """How the cell moved in a run; None for one whose record does not tell.
 
-    def _traced(self, file: Path) -> dict[str, Any] | None:
-        try:
-            trace = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        A record has tens of megabytes: it is read by a process of its own that gives way, and what it told is kept.
+        """
+        folder = self._folder(name)
+        if folder is None or not (folder / FILE).is_file():
             return None
-        return trace if isinstance(trace, dict) else None
-
-    def _recorded(self, folder: Path) -> dict[str, Any] | None:
-        """Read by a process of its own that gives way, and kept; a record has tens of megabytes."""
-        if not (folder / FILE).is_file():
-            return None
-        kept = Path(self._pages.name) / f"{folder.name}.{TRACE}"
-        command = ["nice", "-n", "10", sys.executable, "-m", "cell.console.recorded", str(folder / FILE)]
+        kept = Path(self._pages.name) / f"{name}.json"
         with self._drawing:
             if not kept.exists():
-                try:
-                    read = subprocess.run(command, capture_output=True, timeout=DRAW_S, check=True).stdout
-                    trace: dict[str, Any] = json.loads(read)
-                except (OSError, subprocess.SubprocessError, ValueError):
+                read = self._printed("-m", "cell.console.recorded", str(folder / FILE))
+                if read is None:
                     return None
-                if not (folder / "report.json").exists():
-                    # A run that goes on is read anew each time.
-                    return trace
+                # A run that goes on is read anew each time.
+                kept = kept if (folder / "report.json").exists() else kept.with_suffix(".now.json")
                 kept.write_bytes(read)
-        return self._traced(kept)
+            motion: dict[str, Any] = json.loads(kept.read_bytes())
+        return {"run": name, **motion} if motion["times"] else None
 
     def _folder(self, name: str) -> Path | None:
         if not RUN.fullmatch(name) or not (self._root / name).is_dir():

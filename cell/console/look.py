@@ -17,7 +17,6 @@ from cell.console.pictures import GrowingCloud, Pictures
 from cell.console.readings import Readings
 from cell.console.run_view import RunView
 from cell.console.scene_now import SceneNow
-from cell.console.trace import Trace, traced
 from cell.geometry.poses import from_ur
 from cell.job import load_job
 from cell.run.folder import list_runs
@@ -141,9 +140,6 @@ class Look:
         if run.kind == "job" and job is not None:
             with suppress(CellError):
                 steps = find_kind(load_job(job)[0].job.kind).names
-        if not self._virtual:
-            trace = Trace(self._cell.devices, virtual=False)
-            threading.Thread(target=traced, args=(self._cell.devices, run, trace), name="trace", daemon=True).start()
         return RunView(run, steps, job, self._expected(job) if steps else {})
 
     def _expected(self, job: str | None) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""How the cell moved in a run, read from its `record.mcap`: the replay of runs that no console has looked at.
+"""How the cell moved in a run, by its `record.mcap`: for the replay with a slider.
 
 Run as a module by the server, in a process of its own: `python -m cell.console.recorded FILE`.
 """
@@ -10,16 +10,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cell.record.file import FILE
 from cell.record.reading import Parts, messages, said
 from drivers.errors import CellError
-
-__all__ = ["FILE", "motion", "moves"]
 
 JOINTS, VEHICLE, EVENT = "/joints", "/vehicle/state", "/sequence/event"
 RAIL = "rail"
 PERIOD_S, MOST = 0.1, 40_000
-"""Seconds between two places that are kept, and how many are at most: as `cell.console.trace` has them."""
+"""Seconds between two moments that are kept, and how many are at most: more than an hour."""
 
 
 def moves(record: Path) -> bool:
@@ -31,10 +28,8 @@ def moves(record: Path) -> bool:
 
 
 def motion(record: Path) -> dict[str, Any]:
-    """As `Trace.as_dict`, ten times a second, from the record's beginning. Joints in rad, rail and vehicle in m.
-
-    Raises `CellError` for a file that is no record.
-    """
+    """Ten times a second from the record's beginning, as docs/console.md has it: joints in rad, rail in m, vehicle in m
+    and rad; None where not told yet. Raises `CellError` for a file that is no record."""
     told = sorted(messages(record, (JOINTS, VEHICLE, EVENT)), key=lambda message: message[1])
     begun = told[0][1] if told else 0
     rows: list[tuple[float, Any, Any, Any]] = []

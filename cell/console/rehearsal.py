@@ -1,6 +1,6 @@
 """A job's dry run on the virtual clock, in a process of its own, so that a person sees what it would do.
 
-Computed first, then shown: the virtual clock has no time of the wall. The run lies among the others, with its trace.
+Computed first, then shown: the virtual clock has no time of the wall. The run lies among the others, with its record.
 Run as a module by the console: `python -m cell.console.rehearsal JOB SEED LEVEL CONFIG`, in the cell's folder.
 """
 
@@ -75,17 +75,13 @@ class Rehearsals:
 
 def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
     """The dry run itself, in this process: name, outcome and reason of the run."""
-    from cell.console.trace import Trace
     from cell.supervisor import Cell
 
     with Cell.open(
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
     ) as cell:  # fmt: skip
-        trace = Trace(cell.devices, virtual=True)
-        with trace.taken():
-            outcome = cell.run(job, trace)
-        trace.write(outcome.folder)
+        outcome = cell.run(job)
     return {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
 
 
