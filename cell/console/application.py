@@ -13,6 +13,8 @@ from urllib.parse import parse_qs
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -109,6 +111,16 @@ class Guard:
         return None
 
 
+class PageFiles(StaticFiles):
+    """The page's files. A browser keeps them, and asks by their ETag whether they are still the same."""
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        """See `StaticFiles`."""
+        response = super().file_response(*args, **options)
+        response.headers["cache-control"] = "no-cache"
+        return response
+
+
 class Application:
     """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station."""
 
@@ -132,19 +144,21 @@ class Application:
 
     def asgi(self) -> ASGIApp:
         """What is served."""
+        # Text alone: pictures are compressed already.
+        small = [Middleware(GZipMiddleware, minimum_size=1000, compresslevel=6)]
         routes = [
-            Route("/", self._index),
+            Route("/", self._index, middleware=small),
             Route(ENTER, self._enter),
-            Route("/api/cell", self._tell_cell),
-            Route("/api/runs", self._runs),
-            Route("/api/trend", self._trend),
-            Route("/api/runs/{run}", self._run),
-            Route("/api/runs/{run}/replay", self._replay),
+            Route("/api/cell", self._tell_cell, middleware=small),
+            Route("/api/runs", self._runs, middleware=small),
+            Route("/api/trend", self._trend, middleware=small),
+            Route("/api/runs/{run}", self._run, middleware=small),
+            Route("/api/runs/{run}/replay", self._replay, middleware=small),
             Route("/api/runs/{run}/report.html", self._report),
             Route("/api/runs/{run}/pictures/{name}", self._picture),
             Route("/api/do", self._command, methods=["POST"]),
             WebSocketRoute("/live", self._live),
-            Mount("/static", StaticFiles(directory=PAGE)),
+            Mount("/static", PageFiles(directory=PAGE), middleware=small),
         ]
         return Guard(Starlette(routes=routes, exception_handlers={HTTPException: _refused, 500: _failed}), self._access)
 
@@ -187,7 +201,10 @@ class Application:
     async def _report(self, request: Request) -> Response:
         page = await run_in_threadpool(self._archive.page, request.path_params["run"])
         # It holds scripts and styles of its own: in a sandbox, from where it reaches nothing here.
-        return _found(None) if page is None else FileResponse(page, headers={"content-security-policy": REPORT_POLICY})
+        if page is None:
+            # Opened in a window of its own, where a person reads what comes.
+            return PlainTextResponse("There is no such run, or it has no report that could be drawn.\n", 404)
+        return FileResponse(page, headers={"content-security-policy": REPORT_POLICY})
 
     async def _picture(self, request: Request) -> Response:
         path = self._archive.picture(request.path_params["run"], request.path_params["name"])

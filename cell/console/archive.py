@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from cell.console.recorded import moves
+from cell.record.file import FILE
 from cell.run.folder import list_runs
 from cell.run.reading import read_report, run_row
 from cell.toml_file import below
@@ -20,7 +22,6 @@ from drivers.errors import CellError
 
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
-TRACE = "trace.json"
 READ = ("report.json", "journal.sqlite")
 MOST_RUNS, MOST_PICTURES = 200, 60
 DRAW_S = 60.0
@@ -60,7 +61,9 @@ class Archive:
         last = [str(name).rpartition("/")[2] for name in report.get("last_frames") or ()]
         kept = sorted(path.name for path in (folder / "frames").glob("*.png") if not path.name.startswith("stripe"))
         names = [name for name in dict.fromkeys((*own, *last, *kept)) if self.picture(folder.name, name) is not None]
-        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES]}
+        record = below(self._root, folder.name, FILE)
+        replay = record is not None and moves(record)
+        return {"run": folder.name, "report": report, "pictures": names[:MOST_PICTURES], "replay": replay}
 
     def picture(self, run: str, name: str) -> Path | None:
         """The file of a picture."""
@@ -85,25 +88,43 @@ class Archive:
         return page
 
     def _drawn(self, folder: Path, page: Path) -> bool:
-        command, nowhere = ["nice", "-n", "10", sys.executable, "-c", _DRAW, str(folder), str(page)], subprocess.DEVNULL
-        try:
-            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere) as process:
-                try:
-                    return process.wait(DRAW_S) == 0
-                finally:
-                    process.kill()
-        except (OSError, subprocess.TimeoutExpired):
-            return False
+        return self._printed("-c", _DRAW, str(folder), str(page)) is not None
+
+    def _printed(self, *arguments: str) -> bytes | None:
+        """What a process of its own, which gives way and ends with this one, prints; None when it fails."""
+        command, silent = ["nice", "-n", "10", sys.executable, *arguments], subprocess.DEVNULL
+        # Into a file: the pipe to it stays open, whose end tells the process that this one is gone.
+        with tempfile.TemporaryFile() as printed:
+            try:
+                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=printed, stderr=silent) as process:
+                    try:
+                        done = process.wait(DRAW_S) == 0
+                    finally:
+                        process.kill()
+            except (OSError, subprocess.TimeoutExpired):
+                return None
+            printed.seek(0)
+            return printed.read() if done else None
 
     def replay(self, name: str) -> dict[str, Any] | None:
-        """How the cell moved in a run; None for one that left no trace."""
+        """How the cell moved in a run; None for one whose record does not tell.
+
+        A record has tens of megabytes: it is read by a process of its own that gives way, and what it told is kept.
+        """
         folder = self._folder(name)
-        path = None if folder is None else below(self._root, folder.name, TRACE)
-        try:
-            trace = None if path is None else json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+        if folder is None or below(self._root, folder.name, FILE) is None:
             return None
-        return {"run": name, **trace} if isinstance(trace, dict) else None
+        kept = Path(self._pages.name) / f"{name}.json"
+        with self._drawing:
+            if not kept.exists():
+                read = self._printed("-m", "cell.console.recorded", str(folder / FILE))
+                if read is None:
+                    return None
+                # A run that goes on is read anew each time.
+                kept = kept if (folder / "report.json").exists() else kept.with_suffix(".now.json")
+                kept.write_bytes(read)
+            motion: dict[str, Any] = json.loads(kept.read_bytes())
+        return {"run": name, **motion} if motion["times"] else None
 
     def _folder(self, name: str) -> Path | None:
         """The folder of a run; none that is a link, or whose report or journal is no file of its own."""
@@ -121,13 +142,14 @@ class Archive:
             report = read_report(folder)
         except (CellError, OSError):
             report = {}
-        row |= {"d_mean_mm": _true(report), "expected_mm": _stated(report)}
+        row |= {"d_mean_mm": true_error_mm(report), "expected_mm": _stated(report)}
         if (folder / "report.json").exists():
             self._rows[folder] = row
         return row
 
 
-def _true(report: Mapping[str, Any]) -> float | None:
+def true_error_mm(report: Mapping[str, Any]) -> float | None:
+    """The true place error of a simulated run, mean of the part's points, mm; None where nobody knows it."""
     try:
         return float(report["truth"]["error_mm"]["d"]["mean"])
     except (KeyError, TypeError, ValueError):

@@ -22,7 +22,6 @@ from cell.console.facts import cell_facts
 from cell.console.link import ServerProcess
 from cell.console.look import Look
 from cell.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
-from cell.console.trace import Trace
 from cell.job import load_job
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
@@ -158,7 +157,7 @@ class Console:
 
     @contextmanager
     def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:
-        """Inside this context a job is done on the virtual clock, and noted; give its outcome to what this gives.
+        """Inside this context a job is done on the virtual clock; give its outcome to what this gives.
 
         The page is told that it is being computed, and offers its motion when it is.
         """
@@ -167,16 +166,13 @@ class Console:
             seed = self._cell.simulated.facts["seed"]
         about = {"job": job, "seed": seed, "run": None}
         rehearsals.present = {"state": "running", "text": "computing", **about}
-        trace = Trace(self._cell.devices, virtual=True)
 
         def done(outcome: RunOutcome) -> None:
-            trace.write(outcome.folder)
             told = {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
             rehearsals.present = {**about, "state": "done", **told}
 
         try:
-            with trace.taken():
-                yield done
+            yield done
         finally:
             if rehearsals.present["state"] == "running":
                 rehearsals.present = {**about, "state": "done", "outcome": "failed", "reason": "it could not be done"}

@@ -25,13 +25,14 @@ from cell.job import load_job, require_job_name
 from cell.run.run import Run
 from cell.steps.kinds import find_kind
 from drivers.errors import CellError, InterlockError
-from statemachine.script import Script
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
 
 FREE = ("hold",)
 """What a page may do that does not hold the cell."""
+SOON_S = 0.1
+"""Wall seconds that a command which begins something waits for a refusal, before it answers "starting"."""
 
 Words = Mapping[str, Any]
 Answer = dict[str, Any]
@@ -58,6 +59,8 @@ class Desk:
         self._say = say
         self._began = began
         self._beginning = threading.Lock()
+        self.starting: str | None = None
+        """What was asked for and has not begun yet."""
         self._found: tuple[str, str] | None = None
         self.manual = Manual(cell, load_job(job)[0], self._pressed)
         self._doing: dict[str, Callable[[str, Words], Answer | str]] = {
@@ -73,8 +76,12 @@ class Desk:
             "go_on": lambda client, words: self._running("go on", Run.go_on),
             "abort": self._abort,
             "decide": self._decide,
-            "calibrate": lambda client, words: self._long("calibration", lambda: cell.calibrate(job=self._job(words))),
-            "verify": lambda client, words: self._long("verification", lambda: cell.verify(job=self._job(words))),
+            "calibrate": lambda client, words: self._long(
+                client, "calibration", lambda: cell.calibrate(job=self._job(words))
+            ),
+            "verify": lambda client, words: self._long(
+                client, "verification", lambda: cell.verify(job=self._job(words))
+            ),
             "home": self._home,
             "diag": lambda client, words: self._diag(),
             "manual": self._manual,
@@ -157,28 +164,64 @@ class Desk:
 
     def _start(self, client: str, words: Words) -> str:
         job = self._job(words)
-        kind = find_kind(load_job(job)[0].job.kind)
-        return self._begin(job, lambda script: self.cell.start(
-            job, at_start=words["at_start"], until=words["until"], script=script
-        ), kind.names)  # fmt: skip
+        until, at_start = words["until"], words["at_start"]
 
-    def _begin(self, job: str, start: Callable[[Script], Run[Any]], steps: tuple[str, ...]) -> str:
-        with self._beginning:
-            run = start(self.questions.script(steps))
+        def begin() -> None:
+            script = self.questions.script(find_kind(load_job(job)[0].job.kind).names)
+            run = self.cell.start(job, at_start=at_start, until=until, script=script)
             self.questions.hold(run)
-        self._began(run, job)
-        return f"job {job} has begun"
+            self._began(run, job)
+
+        return self._soon(client, f"job {job}", begin)
+
+    def _soon(self, client: str, what: str, begin: Callable[[], None]) -> str:
+        """Begin beside this command, which answers at once; a refusal that comes later is told to the page."""
+        if (going := self.cell.current) is not None:
+            raise InterlockError("cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again")
+        if not self._beginning.acquire(blocking=False):
+            busy = f"is starting {self.starting}" if self.starting else "is being asked something else"
+            raise InterlockError("cell", f"{busy}; wait a moment, then look before you press again")
+        self.starting = what
+        refused: list[Exception] = []
+        ended, answered = threading.Event(), threading.Event()
+
+        def perform() -> None:
+            try:
+                begin()
+            except Exception as error:
+                log.info("%s: %s", what, error, exc_info=not isinstance(error, CellError))
+                refused.append(error)
+                if answered.is_set():
+                    self._say(client, {"type": "answer", "ok": False, "text": str(error)})
+            finally:
+                self.starting = None
+                self._beginning.release()
+                ended.set()
+
+        threading.Thread(target=perform, name=f"console: starts {what}", daemon=True).start()
+        ended.wait(SOON_S)
+        answered.set()
+        if refused:
+            raise refused[0]
+        return f"{what} has begun" if ended.is_set() else f"starting {what} …"
 
     def _resume(self, client: str, words: Words) -> str:
-        kind = find_kind(load_job(self.job)[0].job.kind)
-        script = self.questions.script(kind.names)
-        return self._long("resumed job", lambda: self.cell.resume(words["run"], script=script))
+
+        def resume() -> object:
+            script = self.questions.script(find_kind(load_job(self.job)[0].job.kind).names)
+            return self.cell.resume(words["run"], script=script)
+
+        return self._long(client, "resumed job", resume)
 
     def _home(self, client: str, words: Words) -> str:
-        return self._long("homing", lambda: self.cell.home(words["device"]))
+        return self._long(client, "homing", lambda: self.cell.home(words["device"]))
 
-    def _long(self, what: str, work: Callable[[], object]) -> str:
-        """Begin work that lasts, and give what refuses it at once."""
+    def _long(self, client: str, what: str, work: Callable[[], object]) -> str:
+        """Begin work that lasts."""
+        return self._soon(client, what, lambda: self._begin_long(what, work))
+
+    def _begin_long(self, what: str, work: Callable[[], object]) -> None:
+        """Begin it in a thread of its own, and give what refuses it at once."""
         begun = threading.Event()
         failed: list[CellError] = []
         runs: list[Run[Any]] = []
@@ -194,22 +237,15 @@ class Desk:
             finally:
                 begun.set()
 
-        with self._beginning:
-            if (going := self.cell.current) is not None:
-                raise InterlockError(
-                    "cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again"
-                )
-            threading.Thread(target=perform, name=f"console: {what}", daemon=True).start()
-            for _ in range(500):
-                if begun.wait(0.01) or self.cell.current is not None:
-                    break
+        threading.Thread(target=perform, name=f"console: {what}", daemon=True).start()
+        while not begun.wait(0.01) and self.cell.current is None:
+            pass
         if (run := self.cell.current) is not None:
             runs.append(run)
             self.questions.hold(run)
             self._began(run, None)
         elif failed:
             raise failed[0]
-        return f"the {what} has begun"
 
     def _running(self, what: str, act: Callable[[Run[Any]], None]) -> str:
         if (run := self.cell.current) is None:

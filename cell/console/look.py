@@ -10,13 +10,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from cell.console.archive import true_error_mm
 from cell.console.desk import Desk
 from cell.console.messages import CloudPart, Happened, Picture, Show
 from cell.console.pictures import GrowingCloud, Pictures
 from cell.console.readings import Readings
 from cell.console.run_view import RunView
 from cell.console.scene_now import SceneNow
-from cell.console.trace import Trace, traced
 from cell.geometry.poses import from_ur
 from cell.job import load_job
 from cell.run.folder import list_runs
@@ -103,6 +103,7 @@ class Look:
             "last": desk.told(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
+            "starting": desk.starting,
             "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
             "dry_run": desk.rehearsals.present, "behind": 0,
         }  # fmt: skip
@@ -125,8 +126,9 @@ class Look:
     def _end_view(self) -> None:
         if (view := self._view) is None:
             return
-        self._last = view.ended or self._last
-        self._faults = [*self._faults, *view.faults][-8:]
+        if view.ended is not None:
+            self._last = {**view.ended, "figure": _figure(view)}
+        self._faults = [*self._faults, *({**fault, "over": True} for fault in view.faults)][-8:]
         self._view = None
 
     def _viewed(self, run: Run[Any]) -> RunView:
@@ -138,9 +140,6 @@ class Look:
         if run.kind == "job" and job is not None:
             with suppress(CellError):
                 steps = find_kind(load_job(job)[0].job.kind).names
-        if not self._virtual:
-            trace = Trace(self._cell.devices, virtual=False)
-            threading.Thread(target=traced, args=(self._cell.devices, run, trace), name="trace", daemon=True).start()
         return RunView(run, steps, job, self._expected(job) if steps else {})
 
     def _expected(self, job: str | None) -> dict[str, float]:
@@ -168,3 +167,15 @@ class Look:
             if part is not None:
                 header, payload = part
                 self._tell(CloudPart({**header, "run": folder}, payload))
+
+
+def _figure(view: RunView) -> dict[str, Any] | None:
+    """A placed job's place error in mm: the true one where a simulated world tells it, else the stated bound."""
+    if view.ended is None or view.ended["outcome"] != "placed" or view.run.folder is None:
+        return None
+    with suppress(CellError, OSError, KeyError, TypeError, ValueError):
+        report = read_report(view.run.folder)
+        if (true := true_error_mm(report)) is not None:
+            return {"mm": true, "kind": "true"}
+        return {"mm": float(report["place_bound_95"]["d"]), "kind": "stated"}
+    return None

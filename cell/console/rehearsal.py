@@ -1,6 +1,6 @@
 """A job's dry run on the virtual clock, in a process of its own, so that a person sees what it would do.
 
-Computed first, then shown: the virtual clock has no time of the wall. The run lies among the others, with its trace.
+Computed first, then shown: the virtual clock has no time of the wall. The run lies among the others, with its record.
 Run as a module by the console: `python -m cell.console.rehearsal JOB SEED LEVEL CONFIG`, in the cell's folder.
 """
 
@@ -128,7 +128,6 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
         print(json.dumps({"fraction": round(fraction, 3), "text": text}), flush=True)
 
     tell(0.0, "loading the program")
-    from cell.console.trace import Trace
     from cell.job import load_job
     from cell.steps.kinds import find_kind
     from cell.supervisor import Cell
@@ -138,18 +137,15 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
     ) as cell:  # fmt: skip
-        trace, names = Trace(cell.devices, virtual=True), find_kind(load_job(job)[0].job.kind).names
+        names = find_kind(load_job(job)[0].job.kind).names
 
         def observe(event: Event) -> None:
-            trace(event)
             if event.step in names and event.kind in ("step_started", "progress"):
                 within = float(str(event.data.get("fraction", 0.0)))
                 tell((names.index(event.step) + within) / len(names), event.step.replace("_", " "))
 
         tell(0.0, "calibrating and planning")
-        with trace.taken():
-            outcome = cell.run(job, observe)
-        trace.write(outcome.folder)
+        outcome = cell.run(job, observe)
     return {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
 
 

@@ -69,11 +69,21 @@ class RunView:
         here = max(0.0, self._expected[self._step] - (time.monotonic() - self._step_begun))
         return round(here + sum(self._expected[name] for name in later), 1)
 
+    def _row_of(self, step: str) -> dict[str, Any]:
+        """A step's row; what comes before the first step, as a first calibration does, stands before it."""
+        if step not in self._rows:
+            first = all(row["state"] == "open" for row in self._rows.values())
+            self._rows = {step: _row(step), **self._rows} if first else {**self._rows, step: _row(step)}
+        return self._rows[step]
+
     def _take(self, event: Event) -> None:
         step, data = event.step, event.data
-        row = self._rows.setdefault(step, _row(step)) if step and _is_step(event) else None
+        row = self._row_of(step) if step and _is_step(event) else None
         match event.kind:
             case "step_started" if row is not None:
+                # What went before without an end of its own, as a calibration does, has ended.
+                for before in self._rows.values():
+                    before["state"] = "done" if before["state"] == "active" else before["state"]
                 self._step, self._attempt, self._fraction, self._text = step, int(str(data["attempt"])), 0.0, ""
                 self._step_begun = time.monotonic()
                 row |= {"state": "active", "reason": "", "retries": row["retries"] + (self._attempt > 1)}
@@ -99,6 +109,7 @@ class RunView:
                 self._held = event.kind == "paused"
         if event.kind == "run_ended":
             folder = None if self.run.folder is None else self.run.folder.name
+            self._step, self._text = None, "writing the report"
             told = {"outcome": str(data["outcome"]), "reason": str(data["reason"])}
             self.ended = {"run": folder, "kind": self.run.kind, **told, "t": event.at}
 

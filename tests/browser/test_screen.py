@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 
 import pytest
+from playwright.sync_api import Browser, Route
 
 from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, leave, press
-from tests.browser.screen import LOCAL, Screen
+from tests.browser.screen import LOCAL, Console, Screen
 from tests.browser.watcher import Watcher
 
 # As in tests/wire: devices keep deadlines on the wall, which a busy machine cannot always.
@@ -112,3 +113,125 @@ def test_a_dry_run_shows_how_far_it_is_and_is_cancelled(screen: Screen, watcher:
     assert not screen.page.locator("#dry-bar").is_visible()
     watcher.until(lambda state: state["dry_run"]["outcome"] == "cancelled")
     leave(screen, watcher)
+
+
+SIZES = [(1920, 1080), (1280, 800), (768, 1024)]
+RUN = {
+    "kind": "job", "run": "20260101T000000-abcd", "job": "pot", "state": "asking", "step": "laser_sweep", "attempt": 1,
+    "fraction": 0.4, "text": "line 48 of 120", "elapsed_s": 40.0, "left_s": None, "steps": [],
+}  # fmt: skip
+ASKED = {
+    "kind": "confirm", "number": 1, "step": "laser_sweep", "code": "arm.protective_stop",
+    "reason": "the arm has stopped", "numbers": [], "picture": None,
+    "choices": [{"choice": "confirm"}, {"choice": "abort"}],
+}  # fmt: skip
+BOXES = """() => Object.fromEntries(['question', 'stage', 'stop', 'state'].map((id) => {
+    const b = document.getElementById(id).getBoundingClientRect();
+    return [id, [b.left, b.top, b.right, b.bottom]];
+}))"""
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_a_question_stands_beside_the_view_and_says_what_comes_of_an_answer(
+    size: tuple[int, int], browser: Browser, console: Console
+) -> None:
+    changes: dict[str, object] = {"run": RUN, "question": ASKED}
+    screen = Screen.of(browser, console.link(), size, changes=changes)
+    page = screen.page
+    screen.shows("state", "WAITS FOR YOU")
+    screen.shows("question", "flange stands at x .* mm.*laser sweep begins anew.*ends as aborted")
+    screen.shows("question", r"laser sweep: line 48 of 120 \(40 %\)")
+    boxes = page.evaluate(BOXES)
+    for other in ("stage", "stop"):
+        (left, top, right, bottom), (a, b, c, d) = boxes["question"], boxes[other]
+        assert right <= a or c <= left or bottom <= b or d <= top, f"the question covers the {other}"
+    left, top, right, bottom = boxes["question"]
+    assert left >= 0 and right <= size[0] and top >= 0 and bottom <= size[1]
+    a, b, c, d = boxes["stage"]
+    assert min(c, right) - max(a, left) <= 0 < min(d, bottom) - max(b, top), "it stands beside the view"
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert boxes["state"][3] - boxes["state"][1] >= 36, "legible from two metres"
+    screen.hold()
+    page.click("#question .choices button >> nth=0")
+    assert page.input_value("#question textarea") == "nothing touches the arm"
+    # A second attempt that runs is not told the fault of a run before it as its own end.
+    ended = {
+        "device": "arm",
+        "code": "c",
+        "text": "arm: lost",
+        "remedy": "ended the run",
+        "t": time.time(),
+        "over": True,
+    }
+    changes |= {"question": None, "run": {**RUN, "state": "running", "attempt": 2}, "faults": [ended]}
+    screen.shows("state", "RUNNING")
+    screen.shows("run-text", "attempt 2")
+    assert "ended the run" not in page.inner_text("body")
+    screen.close()
+
+
+ENDS = [
+    ({"outcome": "placed", "figure": {"mm": 0.0213, "kind": "true"}}, "PLACED 0.02 mm", "true place error"),
+    ({"outcome": "placed", "figure": {"mm": 0.31, "kind": "stated"}}, "PLACED ± 0.31 mm", "reckoned, not measured"),
+    ({"outcome": "faulted", "figure": None}, "FAULT", "the arm was lost"),
+]
+
+
+def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser: Browser, console: Console) -> None:
+    changes: dict[str, object] = {}
+    screen = Screen.of(browser, console.link(), changes=changes)
+    page = screen.page
+    screen.hold()
+    asked: list[str] = []
+
+    def slow(route: Route) -> None:
+        asked.append(str(route.request.post_data))
+        page.wait_for_timeout(1000)
+        route.fulfill(status=409, json={"ok": False, "error": "LimitError", "text": "the battery is empty"})
+
+    page.route("**/api/do", slow)
+    shown = page.evaluate(
+        "() => { const b = document.getElementById('start'); b.click(); b.click();"
+        " const of = (id) => document.getElementById(id);"
+        " return [of('state').textContent, of('run-text').textContent, b.disabled, of('answer').hidden]; }"
+    )
+    # In the very task that the press was heard in: well below 200 ms.
+    assert shown == ["STARTING", "Starting job pot …", True, True]
+    screen.shows("answer", "the battery is empty")
+    assert len(asked) == 1
+    page.wait_for_selector("#start:enabled")
+    for last, word, sentence in ENDS:
+        changes["last"] = {"run": "x", "kind": "job", "reason": "the arm was lost", "t": 0.0, **last}
+        changes["safety"] = {"stopped": last["outcome"] == "faulted"}
+        screen.shows("state", word.replace("+", "."))
+        screen.shows("state-text", sentence)
+    page.unroute("**/api/do")
+    screen.close()
+
+
+def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(screen: Screen) -> None:
+    """Over the wire, headers and all; without it three.js alone had 1.3 MB."""
+    sizes = """() => ['navigation', 'resource'].flatMap((type) => performance.getEntriesByType(type))
+        .map((entry) => [new URL(entry.name).pathname, entry.transferSize])"""
+    screen.shows("world", "SIMULATED")
+    first = dict(screen.page.evaluate(sizes))
+    assert {"/api/cell", "/static/vendor/three.module.min.js", "/static/style.css"} <= set(first)
+    assert sum(first.values()) <= 500_000, first
+    screen.page.reload()
+    screen.shows("world", "SIMULATED")
+    again = dict(screen.page.evaluate(sizes))
+    assert again["/static/vendor/three.module.min.js"] < 1000
+    assert sum(again.values()) - again["/api/cell"] < 20_000, again
+    print(f"first load {sum(first.values())} bytes, next {sum(again.values())}")
+
+
+def test_an_error_is_told_in_a_sentence(screen: Screen) -> None:
+    answers = {
+        '{"ok": false, "error": "missing", "text": "there is no such run"}': "There is no such run.",
+        '{"detail": 1}': "The server refused this .404.. Load the page again.",
+    }
+    bodies = iter(answers)
+    screen.page.route("**/api/runs", lambda route: route.fulfill(status=404, body=next(bodies)))
+    for sentence in answers.values():
+        screen.page.click("#tab-runs")
+        screen.shows("answer", f"^{sentence}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import pytest
 
 from cell.console.desk import Desk
 from cell.console.facts import cell_facts, jobs
+from cell.console.look import _figure
 from cell.console.mailbox import MOST_CLOUDS, Mailbox
 from cell.console.questions import Questions
 from cell.console.run_view import RunView
@@ -125,6 +128,54 @@ def test_holding_is_offered_only_where_something_beside_the_program_would_stop_i
     assert facts["jobs"][0] == "pot"
 
 
+def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
+    cell: Cell, desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, slow = [], threading.Event()
+
+    def start(*_: object, **__: object) -> Run[Any]:
+        slow.wait(10)
+        raise RefusedError("the battery is empty")
+
+    monkeypatch.setattr(cell, "start", start)
+    monkeypatch.setattr(desk, "_say", lambda client, words: told.append((client, words)))
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    begun = time.monotonic()
+    assert desk.do("c1", {"do": "start", "job": "pot"})["text"] == "starting job pot …"
+    assert time.monotonic() - begun < 0.2
+    assert desk.starting == "job pot"
+    for again in ("start", "home", "calibrate"):
+        assert "is starting job pot" in str(refusal(desk, "c1", do=again))
+    slow.set()
+    assert until(lambda: desk.starting is None)
+    # What refuses it later is told to the page that asked.
+    assert told == [("c1", {"type": "answer", "ok": False, "text": "the battery is empty"})]
+    assert "battery" in str(refusal(desk, "c1", do="start"))
+
+
+@pytest.mark.parametrize(
+    ("report", "figure"),
+    [
+        ({"truth": {"error_mm": {"d": {"mean": 0.021}}}, "place_bound_95": {"d": 0.3}}, {"mm": 0.021, "kind": "true"}),
+        ({"place_bound_95": {"d": 0.3}}, {"mm": 0.3, "kind": "stated"}),
+        ({"place_bound_95": None}, None),
+    ],
+)
+def test_a_placed_job_ends_with_its_figure(tmp_path: Path, report: dict[str, Any], figure: object) -> None:
+    """The true error where a simulated world tells it, else the bound that was stated, said as such."""
+
+    def work(run: Run[Any]) -> None:
+        run.folder = tmp_path
+        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
+        (tmp_path / "report.json").write_text(json.dumps({"outcome": "placed", **report}))
+
+    run: Run[Any] = Run("job", work)
+    view = RunView(run, STEPS, "pot", {})
+    run.ended(5)
+    view.news()
+    assert _figure(view) == figure
+
+
 # --- decisions ---
 
 
@@ -205,6 +256,7 @@ def test_a_run_is_followed_by_its_own_events() -> None:
 
     def work(run: Run[Any]) -> None:
         seen.wait(10)
+        run.tell(Event("progress", "calibrate", {"fraction": 1.0, "text": "stored"}))
         run.tell(Event("step_started", "board_photo", {"attempt": 1}))
         run.tell(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
         run.tell(
@@ -223,9 +275,14 @@ def test_a_run_is_followed_by_its_own_events() -> None:
     assert begun.wait(5)
     view.news()
     told = view.as_dict()
+    # A first calibration stands before the steps, and has ended with the first of them.
+    assert [(step["name"], step["state"]) for step in told["steps"][:2]] == [
+        ("calibrate", "done"),
+        (STEPS[0], "active"),
+    ]
     assert (told["state"], told["step"], told["fraction"]) == ("asking", "board_photo", 0.5)
     assert told["left_s"] == pytest.approx(16.0, abs=1.0)
-    assert [step["state"] for step in told["steps"]] == ["active", "open", "open"]
+    assert [step["state"] for step in told["steps"][1:]] == ["active", "open", "open"]
     assert view.faults[0]["device"] == "arm"
     question = Questions().present(view)
     assert question is not None

@@ -11,6 +11,7 @@ import { Replay } from './replay.js';
 import { Runs } from './runs.js';
 import { CellScene } from './scene.js';
 import { Sequence } from './sequence.js';
+import { status } from './status.js';
 
 const link = new Link();
 let cell = null;
@@ -40,6 +41,8 @@ new Pictures(link);
 
 // A command of the holder; a refusal is shown in the cell's own words.
 async function ask(name, values) {
+  // What was said before has had its time.
+  if (name !== 'jog_step') show(byId('answer'), false);
   const answer = await link.do(name, values);
   if (!answer.ok || answer.rows || name !== 'jog_step') notice(answer);
   return answer;
@@ -100,22 +103,30 @@ function hold(state) {
 
 // --- what the server tells ---
 link.on('hello', () => meet(null));
-link.on('state', (state) => {
+link.on('state', (told) => {
   if (!cell) return;
+  const state = { ...told, starting: sequence.pending ?? told.starting };
   hold(state);
+  status(state);
   world(cell, state);
   devices(state);
   sequence.state(state, mine());
   jog.state(state, mine());
-  question.state(state.question ?? null, mine(), myName());
+  question.state(state, mine(), myName());
   if (!replay.on) live(state);
   const of = state.scene_of ?? state.run?.job ?? sceneOf;
   if (of !== sceneOf) meet(of);
 });
+link.on('answer', notice);
 link.on('freshness', ({ stale, age }) => {
   document.body.classList.toggle('stale', stale);
   show(byId('lost'), stale);
   const since = Number.isFinite(age) ? ` for ${(age / 1e3).toFixed(0)} s` : '';
+  if (stale) {
+    say(byId('state'), 'NO LINK');
+    byId('status').className = 'bad';
+    say(byId('state-text'), 'What is shown is old.');
+  }
   if (stale) say(byId('lost'), `NO CONNECTION to the cell${since}. What you see is old. STOP may not get through: use the emergency stop. ${link.refused}`);
 });
 link.on('cloud', ({ header, payload }) => {

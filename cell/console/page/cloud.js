@@ -1,6 +1,6 @@
 // The cloud that grows during a sweep, coloured by its distance from the nominal surface; and the legend of its colours.
 
-import * as THREE from './vendor/three.module.js';
+import * as THREE from './vendor/three.module.min.js';
 
 const MOST = 400000;
 const SCALE = [[0.13, 0.28, 0.75], [0.35, 0.7, 0.95], [0.92, 0.92, 0.88], [0.98, 0.65, 0.3], [0.75, 0.08, 0.12]];

@@ -13,7 +13,8 @@ export function devices(state) {
   entries.forEach(([name, device], k) => refresh(byId('device-list').children[k], name, device));
   // The newest one loudly for half a minute; then it stays in its device's row.
   const fault = faults.at(-1);
-  const fresh = fault !== undefined && state.t - fault.t < LOUD_S && !state.question;
+  const going = state.run !== null || Boolean(state.starting);
+  const fresh = fault !== undefined && state.t - fault.t < LOUD_S && !state.question && !(fault.over && going);
   show(byId('fault'), fresh);
   if (fresh) say(byId('fault'), told(fault));
   show(byId('stopped'), Boolean(state.safety?.stopped) && state.run === null);
@@ -31,7 +32,7 @@ function row([name, device, met]) {
     el('small', { className: 'link' }),
     ...(errors.length ? [el('small', { className: 'errors', textContent: errors.map(([what, count]) => `${count} ${words(what)}`).join(', ') })] : []),
     ...(device.fault ? [el('p', { className: 'fault', textContent: told(device.fault) })] : []),
-    ...(met && !device.fault ? [el('p', { className: 'met', title: told(met), textContent: `last: ${told(met)}` })] : []));
+    ...(met && !device.fault ? [el('p', { className: 'met', title: told(met), textContent: met.over ? `earlier run: ${met.text}` : `last: ${told(met)}` })] : []));
 }
 
 function refresh(item, name, device) {
@@ -43,6 +44,10 @@ function refresh(item, name, device) {
   const age = (device.age_s ?? 0) > OLD_S ? `${device.age_s.toFixed(1)} s old` : '';
   say(item.querySelector('.link'), [held, trip, age].filter(Boolean).join(' · '));
 }
+
+byId('device-details').onclick = ({ target }) => {
+  target.setAttribute('aria-pressed', String(byId('devices').classList.toggle('detailed')));
+};
 
 // Simulated or real, and which: always in sight.
 export function world(cell, state) {

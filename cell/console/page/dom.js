@@ -32,6 +32,8 @@ export function remake(node, key, make) {
 
 export const words = (name) => String(name ?? '').replaceAll('_', ' ');
 export const mm = (metres, digits = 1) => `${(1e3 * metres).toFixed(digits)} mm`;
+// An error in mm with the digits that count: 0.02, and 0.004.
+export const figure = (value) => value.toFixed(value < 0.0095 ? 3 : 2);
 export const deg = (radians, digits = 1) => `${(radians * 180 / Math.PI).toFixed(digits)}°`;
 
 export function seconds(value) {

@@ -3,6 +3,7 @@
 const STALE_MS = 500;
 const AGAIN_MS = 700;
 const ANSWER_MS = 1500;
+const SILENT = 'The server does not answer. Look whether `cell console` still runs.';
 
 // What authorises this tab: it came behind the # of the link, and is in no cookie.
 const [, entered] = location.hash.match(/^#key=([\w-]+)$/) ?? [];
@@ -100,9 +101,10 @@ export class Link extends EventTarget {
         keepalive: name === 'stop',
         signal: name === 'stop' ? AbortSignal.timeout(ANSWER_MS) : undefined,
       });
-      return { ...(await answer.json()), ok: answer.ok };
-    } catch (error) {
-      return { ok: false, error: 'no answer', text: `the server did not answer (${error.message})` };
+      const told = await answer.text();
+      return { ...(parsed(told) ?? { text: sentence(told, answer.status) }), ok: answer.ok };
+    } catch {
+      return { ok: false, error: 'no answer', text: SILENT };
     }
   }
 
@@ -117,9 +119,25 @@ export class Link extends EventTarget {
     return `${path}?ticket=${this.hello?.ticket ?? ''}`;
   }
 
+  // What the server has; throws an error whose message is a sentence for people.
   async get(path) {
-    const answer = await fetch(path, { headers: { 'X-Cell-Key': KEY } });
-    if (!answer.ok) throw new Error(`${path}: ${answer.status} ${(await answer.text()).slice(0, 300)}`);
+    const answer = await fetch(path, { headers: { 'X-Cell-Key': KEY } }).catch(() => { throw new Error(SILENT); });
+    if (!answer.ok) throw new Error(sentence(await answer.text(), answer.status));
     return answer;
   }
+}
+
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return null;
+  }
+}
+
+// What a refusal says, in its own words; never the JSON that holds them.
+function sentence(told, status) {
+  const text = parsed(told)?.text ?? (/^\s*[{<[]/.test(told) ? '' : told.trim().slice(0, 300));
+  const said = text || `The server refused this (${status}). Load the page again`;
+  return said.charAt(0).toUpperCase() + said.slice(1) + (/[.!?]$/.test(said) ? '' : '.');
 }

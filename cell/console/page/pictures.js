@@ -40,6 +40,7 @@ export class Pictures {
       canvas.width = bitmap.width;
       canvas.height = bitmap.height;
     }
+    canvas.parentElement.classList.remove('empty');
     const pen = canvas.getContext('2d');
     pen.drawImage(bitmap, 0, 0);
     bitmap.close();

@@ -38,14 +38,14 @@ export class Runs {
     box.scrollIntoView({ block: 'nearest' });
   }
 
-  detail(run, base, { report, pictures }) {
+  detail(run, base, { report, pictures, replay: replays }) {
     const steps = (report?.steps ?? []).map((step) => el('li', { className: step.state }, `${words(step.name)}: ${words(step.state)}`,
       el('small', { textContent: ` ${step.duration_s?.toFixed?.(1) ?? ''} s${step.retries ? ` · ${step.retries} retries` : ''}` })));
     const replay = el('button', { type: 'button', className: 'main', textContent: 'Replay in 3-D', onclick: () => this.link.tell('replay', { run, job: report?.job?.name ?? report?.job }) });
     return [
       el('h2', { textContent: run }),
       el('p', { className: `outcome ${report?.outcome}`, textContent: `${report?.outcome ?? 'going on'}${report?.reason ? `: ${report.reason}` : ''}` }),
-      el('div', { className: 'buttons' }, replay, el('a', { href: this.link.ticketed(`${base}/report.html`), target: '_blank', rel: 'noopener', textContent: 'Report' })),
+      el('div', { className: 'buttons' }, ...(replays ? [replay] : []), el('a', { href: this.link.ticketed(`${base}/report.html`), target: '_blank', rel: 'noopener', textContent: 'Report' })),
       el('ol', { className: 'plain' }, ...steps),
       ...(pictures ?? []).map((name) => el('img', { src: this.link.ticketed(`${base}/pictures/${encodeURIComponent(name)}`), alt: words(name), loading: 'lazy' })),
     ];

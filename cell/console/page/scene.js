@@ -1,6 +1,6 @@
 // The cell in 3-D: bodies as the planner has them, turned and shifted by what the devices read. Frames: docs/console.md.
 
-import * as THREE from './vendor/three.module.js';
+import * as THREE from './vendor/three.module.min.js';
 import { OrbitControls } from './vendor/OrbitControls.js';
 import { Cloud } from './cloud.js';
 

@@ -1,9 +1,12 @@
 // Where the sequence stands, and what begins, holds and ends it.
 
 import { byId, el, remake, say, seconds, show, words } from './dom.js';
+import { ended } from './status.js';
 
 const SIGNS = { open: '○', active: '▶', done: '✓', failed: '✗', resumed: '↺' };
 const MOST_EVENTS = 100;
+// How long after an answer a button stays shut, until the state tells of what was begun.
+const SEEN_MS = 400;
 
 export class Sequence {
   constructor(link, ask) {
@@ -27,15 +30,25 @@ export class Sequence {
     link.on('hello', () => byId('events').replaceChildren());
   }
 
+  // Begin something: said at once, and not twice, however long the answer takes.
+  async start(name, values, what) {
+    if (this.pending) return;
+    this.pending = what;
+    this.link.tell('state', this.link.state);
+    await this.ask(name, values);
+    setTimeout(() => { this.pending = null; }, SEEN_MS);
+  }
+
   begin() {
     const values = { job: byId('job').value };
     if (byId('at-start').checked) values.at_start = true;
     if (byId('until').value) values.until = byId('until').value;
-    this.ask('start', values);
+    this.start('start', values, `job ${values.job}`);
   }
 
   work(name) {
-    this.ask(name, ['calibrate', 'verify'].includes(name) ? { job: byId('job').value } : {});
+    if (name === 'diag') this.ask(name);
+    else this.start(name, name === 'home' ? {} : { job: byId('job').value }, { home: 'homing', calibrate: 'calibration', verify: 'verification' }[name]);
   }
 
   // The cell that is shown has changed.
@@ -45,11 +58,11 @@ export class Sequence {
     byId('until').replaceChildren(el('option', { value: '', textContent: 'the end' }), ...until);
   }
 
-  state({ run, last, pace, dry_run: dry }, mine) {
+  state({ run, last, pace, starting, dry_run: dry }, mine) {
     const paused = run !== null && ['pausing', 'paused'].includes(run.state);
     say(byId('run-title'), run ? `${words(run.kind)} ${run.job ?? ''}`.trim() + this.mood(run) : 'No run');
-    say(byId('run-text'), run ? this.now(run) : this.ended(last));
-    byId('run-text').className = !run && last ? `outcome ${last.outcome}` : 'quiet';
+    say(byId('run-text'), run ? this.now(run) : starting ? `Starting ${starting} …` : ended(last));
+    byId('run-text').className = !run && !starting && last ? `outcome ${last.outcome}` : 'quiet';
     byId('run-fraction').value = run?.fraction ?? 0;
     say(byId('run-left'), this.time(run));
     show(byId('run-left').parentElement, run !== null);
@@ -64,7 +77,7 @@ export class Sequence {
       byId('pace').value = Math.round(100 * pace);
       say(byId('pace-said'), `${Math.round(100 * pace)} %`);
     }
-    byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine; });
+    byId('start-form').querySelectorAll('button, select, input').forEach((control) => { control.disabled = !mine || Boolean(starting); });
     if (dry?.state === 'running') byId('dry-run').disabled = true;
     this.dry(dry ?? null);
   }
@@ -76,11 +89,6 @@ export class Sequence {
   now(run) {
     const again = run.attempt > 1 ? ` (attempt ${run.attempt})` : '';
     return run.step ? `${words(run.step)}${again}: ${run.text || '…'}` : run.text || 'begins …';
-  }
-
-  ended(last) {
-    if (!last) return 'Nothing is going on.';
-    return `Last ${words(last.kind)}: ${last.outcome}${last.reason ? `. ${last.reason}` : ''}`;
   }
 
   time(run) {
