@@ -76,6 +76,7 @@ class Desk:
             "calibrate": lambda client, words: self._long("calibration", lambda: cell.calibrate(job=self._job(words))),
             "verify": lambda client, words: self._long("verification", lambda: cell.verify(job=self._job(words))),
             "home": self._home,
+            "recover": self._recover,
             "diag": lambda client, words: self._diag(),
             "manual": self._manual,
             "jog_step": self._jog_step,
@@ -186,6 +187,10 @@ class Desk:
     def _home(self, client: str, words: Words) -> str:
         device = words.get("device")
         return self._long("homing", lambda: self.cell.home(None if device is None else str(device)))
+
+    def _recover(self, client: str, words: Words) -> str:
+        by = _text(words, "by", self.holders.name(client))
+        return self._long("recovery", lambda: self.cell.recover(by))
 
     def _long(self, what: str, work: Callable[[], object]) -> str:
         """Begin work that lasts, and give what refuses it at once."""
