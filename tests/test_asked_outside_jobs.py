@@ -175,3 +175,14 @@ def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(ce
     simulated(cell).fault("arm.emergency_stop")
     with pytest.raises(DeviceFault, match="emergency stop"):
         cell.recover("Ann")
+
+
+def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(cell: Cell) -> None:
+    """Connected in remote control: what was asked there holds for no later motion."""
+    simulated(cell).devices.vehicle.brake()
+    cell.home("arm")
+    simulated(cell).fault("arm.local_control")
+    with pytest.raises(DeviceFault, match="in local control") as caught:
+        cell.perform("homing", lambda hands: cell.mover(None, hands.safe_point).to_joints(away(cell)))
+    assert caught.value.code == "arm.local_control"
+    assert np.abs(simulated(cell).arm.model.drive.q - HOME).max() < 1e-3

@@ -122,8 +122,6 @@ def recover(
     import sys
 
     from cell.cli import EXIT_FAILED
-    from cell.cli.display import tell_question
-    from cell.supervisor import HOMED, Cell
     from drivers.errors import ConfigError
 
     if by is None:
@@ -131,6 +129,9 @@ def recover(
             raise ConfigError("a person has to look at the cell first: say who has, with --by NAME")
         if not typer.confirm("Have you looked at the cell, and is the way of the arm clear?"):
             raise typer.Exit(EXIT_FAILED)
+    from cell.cli.display import tell_question
+    from cell.supervisor import HOMED, Cell
+
     with Cell.open(config, sim=sim, seed=seed, level=level.value, only=HOMED["arm"]) as cell:
         cell.recover(by or getpass.getuser(), tell_question)
     typer.echo("recovered: arm and vehicle can move again")

@@ -20,7 +20,8 @@ class Setup:
 
     `payload` is mass in kg and centre of gravity in the flange frame in m. The controller ends its program when it
     hears nothing for `watchdog` seconds on the wall. `braking` is the deceleration of a stop in rad/s². Without
-    `control` the arm is only looked at: nothing is set, started or ended.
+    `control` the arm is only looked at: nothing is set, started or ended. `model` is the name that the controller has
+    to tell, any where it is empty.
     """
 
     address: str
@@ -30,6 +31,7 @@ class Setup:
     watchdog: float
     braking: float
     control: bool = True
+    model: str = ""
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,9 @@ class UrArm:
     it from the table that the controller tells, None where it tells none. Here and before every motion it has to agree
     with what the arm reports within 0.05 mm and 0.1 mrad, else `DeviceFault` (arm.wrong_kinematics).
 
+    `model`, where it is given, is what the dashboard has to call the arm, else `DeviceFault` (arm.wrong_model). Before
+    every motion the dashboard is asked whether the arm is in remote control (arm.local_control).
+
     With `control=False` the arm is only looked at: nothing on it is started, set or ended, by `close` neither, and a
     program that runs on it runs on. Everything but reading is then an `InterlockError`.
     """
@@ -80,6 +83,7 @@ class UrArm:
         forward: Forward | None = None,
         forward_of: Callable[[LinkTable | None], Forward] | None = None,
         control: bool = True,
+        model: str = "",
         clock: Clock,
     ) -> None:
         self.name = name
@@ -96,6 +100,7 @@ class UrArm:
             _WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
             check_positive(name, "braking", braking, 20.0, "rad/s^2"),
             control,
+            model,
         )
         self.factory = read_factory_kinematics(address, min(connect_timeout, _TOLD_S))
         if forward_of is not None:
@@ -289,6 +294,7 @@ class UrArm:
     def _start(self, what: str, name: str, *arguments: Any) -> UrMotion:
         self._session.require_control()
         with self._starting:
+            self._session.require_remote()
             self._session.require_ready()
             if self._motion is not None and not self._motion.done:
                 raise InterlockError(
