@@ -34,6 +34,7 @@ from cell.opening import open_devices
 from cell.run.folder import find_run
 from cell.run.job_run import Observer, RunOutcome
 from cell.run.job_work import JobWork
+from cell.run.lateness import LATENESS
 from cell.run.maintenance import recorded_maintenance
 from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import Hands
@@ -82,6 +83,9 @@ class Cell:
             self.whereabouts.say_at_start()
         self._runs = Runs(config.cell.name)
         self._signals = EndSignals()
+        self._fed = simulated is None or simulated.facts.get("clock") != "virtual"
+        if self._fed:
+            LATENESS.begin()
 
     @classmethod
     def open(
@@ -252,6 +256,8 @@ class Cell:
         with SignalWatch() as signals:
             if not self._runs.close():
                 return
+            if self._fed:
+                LATENESS.end()
             try:
                 self._runs.end()
                 problems = self.devices.stop() + self.devices.close()

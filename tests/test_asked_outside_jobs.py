@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 
 from cell import Cell
+from cell.calibration import sessions
+from cell.cli import main
 from cell.console.desk import Desk
+from cell.console.run_view import RunView
 from cell.devices.direct import VirtualCell
 from cell.devices.jogging import Jog, jog
 from cell.run.run import Run
 from cell.steps.moves import HOME
-from drivers.errors import Aborted, CellError, DeviceFault, InterlockError
+from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
 from tests.console.server import until
 
@@ -186,3 +189,25 @@ def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(ce
         cell.perform("homing", lambda hands: cell.mover(None, hands.safe_point).to_joints(away(cell)))
     assert caught.value.code == "arm.local_control"
     assert np.abs(simulated(cell).arm.model.drive.q - HOME).max() < 1e-3
+
+
+def test_a_job_whose_first_calibration_fails_ends_as_any_run(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise RefusedError("3 of 20 calibration views show the board")
+
+    monkeypatch.setattr(sessions, "collect_scan", refuse)
+    run = cell.start("pot")
+    assert run.result(60.0).exit_code == 1
+    view = RunView(run, (), "pot", {})
+    view.news()
+    assert view.ended is not None and (view.ended["kind"], view.ended["outcome"]) == ("job", "refused")
+    cell.close()
+    monkeypatch.setattr("sys.argv", ["cell", "dry-run", "--clock", "virtual", "--seed", "3"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = " ".join(capsys.readouterr().out.split())
+    assert (ended.value.code, said.split()[0]) == (1, "refused")
+    assert "in the calibration before the job: 3 of 20 calibration views show the board" in said
+    assert "put that right, then cell dry-run -j pot" in said

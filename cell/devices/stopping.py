@@ -52,7 +52,8 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
     if "arm" not in devices:
         return
     try:
-        safety = devices.arm.state().safety
+        state = devices.arm.state()
+        safety = state.safety
     except DeviceError as error:
         # A link that is lost, or closed to be recovered: the next command to the arm finds that.
         if isinstance(error, DeadlineError) or getattr(error, "code", "") == "arm.link_lost":
@@ -62,7 +63,7 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
         raise DeviceFault(
             "arm",
             f"arm.{safety.name.lower()}",
-            f"the arm is in {safety.value}",
+            ": ".join(filter(None, (f"the arm is in {safety.value}", state.reason))),
             recoverable=safety is ArmSafety.PROTECTIVE_STOP,
             hint="Look for the reason and clear the way.",
         )

@@ -6,12 +6,28 @@ from dataclasses import replace
 
 from cell.devices.devices import Devices
 from cell.devices.following import Following
-from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError, DeviceError, DeviceFault, RefusedError
+from cell.run.lateness import LATENESS, MOST_S
+from drivers.errors import (
+    Aborted,
+    CalibrationStale,
+    CellError,
+    ConfigError,
+    DeadlineError,
+    DeviceError,
+    DeviceFault,
+    NotConnectedError,
+    RefusedError,
+)
 from statemachine.cancel import CancelToken
 from statemachine.policy import Failure, Outcome
 
 CONFIRMED_BY_A_PERSON = frozenset(("arm.protective_stop",))
 """Faults that no program may clear by itself: the maker asks that a person looks at the arm first."""
+
+
+UNHEARD = frozenset(("arm.link_lost", "arm.program_stopped"))
+"""Faults of a device that was not heard, or did not hear, in time."""
+BUSY = "this computer is too busy"
 
 
 def classify(error: BaseException, following: Following | None = None) -> Failure:
@@ -22,6 +38,9 @@ def classify(error: BaseException, following: Following | None = None) -> Failur
     failure = _classify(error)
     if notes := getattr(error, "__notes__", ()):
         failure = replace(failure, reason="; ".join([failure.reason, *notes]))
+    unheard = isinstance(error, DeadlineError | NotConnectedError) or failure.code in UNHEARD
+    if unheard and (late := LATENESS.worst) > MOST_S and BUSY not in failure.reason:
+        failure = replace(failure, reason=f"{failure.reason} {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late.")
     if not failure.needs_person or following is None:
         return failure
     names = ", ".join(following.simulated)

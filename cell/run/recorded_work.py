@@ -104,7 +104,7 @@ class RecordedWork:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)
         except BaseException as error:
-            ended, outcome, reason = error, _outcome(error), str(error)
+            ended, outcome, reason = error, outcome_of(error), str(error)
             raise
         finally:
             if self.run.kind == self.kind:
@@ -229,7 +229,8 @@ def _last(action: Callable[[], object], ended: BaseException | None) -> None:
             ended.add_note(f"and the end could not be recorded: {error}")
 
 
-def _outcome(error: BaseException) -> str:
+def outcome_of(error: BaseException) -> str:
+    """How a run ended that this error ended, in the report's word."""
     if isinstance(error, Aborted):
         return "aborted"
     return "refused" if isinstance(error, RefusedError) else "faulted"

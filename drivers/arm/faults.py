@@ -63,9 +63,21 @@ _STATUS = (
 """What words of the dashboard server's safety status mean."""
 
 
+LATE_S = 0.01
+"""By how much what an arm is told may come late before that is named as the reason of a stop: five of its cycles."""
+_BUSY = "this computer is too busy"
+
+
+def late_words(seconds: float) -> str:
+    """Why an arm stopped that was told its points so much late; empty for one that was told them in time."""
+    return f"points came {1e3 * seconds:.0f} ms late: {_BUSY}" if seconds >= LATE_S else ""
+
+
 def fault(device: str, code: str, text: str = "") -> DeviceFault:
     """The `DeviceFault` for a code of the child process, with its text added."""
     what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
+    if _BUSY in text:
+        hint = hint.replace("Look for what it ran into and clear the way", "End what else computes here, see the arm")
     return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 

@@ -65,7 +65,8 @@ class Snapshot:
     the controller's own clock.
 
     `safety_bits`, `mode` and `runtime`, the state of the program, as the controller reports them; `wrench` at the
-    flange in base axes; `payload` is what the controller reckons with, kg and centre of gravity in the flange in m.
+    flange in base axes; `late` by how many s at most what the arm was told came late, before it stopped for safety;
+    `payload` is what the controller reckons with, kg and centre of gravity in the flange in m.
     """
 
     stamp: float
@@ -79,6 +80,7 @@ class Snapshot:
     inputs: int
     outputs: int
     device_time: float = 0.0
+    late: float = 0.0
     payload: tuple[float, Six] = (0.0, (0.0, 0.0, 0.0))
 
     @property

@@ -21,6 +21,7 @@ from drivers.arm import health
 from drivers.arm.clock_latch import latch_clock
 from drivers.arm.dashboard import unknown
 from drivers.arm.factory import read_factory_kinematics
+from drivers.arm.faults import late_words
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
@@ -170,13 +171,15 @@ class UrArm:
         return latch_clock(self.name, self._session.setup.address, self._clock, self.statistics.traffic)
 
     def _state(self, snapshot: Snapshot) -> ArmState:
+        safety = _SAFETY[safety_code(snapshot.safety_bits)]
         return ArmState(
             stamp=self._clock.now() - self._feed.age(snapshot),
             joints=np.array(snapshot.joints),
             joint_speeds=np.array(snapshot.speeds),
             flange=np.array(snapshot.flange),
             wrench=np.array(snapshot.wrench),
-            safety=_SAFETY[safety_code(snapshot.safety_bits)],
+            safety=safety,
+            reason=late_words(snapshot.late) if safety is ArmSafety.PROTECTIVE_STOP else "",
             moving=not snapshot.at_rest,
             digital_inputs=snapshot.inputs,
             digital_outputs=snapshot.outputs,

@@ -52,6 +52,11 @@ class ControlThread:
         self.finished = threading.Event()
         threading.Thread(target=self._run, name="arm control", daemon=True).start()
 
+    @property
+    def late(self) -> float:
+        """See `ControlProgram.late`."""
+        return self._program.late
+
     def submit(self, request: Request) -> None:
         """Queue a request. A stop drops what waits and ends what runs."""
         if request.name in ("stop", "close"):
@@ -71,6 +76,8 @@ class ControlThread:
     def _run(self) -> None:
         while not self.finished.is_set():
             request: Request | None
+            # Whatever the last one took: from here on it has to be in time.
+            self._program.awake(math.inf)
             try:
                 request = self._requests.get(timeout=KICK_S)
             except queue.Empty:
@@ -155,6 +162,7 @@ class ControlThread:
     def _watch(self, before: int) -> End | None:
         """Until the controller reports the end of the operation after `before`: None, or why it ended early."""
         begun = time.monotonic()
+        self._program.awake(math.inf)
         while True:
             if self._program.to_stop.is_set():
                 return self._program.brake() or ("stopped", "")

@@ -82,6 +82,7 @@ class DirectArm:
             digital_outputs=model.digital_outputs,
             device_time=self.clock.now(),
             controlled=model.power is Power.RUNNING,
+            reason=model.fault_text,
         )
 
     @contextmanager

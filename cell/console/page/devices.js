@@ -21,6 +21,8 @@ export function devices(state) {
   const ill = state.run === null ? entries.map(([, device]) => device.fault).find((met) => CLEARED.test(met?.code)) : null;
   show(byId('unlock'), Boolean(ill));
   if (ill) say(byId('unlock').firstElementChild, `${ill.text}. Nothing clears it by itself. `);
+  show(byId('busy'), Boolean(state.busy) && state.run === null);
+  say(byId('busy'), state.busy ?? '');
   show(byId('stopped'), Boolean(state.safety?.stopped) && state.run === null);
 }
 
