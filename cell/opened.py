@@ -90,7 +90,7 @@ class Opened:
         self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
     ) -> Made:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
-        health = require_no_emergency_stop if kind == "jog" else require_healthy
+        health = require_no_emergency_stop if kind in ("jog", "recovery") else require_healthy
         facts = {**self.facts, **(info or {})}
         recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health, self.config)
         return recorded.perform(work)

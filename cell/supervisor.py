@@ -24,7 +24,7 @@ from cell.calibration.verify.verdict import Verification
 from cell.config import DEVICES, CellConfig, Confirm
 from cell.devices.devices import Devices
 from cell.devices.injection import Injector
-from cell.devices.jogging import begin_program
+from cell.devices.jogging import arm_is_ready, begin_program
 from cell.devices.mix import Sim
 from cell.devices.simulated import Simulation, is_whole
 from cell.devices.stopping import stop_cell
@@ -34,6 +34,7 @@ from cell.opening import open_devices
 from cell.run.folder import find_run
 from cell.run.job_run import Observer, RunOutcome
 from cell.run.job_work import JobWork
+from cell.run.lateness import LATENESS
 from cell.run.maintenance import recorded_maintenance
 from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import Hands
@@ -82,6 +83,9 @@ class Cell:
             self.whereabouts.say_at_start()
         self._runs = Runs(config.cell.name)
         self._signals = EndSignals()
+        self._fed = simulated is None or simulated.facts.get("clock") != "virtual"
+        if self._fed:
+            LATENESS.begin()
 
     @classmethod
     def open(
@@ -252,6 +256,8 @@ class Cell:
         with SignalWatch() as signals:
             if not self._runs.close():
                 return
+            if self._fed:
+                LATENESS.end()
             try:
                 self._runs.end()
                 problems = self.devices.stop() + self.devices.close()
@@ -433,7 +439,24 @@ class Cell:
             "timing", lambda run: sessions.time_stamps(self._here, run, calibration, loaded), observer, stops
         ).result()
 
-    def home(self, device: str | None = None) -> None:
+    def recover(self, by: str, observer: Observer | None = None) -> None:
+        """A person, `by` name, has looked at the cell: unlock the arm's protective stop, connect a lost link, clear the
+        vehicle's fault. Nothing moves. `ConfigError` when nobody is named; `DeviceFault` for what only the pendant or
+        the emergency stop's button clears.
+        """
+        if not by.strip():
+            raise ConfigError("recover needs the name of the person who has looked at the cell")
+
+        def work(hands: Hands) -> None:
+            arm, vehicle = self.devices.arm, self.devices.vehicle
+            if not arm_is_ready(arm):
+                arm.recover(confirmed=True)
+            if vehicle.state().trouble:
+                vehicle.recover()
+
+        self.perform("recovery", work, observer, {"by": by})
+
+    def home(self, device: str | None = None, observer: Observer | None = None) -> None:
         """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
         stops = self.stops
         if device not in (None, *HOMED):
@@ -447,4 +470,4 @@ class Cell:
                 begin_program(self.devices.arm)
                 self.mover(None, hands.safe_point).to_joints(HOME)
 
-        self.perform("homing", work, stops=stops)
+        self.perform("homing", work, observer, stops=stops)

@@ -12,7 +12,7 @@ __all__ = [
     "VEHICLE_FAULTS",
 ]  # fmt: skip
 
-ARM_FAULTS = ("arm.protective_stop", "arm.safeguard_stop", "arm.emergency_stop")
+ARM_FAULTS = ("arm.protective_stop", "arm.safeguard_stop", "arm.emergency_stop", "arm.local_control")
 TARGET_CAMERA_FAULTS = tuple(f"target_{name}" for name in CAMERA_FAULTS)
 """Those of the target camera; a name that says only `camera.` is the scan camera's."""
 

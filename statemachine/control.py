@@ -145,6 +145,12 @@ class RunControl:
             self._question += 1
             return self._question
 
+    @property
+    def question(self) -> tuple[int, str] | None:
+        """What the run waits for a person's word about, and the number of that question; None when it does not."""
+        with self._change:
+            return None if self._wanted is None else (self._question, self._wanted)
+
     def answer(self) -> str | None:
         """Who has confirmed since `ask`, or None."""
         return self._confirmed

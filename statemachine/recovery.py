@@ -1,18 +1,54 @@
-"""Clearing a fault while the cell stands, once a person has confirmed it where that is needed."""
+"""Doing a step until it succeeds: repeating it, and clearing faults meanwhile, confirmed by a person where needed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 
+from statemachine.attempts import Attempts
 from statemachine.cancel import CancelToken
-from statemachine.policy import Failure, Outcome, Step
+from statemachine.policy import Failure, OnFailure, Outcome, Step
 from statemachine.sequence import Sequence, Trigger
 from statemachine.standing import await_word
 from statemachine.watchman import Watchman
 
 Recover = Callable[[BaseException, CancelToken, bool], None]
 """Clears the fault behind an exception, begins nothing once the token is cancelled; told whether a person confirmed."""
+
+
+def performed(
+    step: Step,
+    attempts: Attempts,
+    recover: Recover | None,
+    sequence: Sequence,
+    watchman: Watchman,
+    hold: Callable[[], Failure | None] = lambda: None,
+) -> Failure | None:
+    """Do one step, with its repetitions; None when it has succeeded. `hold()` waits while the run is paused."""
+    attempt = 1
+    while (end := attempts.attempt(step, attempt)) is not None:
+        left = step.max_retries + 1 - attempt
+        error = watchman.error
+        if left == 0 or error is None or watchman.abandoned or end.outcome is Outcome.ABORTED:
+            return end
+        sequence.facts.retries_left = left
+        sequence.facts.recoverable = end.recoverable
+        if step.retries(error):
+            if (unsafe := watchman.halt_before(f"before {step.name} is tried again", end)) is not None:
+                return unsafe
+            watchman.teller.failed(step.name, attempt, end, "tried again")
+            sequence.fire(Trigger.RETRY)
+        elif end.recoverable and step.on_failure is OnFailure.RECOVER and recover is not None:
+            failed, by = recovered(step, end, error, recover, sequence, watchman)
+            if failed is not None:
+                return failed
+            watchman.teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
+        else:
+            return end
+        if (asked := hold()) is not None:
+            return asked
+        attempt += 1
+    return None
 
 
 def recovered(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from statemachine.attempts import Attempts
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
-from statemachine.recovery import Recover, recovered
+from statemachine.policy import Failure, Outcome, Policy, Step
+from statemachine.recovery import Recover, performed
 from statemachine.script import NO_SCRIPT, Again, Script
 from statemachine.scripting import Scripting
 from statemachine.sequence import Sequence, SequenceError, Trigger
@@ -141,30 +141,7 @@ class Runner:
 
     def _perform(self, step: Step) -> Failure | None:
         """Do one step, with its repetitions; None when it has succeeded."""
-        attempt = 1
-        while (end := self._attempts.attempt(step, attempt)) is not None:
-            left = step.max_retries + 1 - attempt
-            error = self._watchman.error
-            if left == 0 or error is None or self._watchman.abandoned or end.outcome is Outcome.ABORTED:
-                return end
-            self.sequence.facts.retries_left = left
-            self.sequence.facts.recoverable = end.recoverable
-            if step.retries(error):
-                if (unsafe := self._watchman.halt_before(f"before {step.name} is tried again", end)) is not None:
-                    return unsafe
-                self._teller.failed(step.name, attempt, end, "tried again")
-                self.sequence.fire(Trigger.RETRY)
-            elif end.recoverable and step.on_failure is OnFailure.RECOVER and self.recover is not None:
-                failed, by = recovered(step, end, error, self.recover, self.sequence, self._watchman)
-                if failed is not None:
-                    return failed
-                self._teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
-            else:
-                return end
-            if (asked := self._hold()) is not None:
-                return asked
-            attempt += 1
-        return None
+        return performed(step, self._attempts, self.recover, self.sequence, self._watchman, self._hold)
 
     # --- the end ---
 

@@ -24,9 +24,9 @@ from cell.job import Job, load_job
 from cell.lab.bench.whole_job import JobRecord
 from cell.report.report import make_report
 from cell.report.truth import Witness, pose_of
+from cell.run.faults import classify
 from cell.run.folder import new_run
 from cell.run.frames import FrameStore
-from cell.run.job_run import classify
 from cell.run.resumption import job_source
 from cell.steps.kinds import PLACE
 from cell.steps.whereabouts import Whereabouts

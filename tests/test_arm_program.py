@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import drivers.arm.ur_program as program
-from cell.run.job_run import classify
+from cell.run.faults import classify
 from drivers.arm.messages import Setup, Snapshot
 from drivers.arm.ur_program import ControlProgram, joints_off
 from drivers.errors import (

@@ -12,7 +12,7 @@ import pytest
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.devices.stopping import stop_cell
-from cell.run.job_run import classify
+from cell.run.faults import classify
 from cell.steps.moves import HOME
 from drivers.clock import Clock
 from drivers.errors import Aborted

@@ -109,7 +109,8 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         made = with_edge(config, devices, hands.keep, made)
         return replace(observations, witness=made.scan.witness), made
 
-    observations, calibration = cell.recorded(run, "calibration", work)
+    info = {"for_job": str(job)} if run.kind == "job" else None
+    observations, calibration = cell.recorded(run, "calibration", work, info)
     save_with_observations(calibration, observations, cell.calibrations_folder)
     tell(1.0, "stored")
     return calibration

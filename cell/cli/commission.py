@@ -62,6 +62,7 @@ def commission(
     """
     from rich.console import Console
 
+    from cell.cli.display import tell_question
     from cell.commission.begin import begin, confirms_itself
     from cell.commission.protocol import write_protocol
     from cell.commission.sequence import CHECKS, chosen
@@ -86,6 +87,7 @@ def commission(
         _Page(console, CHECKS),
         **options,
     )
+    made.desk.heard = tell_question
     if show:
         _list(made, checks, json)
         return

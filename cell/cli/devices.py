@@ -31,6 +31,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command(context_settings={"ignore_unknown_options": True})(jog)
     app.command()(home)
+    app.command()(recover)
     app.command()(diag)
     app.command()(find)
     app.command()(devices)
@@ -60,6 +61,7 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
+    from cell.cli.display import tell_question
     from cell.devices.jogging import jog as perform
     from cell.devices.jogging import needed_for, parse_jog
     from cell.supervisor import Cell
@@ -75,7 +77,7 @@ def jog(
         Cell.open(config, sim=sim, seed=seed, level=level.value, job=job, only=needed_for(wish, lifted)) as cell,
         cell.maintenance(reason, lifted) if lifted else nullcontext(),
     ):
-        result = perform(cell, wish, job)
+        result = perform(cell, wish, job, tell_question)
     if json:
         print_json(result)
     else:
@@ -92,6 +94,7 @@ def home(
     level: LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
+    from cell.cli.display import tell_question
     from cell.config import DEVICES
     from cell.supervisor import HOMED, Cell
     from drivers.errors import ConfigError
@@ -100,8 +103,38 @@ def home(
         raise ConfigError(f"cannot home {device!r}; write `cell home`, or {' or '.join(HOMED)} behind it")
     needed = tuple(DEVICES) if device is None else HOMED[device]
     with Cell.open(config, sim=sim, seed=seed, level=level.value, only=needed) as cell:
-        cell.home(device)
+        cell.home(device, tell_question)
     typer.echo({"rail": "rail homed", "arm": "arm folded"}.get(device or "", "rail homed, arm folded"))
+
+
+def recover(
+    by: Annotated[str | None, typer.Option(help="Who has looked; without it, a terminal asks.")] = None,
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+) -> None:
+    """Clear a fault while nothing runs: unlock the arm's protective stop, clear the vehicle's fault. Nothing moves.
+
+    You decide, not a program: look at the cell first.
+    """
+    import getpass
+    import sys
+
+    from cell.cli import EXIT_FAILED
+    from drivers.errors import ConfigError
+
+    if by is None:
+        if not sys.stdin.isatty():
+            raise ConfigError("a person has to look at the cell first: say who has, with --by NAME")
+        if not typer.confirm("Have you looked at the cell, and is the way of the arm clear?"):
+            raise typer.Exit(EXIT_FAILED)
+    from cell.cli.display import tell_question
+    from cell.supervisor import HOMED, Cell
+
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, only=HOMED["arm"]) as cell:
+        cell.recover(by or getpass.getuser(), tell_question)
+    typer.echo("recovered: arm and vehicle can move again")
 
 
 def diag(

@@ -22,6 +22,19 @@ SAID = ("note", "paused", "going_on")
 COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 
 
+def tell_question(event: Event, console: Console | None = None) -> None:
+    """An observer that says what a person is asked, and how it is answered; without a console on standard error."""
+    console = console or Console(stderr=True)
+    if event.kind == "confirm_needed":
+        number = event.data["number"]
+        said = f"waiting for a person, question {number}: {event.data['reason']}"
+        console.print(said, style="bold yellow", markup=False)
+        answer = f"cell confirm --question {number} (or cell abort)"
+        console.print(f"when that is done, in another shell here: {answer}", markup=False)
+    elif event.kind == "confirmed":
+        console.print(f"confirmed by {event.data['by']}", markup=False)
+
+
 class ProgressDisplay:
     """Bars for the steps, a row each; an observer for `Cell.run` and `Cell.calibrate`. Writes to standard error."""
 
@@ -51,14 +64,8 @@ class ProgressDisplay:
         step = event.step
         if event.kind in SAID and "text" in event.data:
             self.console.print(str(event.data["text"]), markup=False)
-        elif event.kind == "confirm_needed":
-            number = event.data["number"]
-            said = f"waiting for a person, question {number}: {event.data['reason']}"
-            self.console.print(said, style="bold yellow", markup=False)
-            answer = f"cell confirm --question {number} (or cell abort)"
-            self.console.print(f"when that is done, in another shell here: {answer}", markup=False)
-        elif event.kind == "confirmed":
-            self.console.print(f"confirmed by {event.data['by']}", markup=False)
+        elif event.kind in ("confirm_needed", "confirmed"):
+            tell_question(event, self.console)
         elif step is None:
             return
         elif event.kind == "step_started":

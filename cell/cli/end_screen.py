@@ -41,6 +41,8 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
     again = "cell dry-run" if report.get("simulated") is True else "cell run"
+    if job := report.get("for_job"):
+        return f"cell diag: the state of every device; put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
         if outcome == "done":
             return "cell calibrate verify: how good it is" if kind == "calibration" else None

@@ -21,7 +21,7 @@ def _calibrate(desk: Desk, result: Result) -> None:
         calibration = desk.cell.calibration()
         result.notes.append("a calibration of this cell as it is configured was stored already")
     except CalibrationStale:
-        calibration = desk.cell.calibrate(job=desk.job_file)
+        calibration = desk.cell.calibrate(desk.heard, desk.job_file)
     summary = calibration.summary()
     result.notes.append(f"stored as {calibration.name} in {desk.cell.calibrations_folder.name}/")
     scan, target = desk.config.scan_camera.flange_from_camera.se3(), desk.config.target_camera.flange_from_camera.se3()
@@ -37,7 +37,7 @@ def _calibrate(desk: Desk, result: Result) -> None:
 
 
 def _verify(desk: Desk, result: Result) -> None:
-    verification = desk.cell.verify(job=desk.job_file)
+    verification = desk.cell.verify(desk.heard, desk.job_file)
     summary = verification.summary()
     for row in summary["figures"]:
         result.measure(f"{row['name']} (1 sigma {row['sigma']:.4f})", row["value"], row["unit"])
@@ -59,7 +59,7 @@ def _job(part: bool, desk: Desk, result: Result) -> None:
     ):
         raise RefusedError("the job was not begun")
     known = cell.whereabouts.anchored
-    outcome = cell.run(desk.job_file, at_start=not known, until=None if part else BEFORE_PLACING)
+    outcome = cell.run(desk.job_file, desk.heard, at_start=not known, until=None if part else BEFORE_PLACING)
     result.notes.append(f"run {outcome.folder.name}: {outcome.outcome}, {outcome.reason}")
     for row in outcome.report.get("measured") or ():
         if isinstance(row.get("value"), int | float):

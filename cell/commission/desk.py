@@ -27,6 +27,7 @@ from cell.run.recorded_work import Hands
 from cell.steps.moves import HOME, Mover
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Frame, Image
+from statemachine.step import Observer
 
 if TYPE_CHECKING:
     from cell.config import CellConfig
@@ -79,6 +80,8 @@ class Desk:
     job_file: str
     simulated: bool
     hands: Hands | None = None
+    heard: Observer | None = None
+    """Is told what goes on in a check, such as a question to a person."""
     last_views: dict[str, pin.SE3] = field(default_factory=dict)
     """base_from_flange at which each camera saw its board last."""
     _cell: Cell | None = None

@@ -114,9 +114,11 @@ class Commissioning:
         name: list[str] = []
 
         def work(hands: Hands) -> None:
+            # Done again after a fault that a person has confirmed: without what was noted before it.
+            vars(result).update(vars(Result()))
             current = desk.cell.current
             if current is not None and current.folder is not None:
-                name.append(current.folder.name)
+                name[:] = [current.folder.name]
             desk.hands = hands
             try:
                 check.work(desk, result)
@@ -124,7 +126,7 @@ class Commissioning:
                 desk.hands = None
 
         try:
-            desk.cell.perform("commission", work, info={"check": check.name})
+            desk.cell.perform("commission", work, desk.heard, {"check": check.name})
         finally:
             desk.hands = None
         return name[0] if name else ""

@@ -47,6 +47,7 @@ COMMANDS: dict[str, type[Said]] = {
     "leave": _said(),
     "hand_over": _said(to=(Client, ...)),
     "clear_stop": _said(by=(Text, ...)),
+    "recover": _said(by=(Text | None, None)),
     "start": _said(job=(Text | None, None), until=(Identifier | None, None), at_start=(bool, False)),
     "resume": _said(run=(Run | None, None)),
     "dry_run": _said(job=(Text | None, None), seed=(Seed | None, None)),

@@ -83,6 +83,7 @@ class Desk:
                 client, "verification", lambda: cell.verify(job=self._job(words))
             ),
             "home": self._home,
+            "recover": self._recover,
             "diag": lambda client, words: self._diag(),
             "manual": self._manual,
             "jog_step": self._jog_step,
@@ -215,6 +216,10 @@ class Desk:
 
     def _home(self, client: str, words: Words) -> str:
         return self._long(client, "homing", lambda: self.cell.home(words["device"]))
+
+    def _recover(self, client: str, words: Words) -> str:
+        by = self.holders.name(client) if words["by"] is None else words["by"]
+        return self._long(client, "recovery", lambda: self.cell.recover(by))
 
     def _long(self, client: str, what: str, work: Callable[[], object]) -> str:
         """Begin work that lasts."""

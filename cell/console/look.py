@@ -20,6 +20,7 @@ from cell.console.scene_now import SceneNow
 from cell.geometry.poses import from_ur
 from cell.job import load_job
 from cell.run.folder import list_runs
+from cell.run.lateness import busy_words
 from cell.run.reading import read_report
 from cell.run.run import Run
 from cell.steps.kinds import find_kind
@@ -105,7 +106,7 @@ class Look:
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
             "starting": desk.starting,
             "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
-            "dry_run": desk.rehearsals.present, "behind": 0,
+            "dry_run": desk.rehearsals.present, "behind": 0, "busy": busy_words(),
         }  # fmt: skip
 
     def _follow_run(self) -> None:

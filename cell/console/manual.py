@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from cell.console.holding import Press
 from cell.devices.gate import Gated
 from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
 from cell.job import Job
+from cell.run.faults import CONFIRMED_BY_A_PERSON
 from cell.run.recorded_work import Hands
-from drivers.errors import Aborted, CellError, ConfigError, InterlockError, LimitError
+from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Attended, Motion
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ RAIL_BRAKING_S = 0.03
 LINES_M = (0.2, 0.1, 0.05, 0.02, 0.01)
 TURNS_RAD = (0.6, 0.3, 0.1, 0.05)
 """How far one press moves at most: the first of these ways that is clear from end to end."""
+
+NOT_DONE = "the arm had stopped before; it was not done"
 
 log = logging.getLogger(__name__)
 
@@ -145,6 +148,9 @@ class Manual:
             self._on.clear()
 
     def _work(self, hands: Hands) -> None:
+        # Begun anew after a fault that a person has confirmed: what was asked for meanwhile is not done now.
+        while not self._wanted.empty():
+            self._drop(self._wanted.get())
         self._on.set()
         while not self._off.is_set():
             hands.check()
@@ -154,6 +160,14 @@ class Manual:
                     self._hold(wanted, hands)
                 else:
                     self._do_step(wanted, hands)
+
+    def _drop(self, wanted: _Step | Press) -> None:
+        if isinstance(wanted, Press):
+            wanted.end(NOT_DONE)
+            self._tell(wanted, "refused", NOT_DONE)
+        else:
+            wanted.answer.append(Aborted(NOT_DONE))
+            wanted.done.set()
 
     def _do_step(self, step: _Step, hands: Hands) -> None:
         wish = step.wish
@@ -173,6 +187,8 @@ class Manual:
         step.done.set()
         if hands_ended is not None:
             raise hands_ended
+        if _needs_person(answer):
+            raise answer
 
     def _hold(self, press: Press, hands: Hands) -> None:
         if press.over() is not None:
@@ -185,6 +201,8 @@ class Manual:
             hands.check()
             self._tell(press, "refused", str(error))
             log.info("hold %s %s: %s", press.device, press.axis, error)
+            if _needs_person(error):
+                raise
             return
         press.end(why)
         self._tell(press, "ended", why)
@@ -261,6 +279,13 @@ class Manual:
     def _require_on(self) -> None:
         if not self.on:
             raise InterlockError("cell", "is not in manual mode, in which alone something is jogged; switch it on")
+        if (run := self._cell.current) is not None and run.control.question is not None:
+            raise InterlockError("cell", "waits for a person; answer the question first, then jog again")
+
+
+def _needs_person(ended: object) -> TypeGuard[DeviceFault]:
+    """Whether the run has to ask a person before anything moves again."""
+    return isinstance(ended, DeviceFault) and ended.code in CONFIRMED_BY_A_PERSON
 
 
 def rail_hold_speed(config: RailConfig) -> float:

@@ -125,7 +125,8 @@ class Readings:
         if name == "arm" and self.arm is not None and self.arm.safety is not ArmSafety.NORMAL:
             state = self.arm.safety
             remedy = "Look for the reason and clear the way."
-            return {"code": f"arm.{state.name.lower()}", "text": f"the arm is in {state.value}", "remedy": remedy}
+            text = ": ".join(filter(None, (f"the arm is in {state.value}", self.arm.reason)))
+            return {"code": f"arm.{state.name.lower()}", "text": text, "remedy": remedy}
         if name == "vehicle" and self.vehicle is not None and self.vehicle.trouble:
             told = "; ".join(self.vehicle.trouble)
             return {"code": "vehicle.trouble", "text": told, "remedy": "Look at the vehicle, then recover it."}

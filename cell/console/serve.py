@@ -52,7 +52,8 @@ JPEG = (cv2.IMWRITE_JPEG_QUALITY, 75)
 ANSWER_S, STOP_S = 60.0, 15.0
 IDLE_S = 4.0
 """Wall seconds in which a connection has to say what it wants."""
-PING_S = 5.0
+PING_S = 2.0
+"""Wall seconds between two questions whether a page is there, and that it has for each: one that is lost lets go."""
 MOST_FILES = 2048
 WAITING = 256
 BUSY, SILENT = 429, 504

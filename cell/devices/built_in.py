@@ -190,6 +190,7 @@ def _arm(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
         safe_off_outputs=around.safe_off_outputs,
         forward_of=around.forward_of,
         control=not around.look,
+        model=config.model,
     )
 
 

@@ -19,8 +19,9 @@ from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
 from cell.steps.camera_poses import look_pose
 from cell.units import parse_quantity
 from cell.vision import parse_board
-from drivers.errors import ConfigError, LimitError
-from drivers.interfaces import Arm
+from drivers.errors import ConfigError, DeviceFault, LimitError
+from drivers.interfaces import Arm, ArmSafety, Vector
+from statemachine.step import Observer
 
 if TYPE_CHECKING:
     from cell.supervisor import Cell
@@ -31,6 +32,10 @@ JOG_SPEED = 0.05  # m/s
 _WATCHED = {"arm": ("vehicle", "vehicle_parked"), "vehicle": ("arm", "arm_stowed")}
 """Arm and vehicle move only while the other one is safe: which that is, and the interlock that says so."""
 _USAGE = "rail +5mm · arm z -10mm · arm rx +2deg · arm j3 +5deg · vehicle +0.1m · vehicle +5deg"
+
+
+Begun = tuple[Vector, pin.SE3]
+"""Joint angles (6,), rad, and base_from_flange where the arm stood at first."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ def _amount(text: str, unit: str) -> float:
         raise ConfigError(f"jog by {error}; write it like: {_USAGE}") from error
 
 
-def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
+def jog(cell: Cell, wish: Jog, job: str | Path = "pot", observer: Observer | None = None) -> dict[str, str]:
     """Perform it and give where the device is afterwards, in words with units. Ctrl-C stops the cell.
 
     The vehicle is also jogged with the arm in the looking pose of `job`.
@@ -81,19 +86,23 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot") -> dict[str, str]:
     stops = cell.stops
     loaded, _ = load_job(job)
 
+    begun: list[Begun] = []
+
     def work(hands: Hands) -> dict[str, str]:
-        return moved(cell, wish, loaded, hands)
+        return moved(cell, wish, loaded, hands, begun)
 
-    return cell.perform("jog", work, info={"moved": f"{wish.device} {wish.axis}".strip()}, stops=stops)
+    return cell.perform("jog", work, observer, {"moved": f"{wish.device} {wish.axis}".strip()}, stops)
 
 
-def moved(cell: Cell, wish: Jog, job: Job, hands: Hands) -> dict[str, str]:
-    """The same as part of a run that goes on."""
+def moved(cell: Cell, wish: Jog, job: Job, hands: Hands, begun: list[Begun] | None = None) -> dict[str, str]:
+    """The same as part of a run that goes on. `begun` keeps where the arm began, for who does it again after a fault:
+    it then goes on to the same goal.
+    """
     match wish.device:
         case "rail":
             return _jog_rail(cell, wish)
         case "arm":
-            return _jog_arm(cell, wish)
+            return _jog_arm(cell, wish, [] if begun is None else begun)
         case _:
             _name_look(cell, job)
             return _jog_vehicle(cell, wish, hands.check)
@@ -120,20 +129,33 @@ def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:
 def begin_program(arm: Arm) -> None:
     """Begin the arm's control program anew where a stop, a silent computer or somebody at the pendant has ended it.
 
-    Raises `DeviceFault` where that takes a person's word, as after a protective stop.
+    A lost link is connected again. Raises `DeviceFault` where that takes a person's word, as after a protective stop.
     """
-    if not arm.state().controlled:
+    if not arm_is_ready(arm):
         arm.recover()
 
 
-def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
+def arm_is_ready(arm: Arm) -> bool:
+    """Whether it is connected, not stopped for safety, and its control program runs."""
+    try:
+        state = arm.state()
+    except DeviceFault as fault:
+        if fault.code != "arm.link_lost":
+            raise
+        return False
+    return state.controlled and state.safety is ArmSafety.NORMAL
+
+
+def _jog_arm(cell: Cell, wish: Jog, begun: list[Begun]) -> dict[str, str]:
     if "vehicle" in cell.devices:
         cell.devices.vehicle.recover()
     begin_program(cell.devices.arm)
     mover = cell.mover(None)
+    if not begun:
+        begun.append((mover.joints.copy(), from_ur(cell.devices.arm.state().flange)))
+    ((joints, start),) = begun
     if wish.axis.startswith("j"):
         number = int(wish.axis[1]) - 1
-        joints = mover.joints
         goal = joints.copy()
         goal[number] += wish.amount
         low, high = mover.kinematics.limits.lower[number], mover.kinematics.limits.upper[number]
@@ -146,7 +168,6 @@ def _jog_arm(cell: Cell, wish: Jog) -> dict[str, str]:
         mover.to_joints(goal)
         reached = mover.joints
         return {wish.axis: f"{math.degrees(joints[number]):.3f} deg → {math.degrees(reached[number]):.3f} deg"}
-    start = from_ur(cell.devices.arm.state().flange)
     direction = np.eye(3)["xyz".index(wish.axis[-1])]
     if wish.axis.startswith("r"):
         goal_pose = from_parts(start.translation, pin.exp3(direction * wish.amount) @ start.rotation)

@@ -52,7 +52,8 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
     if "arm" not in devices:
         return
     try:
-        safety = devices.arm.state().safety
+        state = devices.arm.state()
+        safety = state.safety
     except DeviceError as error:
         # A late state, or a link that `recover` has closed and opens again: the next command finds what is wrong.
         if isinstance(error, DeadlineError) or getattr(error, "code", "") == "arm.link_closed":
@@ -62,7 +63,7 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
         raise DeviceFault(
             "arm",
             f"arm.{safety.name.lower()}",
-            f"the arm is in {safety.value}",
+            ": ".join(filter(None, (f"the arm is in {safety.value}", state.reason))),
             recoverable=safety is ArmSafety.PROTECTIVE_STOP,
             hint="Look for the reason and clear the way.",
         )

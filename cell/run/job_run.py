@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from cell.report.figures import told
 from cell.report.html import table
 from cell.report.report import make_report
 from cell.report.truth import Witness
-from cell.run.folder import new_run, write_json
+from cell.run.faults import classify, clear
+from cell.run.folder import new_run
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.pace import Pace
@@ -37,26 +39,15 @@ from cell.steps.stored_sweep import StoredSweep
 from cell.steps.swath import Collector
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
-from drivers.errors import (
-    Aborted,
-    CalibrationStale,
-    CellError,
-    ConfigError,
-    DeviceError,
-    DeviceFault,
-    RefusedError,
-)
-from statemachine.cancel import CancelToken
+from cell.storage import write_json
+from drivers.errors import CellError
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Failure, Outcome
+from statemachine.policy import Outcome
 from statemachine.runner import Event, Runner
 from statemachine.script import NO_SCRIPT, Script
 
 Observer = Callable[[Event], None]
-
-CONFIRMED_BY_A_PERSON = frozenset(("arm.protective_stop",))
-"""Faults that no program may clear by itself: the maker asks that a person looks at the arm first."""
 
 log = logging.getLogger(__name__)
 
@@ -173,10 +164,10 @@ class JobRun:
                 policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"),
                 journal=journal,
                 clock=self.devices.clock,
-                classify=self._classify,
+                classify=partial(classify, following=self.devices.following),
                 safe_stop=lambda reason: stop_cell(self.devices),
                 observer=each_of(observers),
-                recover=self._recover,
+                recover=partial(clear, self.devices),
                 health=lambda: require_healthy(self.devices),
                 control=self.run.control,
                 script=self._in_the_gate(self.script),
@@ -226,14 +217,6 @@ class JobRun:
         except CellError as error:
             return {"missing": str(error)}
 
-    def _classify(self, error: BaseException) -> Failure:
-        """As `classify`; what a person is asked says what is simulated beside real devices."""
-        failure = classify(error)
-        if not failure.needs_person or self.devices.following is None:
-            return failure
-        names = ", ".join(self.devices.following.simulated)
-        return replace(failure, reason=f"{failure.reason} (simulated here: {names}; all else is real)")
-
     def _facts(self) -> dict[str, Any]:
         return {
             "kind": "job",
@@ -268,15 +251,6 @@ class JobRun:
         after = {name: entered(look) for name, look in script.after.items()}
         return Script(after, None if script.on_refusal is None else entered(script.on_refusal))
 
-    def _recover(self, error: BaseException, token: CancelToken, confirmed: bool) -> None:
-        """Clear the fault of a device, as far as a program may; a camera or the rail only needs the step again."""
-        with self.devices.gate.entered(token):
-            token.check()
-            if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
-                self.devices.arm.recover(confirmed=confirmed)
-            elif isinstance(error, DeviceError) and error.device == "vehicle":
-                self.devices.vehicle.recover()
-
 
 def each_of(observers: tuple[Observer, ...]) -> Observer:
     """One observer that tells all; one that fails is told nothing more and keeps no other from listening."""
@@ -291,25 +265,3 @@ def each_of(observers: tuple[Observer, ...]) -> Observer:
                 log.warning("an observer of the run failed and is told nothing more: %s", error)
 
     return tell
-
-
-def classify(error: BaseException) -> Failure:
-    """What a step's exception means for the run; what failed besides, as it was ended, is told after it."""
-    failure = _classify(error)
-    if notes := getattr(error, "__notes__", ()):
-        return replace(failure, reason="; ".join([failure.reason, *notes]))
-    return failure
-
-
-def _classify(error: BaseException) -> Failure:
-    match error:
-        case RefusedError() | CalibrationStale() | ConfigError():
-            return Failure(Outcome.REFUSED, str(error), type(error).__name__, error=error)
-        case Aborted():
-            return Failure(Outcome.ABORTED, str(error), "aborted")
-        case DeviceFault():
-            person = error.code in CONFIRMED_BY_A_PERSON
-            return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable, person)
-        case CellError():
-            return Failure(Outcome.FAULTED, str(error), type(error).__name__)
-    return Failure(Outcome.FAULTED, f"unexpected {type(error).__name__}: {error}", "internal")

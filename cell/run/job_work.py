@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,9 @@ from cell.devices.simulated import is_whole
 from cell.opened import Opened
 from cell.report.figures import following_words
 from cell.run.job_run import JobRun, Observer, RunOutcome
+from cell.run.reading import read_report
 from cell.run.ready_job import ReadyJob
+from cell.run.recorded_work import outcome_of
 from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
 from statemachine.runner import Event
@@ -39,7 +42,7 @@ class JobWork:
     at_start: bool
 
     def perform(self, run: Run[RunOutcome]) -> RunOutcome:
-        """Do it; raises what `JobRun.perform` and the calibration raise."""
+        """Do it; raises what `JobRun.perform` raises. Ended as any run where the calibration before it ends it."""
         cell, ready = self.cell, self.ready
 
         def note(text: str) -> None:
@@ -55,7 +58,11 @@ class JobWork:
         calibration = self.stored
         if calibration is None:
             note("this simulated cell has no calibration yet: calibrating first")
-            calibration = sessions.calibrate(cell, run, self.file)
+            begun = time.time()
+            try:
+                calibration = sessions.calibrate(cell, run, self.file)
+            except Exception as error:
+                return self._uncalibrated(run, error, time.time() - begun)
         earlier = None
         if self.before is not None:
             earlier, why = self.before.sweep(ready.job, cell.config, calibration)
@@ -80,3 +87,12 @@ class JobWork:
         finally:
             if self.at_start:
                 cell.whereabouts.forget_word()
+
+    def _uncalibrated(self, run: Run[RunOutcome], error: Exception, wall_s: float) -> RunOutcome:
+        """How a job ended whose first calibration ended with this error; its report is the calibration's."""
+        if run.folder is None:
+            raise error
+        outcome, reason = outcome_of(error), f"in the calibration before the job: {error}"
+        run.tell(Event("run_ended", None, {"outcome": outcome, "reason": reason}))
+        report = {**read_report(run.folder), "outcome": outcome, "reason": reason}
+        return RunOutcome(outcome, reason, run.folder, report, control=run.control, wall_s=wall_s)

@@ -1,16 +1,17 @@
 """Work outside a job as a recorded run: calibration, verification, homing, jogs.
 
-It has a folder, a journal and a report like a job's run, listens to the same requests, and whatever ends it early stops
-the cell first.
+It has a folder, a journal and a report like a job's run, listens to the same requests, asks the same question after a
+protective stop, and whatever ends it early stops the cell first.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
 from cell.record.recorder import begin_record
+from cell.run.faults import classify, clear
 from cell.run.folder import REPORT, new_run, timeless, when
 from cell.run.frames import FrameStore
 from cell.run.logs import run_log
@@ -26,14 +28,22 @@ from cell.storage import sealed, write_json
 from cell.version import release
 from drivers.errors import Aborted, CellError, Interrupted, RefusedError
 from drivers.interfaces import Frame
+from statemachine.attempts import Attempts
+from statemachine.cancel import CancelToken
 from statemachine.journal import Journal, JournalError
-from statemachine.step import Event
+from statemachine.policy import Failure, Outcome, Policy, Step
+from statemachine.recovery import performed
+from statemachine.sequence import Sequence, State, Trigger
+from statemachine.step import Event, StepContext
+from statemachine.telling import Teller
 from statemachine.waiting import waiting_on
+from statemachine.watch import SignalWatch
+from statemachine.watchman import Watchman
 
 GRACE_S = 5.0
 """Wall seconds that stopped work has to end."""
-REQUEST_POLLS, HEALTH_POLLS = 10, 5
-"""At every so many looks around: requests of other processes, the cell's health."""
+RETRIES = 3
+"""How often at most the work is done again after a fault was cleared."""
 
 FRAMES = "frames"
 """Where in the run's folder the pictures are that its work looked at."""
@@ -95,7 +105,7 @@ class RecordedWork:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)
         except BaseException as error:
-            ended, outcome, reason = error, _outcome(error), str(error)
+            ended, outcome, reason = error, outcome_of(error), str(error)
             raise
         finally:
             if self.run.kind == self.kind:
@@ -119,79 +129,95 @@ class RecordedWork:
             self.run.folder = outer or folder
 
     def _watched(self, work: Callable[[Hands], Made], journal: Journal, frames: FrameStore) -> Made:
-        control, clock = self.run.control, self.devices.clock
-        waiting = waiting_on(clock)
-        hands = Hands(
-            control.token.check,
-            lambda: control.safe_point(control.token, self._say, waiting.look),
-            self._progress,
-            frames.keep,
-        )
-        made: list[Made] = []
+        """Do it under the same watch as a job's step: a fault that a person may clear is asked about, then it is done
+        again from its beginning.
+        """
+        control, devices = self.run.control, self.devices
         problems: list[str] = []
-        asked: str | None = None
-        ailing: Exception | None = None
         stopped = False
-        polls = 0
 
-        def begin() -> None:
-            with self.devices.gate.entered(control.token):
-                control.token.check()
-                made.append(work(hands))
+        def begin(context: StepContext) -> object:
+            with devices.gate.entered(context.token):
+                context.check()
+                return work(Hands(context.check, context.safe_point, context.progress, frames.keep))
 
-        def stop(why: str) -> None:
+        def stop(reason: str) -> None:
             nonlocal stopped
             stopped = True
-            control.token.cancel(why)
-            problems.extend(self.devices.stop())
+            problems[:] = ["the safe stop did not end"]
+            problems[:] = devices.stop()
 
-        def cut() -> str | None:
-            nonlocal asked, ailing, polls
-            polls += 1
+        def recover(error: BaseException, token: CancelToken, confirmed: bool) -> None:
+            nonlocal stopped
+            stopped = False
+            clear(devices, error, token, confirmed)
+
+        sequence = Sequence((self.kind,), State.DONE)
+        step = Step(self.kind, math.inf, RETRIES)
+        simulated = self.config is not None and self.config.cell.confirm == "simulated"
+        open_before, end = devices.gate.is_open, None
+        with SignalWatch() as signals:
+            watchman = Watchman(
+                policy=Policy((step,), grace_s=GRACE_S, simulated_person=simulated),
+                journal=journal,
+                clock=devices.clock,
+                control=control,
+                classify=self._classify,
+                safe_stop=stop,
+                health=lambda: self.health(devices),
+                waiting=waiting_on(devices.clock),
+                signals=signals,
+                teller=Teller(journal, self._heard, lambda: sequence.state),
+            )
+            attempts = Attempts(sequence.steps, {self.kind: begin}, watchman)
+            sequence.fire(Trigger.START)
             try:
-                if polls % REQUEST_POLLS == 0:
-                    control.obey(journal.take_requests())
-                if polls % HEALTH_POLLS == 0:
-                    self.health(self.devices)
-            # Whatever keeps it from being watched ends the work; it must not go on unseen.
-            except Exception as found:
-                ailing = found
-            asked = control.token.reason
-            why = asked or (None if ailing is None else str(ailing))
-            if why is not None:
-                stop(why)
-            return why
-
-        key = journal.step_started(self.kind, 1)
-        begun = clock.now()
-        call = waiting.do(self.kind, begin, cut, GRACE_S)
-        error = ailing or call.error
-        if not stopped:
-            asked = control.token.reason
-            if asked is not None or error is not None:
-                stop(asked or str(error))
-        if not call.done.is_set():
+                end = performed(step, attempts, recover, sequence, watchman) or watchman.asked()
+            # Its end cannot be recorded; what it ended with counts.
+            except JournalError as failure:
+                log.warning("the %s could not be recorded: %s", self.kind, failure)
+                if self.kind not in attempts.results:
+                    watchman.error = watchman.error or failure
+                    end = Failure(Outcome.FAULTED, str(watchman.error))
+            if end is None:
+                if open_before:
+                    # The stops of attempts that were recovered from keep nobody from going on.
+                    devices.gate.clear(devices.gate.stops)
+                made: Made = attempts.results[self.kind]  # type: ignore[assignment]
+                return made
+            if not stopped or self.kind in attempts.results:
+                watchman.halt(end.reason)
+        if watchman.abandoned:
             problems.append(f"the {self.kind} was still busy {GRACE_S:g} s after the stop")
-        said = asked or (None if error is None else str(error))
-        _last(lambda: journal.step_ended(key, clock.now() - begun, error=said), error)
+        raise self._ended(end, watchman, problems)
+
+    def _ended(self, end: Failure, watchman: Watchman, problems: list[str]) -> BaseException:
+        """What the end of work is raised as: its own error, unless somebody asked for it or the stop failed."""
+        control, error = self.run.control, watchman.error
         unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
-        if asked is not None:
+        if (asked := control.token.reason) is not None:
             text = f"{self.kind} {asked}" if control.signal is not None else f"{self.kind} ended: {asked}"
             kind = Interrupted if control.signal is not None else Aborted
-            raise kind(f"{text}; the cell was stopped{unconfirmed}")
-        if error is not None and problems:
-            raise stop_not_confirmed(f"{self.kind}: {error}{unconfirmed}") from error
-        if error is not None:
-            raise error
-        return made[0]
+            return kind(f"{text}; the cell was stopped{unconfirmed}")
+        if problems or error is None:
+            fault = stop_not_confirmed(f"{self.kind}: {end.reason}{unconfirmed}")
+            fault.__cause__ = error
+            return fault
+        if isinstance(error, CellError) and end.reason != watchman.classified(error).reason:
+            # Nobody confirmed it, or it could not be cleared.
+            error.args = (end.reason,)
+        return error
 
-    def _progress(self, fraction: float, text: str) -> None:
-        self.run.control.token.check()
-        self.run.tell(Event("progress", self.kind, {"fraction": fraction, "text": text}))
+    def _classify(self, error: BaseException) -> Failure:
+        """As `classify`. Only what a person confirms is cleared, and a lost link to the arm where nothing is jogged."""
+        failure = classify(error, self.devices.following)
+        lost = failure.code == "arm.link_lost" and self.kind != "jog"
+        return replace(failure, recoverable=failure.recoverable and (failure.needs_person or lost))
 
-    def _say(self, held: bool) -> None:
-        text = "held before its next motion" if held else "goes on"
-        self.run.tell(Event("paused" if held else "going_on", self.kind, {"text": text}))
+    def _heard(self, event: Event) -> None:
+        # Steps and states are those of a job.
+        if not event.kind.startswith(("step_", "state")):
+            self.run.tell(event)
 
 
 def _last(action: Callable[[], object], ended: BaseException | None) -> None:
@@ -204,7 +230,8 @@ def _last(action: Callable[[], object], ended: BaseException | None) -> None:
             ended.add_note(f"and the end could not be recorded: {error}")
 
 
-def _outcome(error: BaseException) -> str:
+def outcome_of(error: BaseException) -> str:
+    """How a run ended that this error ended, in the report's word."""
     if isinstance(error, Aborted):
         return "aborted"
     return "refused" if isinstance(error, RefusedError) else "faulted"

@@ -111,8 +111,15 @@ class JogScreen:
                 self._size = min(max(self._size + (1 if key.name == "]" else -1), 0), 4)
             case "," | ".":
                 self._speed = min(max(self._speed + (1 if key.name == "." else -1), 0), len(SPEEDS) - 1)
+            case "y" if self._question is not None and (run := self._cell.current) is not None:
+                run.confirm(getpass.getuser(), self._question[0])
             case "tab":
                 self._holding = not self._holding and self._screen.releases
+
+    @property
+    def _question(self) -> tuple[int, str] | None:
+        run = self._cell.current
+        return None if run is None else run.control.question
 
     @property
     def _near(self) -> bool:
@@ -219,7 +226,7 @@ class JogScreen:
             *self._positions(now),
             "",
             self._said,
-            "",
+            "" if (asked := self._question) is None else f"{asked[1]} y: I have looked, unlock it",
             "↑ ↓ axis  ← → move  [ ] step  , . speed  tab hold or step  space stop  q leave",
         ])  # fmt: skip
 

@@ -39,6 +39,9 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "the arm is not the one that is configured", False,
         "See that its address and model are right and that nobody has set another tool at the pendant.",
     ),
+    "arm.wrong_model": (
+        "the arm is not of the model that is configured", False, "Correct arm.model or arm.address in cell.toml.",
+    ),
     "arm.wrong_payload": (
         "the controller reckons with another payload than this driver has set", True,
         "Somebody has set it at the pendant or by a program: see what the arm carries, then recover() sets it again.",
@@ -64,9 +67,21 @@ _STATUS = (
 """What words of the dashboard server's safety status mean."""
 
 
+LATE_S = 0.01
+"""By how much what an arm is told may come late before that is named as the reason of a stop: five of its cycles."""
+_BUSY = "this computer is too busy"
+
+
+def late_words(seconds: float) -> str:
+    """Why an arm stopped that was told its points so much late; empty for one that was told them in time."""
+    return f"points came {1e3 * seconds:.0f} ms late: {_BUSY}" if seconds >= LATE_S else ""
+
+
 def fault(device: str, code: str, text: str = "") -> DeviceFault:
     """The `DeviceFault` for a code of the child process, with its text added."""
     what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
+    if _BUSY in text:
+        hint = hint.replace("Look for what it ran into and clear the way", "End what else computes here, see the arm")
     return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 
@@ -74,6 +89,17 @@ def require_remote(device: str, dashboard: Dashboard) -> None:
     """Raise `DeviceFault` (arm.local_control) when the arm says so; controllers that know of no such mode do not."""
     if dashboard.ask("is in remote control").lower() == "false":
         raise fault(device, "arm.local_control", "it takes nothing but questions from others")
+
+
+def require_named(device: str, dashboard: Dashboard, model: str) -> None:
+    """Raise `DeviceFault` (arm.wrong_model) when the arm calls itself otherwise than `model`.
+
+    E-series controllers leave out the "e"; what names no model is left to the kinematics.
+    """
+    told = dashboard.ask("get robot model")
+    plain = told.upper()
+    if model and plain.startswith("UR") and plain not in (model.upper(), model.upper().removesuffix("E")):
+        raise fault(device, "arm.wrong_model", f'it calls itself {told}, arm.model is "{model}"')
 
 
 def unlock(

@@ -20,7 +20,8 @@ class Setup:
 
     `payload` is mass in kg and centre of gravity in the flange frame in m. The controller ends its program when it
     hears nothing for `watchdog` seconds on the wall. `braking` is the deceleration of a stop in rad/s². Without
-    `control` the arm is only looked at: nothing is set, started or ended.
+    `control` the arm is only looked at: nothing is set, started or ended. `model` is the name that the controller has
+    to tell, any where it is empty.
     """
 
     address: str
@@ -30,6 +31,7 @@ class Setup:
     watchdog: float
     braking: float
     control: bool = True
+    model: str = ""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Snapshot:
     the controller's own clock.
 
     `safety_bits`, `mode` and `runtime`, the state of the program, as the controller reports them; `wrench` at the
-    flange in base axes; `payload` is what the controller reckons with, kg and centre of gravity in the flange in m.
+    flange in base axes; `late` by how many s at most what the arm was told came late, before it stopped for safety;
+    `payload` is what the controller reckons with, kg and centre of gravity in the flange in m.
     """
 
     stamp: float
@@ -78,6 +81,7 @@ class Snapshot:
     inputs: int
     outputs: int
     device_time: float = 0.0
+    late: float = 0.0
     payload: tuple[float, Six] = (0.0, (0.0, 0.0, 0.0))
 
     @property

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.faults import fault, require_remote, unlock
+from drivers.arm.faults import fault, require_named, require_remote, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.first_look import look
 from drivers.arm.link import ArmLink
@@ -49,7 +49,7 @@ class ArmSession:
         on_ended: Callable[[Ended], None],
         on_broken: Callable[[Exception], None],
     ) -> None:
-        """Connect. Raises `NotConnectedError`; `DeviceFault` in local control or for another arm than `forward` says.
+        """Connect. Raises `NotConnectedError`; `DeviceFault` in local control, and for another arm than it has to be.
 
         `unknown` says why the controller's own table is not known, if it is not.
         """
@@ -68,7 +68,10 @@ class ArmSession:
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
         look(name, setup.address, clock, connect_timeout)
         if setup.control:
-            self._require_remote()
+            self.require_remote()
+            # One that does not answer is left to the connection, which says more.
+            with suppress(DeadlineError, NotConnectedError):
+                require_named(name, self.dashboard, setup.model)
         self.link = self._connect(lambda: True)
         try:
             self._require_model()
@@ -90,6 +93,11 @@ class ArmSession:
             raise InterlockError(
                 self._name, "is connected only to be looked at; nothing was sent. Connect with control=True first."
             )
+
+    def require_remote(self) -> None:
+        """Raise the `DeviceFault` of an arm in local control; one whose dashboard is silent is left to its link."""
+        with suppress(DeadlineError, NotConnectedError):
+            require_remote(self._name, self.dashboard)
 
     def require_ready(self) -> None:
         """Raise the `DeviceFault` that keeps the arm from moving, if any."""
@@ -234,11 +242,6 @@ class ArmSession:
     def _take(self, snapshot: Snapshot) -> None:
         self.statistics.traffic.received(snapshot)
         self.feed.take(snapshot)
-
-    def _require_remote(self) -> None:
-        """As `require_remote`; an arm that does not answer is left to the connection, which says more."""
-        with suppress(DeadlineError, NotConnectedError):
-            require_remote(self._name, self.dashboard)
 
     def _on_lost(self, error: DeviceFault) -> None:
         self.statistics.count("link lost")

@@ -21,6 +21,7 @@ from drivers.arm import health
 from drivers.arm.clock_latch import latch_clock
 from drivers.arm.dashboard import unknown
 from drivers.arm.factory import read_factory_kinematics
+from drivers.arm.faults import late_words
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
@@ -63,6 +64,9 @@ class UrArm:
     it from the table that the controller tells, None where it tells none. Here and before every motion it has to agree
     with what the arm reports within 0.05 mm and 0.1 mrad, else `DeviceFault` (arm.wrong_kinematics).
 
+    `model`, where it is given, is what the dashboard has to call the arm, else `DeviceFault` (arm.wrong_model). Before
+    every motion the dashboard is asked whether the arm is in remote control (arm.local_control).
+
     With `control=False` the arm is only looked at: nothing on it is started, set or ended, by `close` neither, and a
     program that runs on it runs on. Everything but reading is then an `InterlockError`.
     """
@@ -80,6 +84,7 @@ class UrArm:
         forward: Forward | None = None,
         forward_of: Callable[[LinkTable | None], Forward] | None = None,
         control: bool = True,
+        model: str = "",
         clock: Clock,
     ) -> None:
         self.name = name
@@ -96,6 +101,7 @@ class UrArm:
             _WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
             check_positive(name, "braking", braking, 20.0, "rad/s^2"),
             control,
+            model,
         )
         self.factory = read_factory_kinematics(address, min(connect_timeout, _TOLD_S))
         if forward_of is not None:
@@ -165,13 +171,15 @@ class UrArm:
         return latch_clock(self.name, self._session.setup.address, self._clock, self.statistics.traffic)
 
     def _state(self, snapshot: Snapshot) -> ArmState:
+        safety = _SAFETY[safety_code(snapshot.safety_bits)]
         return ArmState(
             stamp=self._clock.now() - self._feed.age(snapshot),
             joints=np.array(snapshot.joints),
             joint_speeds=np.array(snapshot.speeds),
             flange=np.array(snapshot.flange),
             wrench=np.array(snapshot.wrench),
-            safety=_SAFETY[safety_code(snapshot.safety_bits)],
+            safety=safety,
+            reason=late_words(snapshot.late) if safety is ArmSafety.PROTECTIVE_STOP else "",
             moving=not snapshot.at_rest,
             digital_inputs=snapshot.inputs,
             digital_outputs=snapshot.outputs,
@@ -289,6 +297,7 @@ class UrArm:
     def _start(self, what: str, name: str, *arguments: Any) -> UrMotion:
         self._session.require_control()
         with self._starting:
+            self._session.require_remote()
             self._session.require_ready()
             if self._motion is not None and not self._motion.done:
                 raise InterlockError(

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
@@ -197,7 +198,10 @@ class Child:
                 if time.monotonic() - before.stamp > SILENCE_S:
                     self._lose(f"no packet from the arm for {SILENCE_S:g} s")
                 continue
-            snapshot = self._snapshot = self._packets.read()
+            snapshot = self._packets.read()
+            # A stop for safety keeps what was late before it.
+            late = before.late if safety_code(snapshot.safety_bits) and before.late else self._control.late
+            snapshot = self._snapshot = replace(snapshot, late=late)
             count += 1
             if count % every == 0 or _urgent(snapshot) != _urgent(before):
                 self._send(snapshot)

@@ -59,6 +59,11 @@ class ControlThread:
         self._cause = code, text
         self.submit(Request(UNANSWERED, "stop"))
 
+    @property
+    def late(self) -> float:
+        """See `ControlProgram.late`."""
+        return self._program.late
+
     def submit(self, request: Request) -> None:
         """Queue a request. A stop drops what waits and ends what runs."""
         if request.name in ("stop", "close"):
@@ -78,6 +83,8 @@ class ControlThread:
     def _run(self) -> None:
         while not self.finished.is_set():
             request: Request | None
+            # Whatever the last one took: from here on it has to be in time.
+            self._program.awake(math.inf)
             try:
                 request = self._requests.get(timeout=KICK_S)
             except queue.Empty:
@@ -165,6 +172,7 @@ class ControlThread:
     def _watch(self, before: int) -> End | None:
         """Until the controller reports the end of the operation after `before`: None, or why it ended early."""
         begun = time.monotonic()
+        self._program.awake(math.inf)
         while True:
             if self._program.to_stop.is_set():
                 return self._program.brake() or ("stopped", "")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from drivers.arm.dashboard import Dashboard
+from drivers.arm.faults import LATE_S, late_words
 from drivers.arm.messages import MODE_RUNNING, PLAYING, STOPPED, Setup, Six, Snapshot, safety_code
 from drivers.arm.trajectory import largest_difference
 from drivers.clock import Clock
@@ -24,6 +26,7 @@ BLIND_S = 0.1
 """For how long on the wall the arm's own word may be behind what happens to it."""
 KICK_S, _KICK_BLIND = 0.02, 0.7
 """How often the watchdog is kicked, in s on the wall, and for which part of its time without a word from the arm."""
+LATE_KEPT_S = 1.0
 _REST_S = 0.02
 _JOINT_TOLERANCE = 2e-3
 
@@ -45,6 +48,25 @@ class ControlProgram:
         self._clock = Clock()
         self._dashboard = Dashboard("arm", setup.address, timeout=_ENDING_S)
         self._kicked = 0.0
+        self._awake = math.inf
+        self._late: deque[tuple[float, float]] = deque(maxlen=100)
+
+    def awake(self, period: float) -> None:
+        """Said at each turn of a loop that commands the arm: notes by how much it comes later than `period` s."""
+        now = time.monotonic()
+        self.note_late(now - self._awake - period)
+        self._awake = now
+
+    def note_late(self, seconds: float) -> None:
+        """What the arm is told came this much late."""
+        if seconds >= LATE_S:
+            self._late.append((time.monotonic(), seconds))
+
+    @property
+    def late(self) -> float:
+        """By how much at most what the arm was told came late in the last `LATE_KEPT_S`, s."""
+        since = time.monotonic() - LATE_KEPT_S
+        return max((seconds for at, seconds in tuple(self._late) if at >= since), default=0.0)
 
     def operation(self) -> tuple[int, bool]:
         """Number of the newest asynchronous operation, and whether it runs."""
@@ -57,7 +79,7 @@ class ControlProgram:
         """What keeps the arm from moving, if anything."""
         snapshot = self._latest()
         if code := safety_code(snapshot.safety_bits):
-            return code, ""
+            return code, self._why(code)
         if snapshot.mode != MODE_RUNNING:
             return "arm.not_powered", f"robot mode {snapshot.mode}"
         if self._control is None:
@@ -70,12 +92,15 @@ class ControlProgram:
         while time.monotonic() < deadline:
             snapshot = self._latest()
             if code := safety_code(snapshot.safety_bits):
-                return code, ""
+                return code, self._why(code)
             if snapshot.mode != MODE_RUNNING:
                 return "arm.not_powered", f"robot mode {snapshot.mode}"
             self._clock.sleep(PERIOD)
         paused = self._latest().runtime not in (STOPPED, PLAYING)
-        return "arm.program_stopped", "it was paused at the arm" if paused else ""
+        return "arm.program_stopped", "it was paused at the arm" if paused else late_words(self.late)
+
+    def _why(self, code: str) -> str:
+        return late_words(self.late) if code == "arm.protective_stop" else ""
 
     def brake(self) -> End | None:
         """Bring the arm to rest, and see to it that nothing of its motion can go on; None once that is so.
@@ -119,6 +144,7 @@ class ControlProgram:
 
     def kick(self) -> None:
         """Keep the watchdog quiet for as long as the arm is heard and its program runs."""
+        self.awake(KICK_S)
         now, snapshot = time.monotonic(), self._latest()
         if (
             self._control is not None

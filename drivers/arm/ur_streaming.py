@@ -55,10 +55,12 @@ class Streaming:
         seen, lead = self._latest().device_time, 0.0
         cycle, how, text = 0, "", ""
         elapsed, pace, slower, braked_by = 0.0, 1.0, 0.0, math.inf
+        self._program.awake(math.inf)
         while not how:
             due = start + cycle * PERIOD
             self._clock.sleep(due - time.monotonic())
             late = time.monotonic() - due
+            self._program.awake(PERIOD)
             if late > _SLIP_S:
                 # The machine held this thread up. Going on where the arm is told to stand, not where it should have
                 # been by now: the latter would be a jump.
@@ -71,6 +73,7 @@ class Streaming:
             if lead > allowed:
                 # The arm would go on unseen, and what is sent would pile up before it and before the next stop.
                 start += PERIOD
+                self._program.note_late(lead)
                 self._program.kick()
             elif self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
                 self._sent.append(time.monotonic())

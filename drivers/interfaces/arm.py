@@ -30,6 +30,7 @@ class ArmState:
     joint encoders; `wrench` is force and torque at the flange in base axes, N and N·m. `stamp` is the host time at
     which the packet arrived, `device_time` in s the arm's own clock when it was measured. `controlled` is False while
     nothing can move the arm, because it has no power or no control program; its flange may then be that of any tool.
+    `reason` says in words why it stopped for safety, as far as that is known.
     """
 
     stamp: float
@@ -43,6 +44,7 @@ class ArmState:
     digital_outputs: int
     device_time: float = 0.0
     controlled: bool = True
+    reason: str = ""
 
 
 class ArmMotion(Motion, Protocol):

@@ -82,6 +82,7 @@ class DirectArm:
             digital_outputs=model.digital_outputs,
             device_time=self.clock.now(),
             controlled=model.power is Power.RUNNING,
+            reason=model.fault_text,
         )
 
     @contextmanager
@@ -165,6 +166,7 @@ class DirectArm:
         Ended by `stop()`, with `Aborted`.
         """
         stops = self._stops
+        self._require_remote()
         for index in (*self._setup.safe_off, *self._tried):
             self.set_digital_output(index, False)
         if self.model.safety is Safety.PROTECTIVE_STOP:
@@ -231,10 +233,15 @@ class DirectArm:
             self._motion.after_tick(t)
 
     def _require_free(self) -> None:
+        self._require_remote()
         if (found := self.trouble()) is not None:
             raise found
         if self._motion is not None and not self._motion.done:
             raise InterlockError(self.name, "a motion is still under way; nothing was sent. Wait for it or stop it.")
+
+    def _require_remote(self) -> None:
+        if not self.model.remote:
+            raise self.fault("arm.local_control", "it takes nothing but questions from others")
 
     def _begin(self, motion: ArmMove) -> ArmMove:
         self._require_free()

@@ -12,6 +12,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from cell.console.messages import Beat, CloudPart, Joined, Left, Show
+from cell.console.serve import PING_S
 from tests.console.server import Served, serving, until
 
 TOKEN = "a-token-of-a-file-that-is-long-enough-0123456789"
@@ -278,6 +279,22 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served) -> No
         heard.append(server.heard.get(timeout=20))
     assert Joined(client) in heard
     assert sum(isinstance(message, Beat) for message in heard) < 300
+
+
+def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Served) -> None:
+    """Its cable is out: nothing is closed, nothing answers. Nobody else could take hold until it is given up."""
+    forget(server)
+    ask = (
+        f"GET /live HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: {'a' * 22}==\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as lost:
+        lost.sendall(ask.encode())
+        joined = server.heard.get(timeout=20)
+        while not isinstance(joined, Joined):
+            joined = server.heard.get(timeout=20)
+        assert server.heard.get(timeout=2.5 * PING_S) == Left(joined.client)
 
 
 def test_broken_frames_and_half_an_upgrade_hurt_nobody(server: Served) -> None:

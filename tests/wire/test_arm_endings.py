@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import signal
 import socket
 import threading
@@ -570,3 +571,25 @@ def test_the_model_is_compared_before_every_motion(bench, error):
     pose_error[:] = 0.8 * np.array(error)
     arm.move_joints(state.joints + 0.05, 1.0, 1.0).wait(5.0)
     arm.close()
+
+
+def test_a_stop_after_points_that_came_late_is_laid_to_this_computer(arm, bench, closes):
+    """The sending process is held up for 40 ms, then the arm stops: the person reads how late its points were."""
+    stands = arm.state().joints
+    times = np.linspace(0.0, 3.0, 31)
+    moving = arm.follow(times, stands + np.outer(times, [0.02, 0, 0, 0, 0, 0]))
+    assert soon(lambda: arm.state().moving)
+    pid = arm._session.link.pid
+    os.kill(pid, signal.SIGSTOP)
+    Clock().sleep(0.04)
+    os.kill(pid, signal.SIGCONT)
+    Clock().sleep(0.05)
+    bench.ask("protective_stop")
+    with pytest.raises(DeviceFault, match=r"points came \d+ ms late: this computer is too busy") as caught:
+        moving.wait(10.0)
+    assert caught.value.code == "arm.protective_stop"
+    assert "ran into" not in str(caught.value)
+    late = int(re.search(r"came (\d+) ms", str(caught.value))[1])
+    assert late >= 30
+    # Whoever looks at the arm's state, such as the watch over a run, reads the same.
+    assert soon(lambda: "this computer is too busy" in arm.state().reason)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 import time
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from cable import Cable
 
 from cell.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
+from drivers.arm.faults import require_named
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
@@ -115,7 +118,7 @@ def test_a_tool_that_another_has_set_is_named_before_the_next_motion(bench):
     arm.close()
 
 
-def test_local_control_is_said_at_connecting_and_at_recovering_and_questions_are_still_answered(arm, bench):
+def test_local_control_is_said_at_connecting_recovering_and_before_each_motion(arm, bench):
     bench.ask("local_control")
     with pytest.raises(DeviceFault, match="in local control") as caught:
         arm.recover()
@@ -123,6 +126,10 @@ def test_local_control_is_said_at_connecting_and_at_recovering_and_questions_are
     assert not caught.value.recoverable
     assert "remote control at the pendant" in caught.value.hint
     assert arm.identity().model == "UR10e"
+    stands = bench.ask("show")["q"]
+    with pytest.raises(DeviceFault, match="in local control"):
+        nudge(arm)
+    assert bench.ask("show")["q"] == stands
     with pytest.raises(DeviceFault, match="in local control"):
         connect(bench.address)
     looking = connect(bench.address, control=False)
@@ -131,6 +138,24 @@ def test_local_control_is_said_at_connecting_and_at_recovering_and_questions_are
     bench.ask("clear")
     arm.recover()
     nudge(arm)
+
+
+def test_an_arm_that_calls_itself_otherwise_is_refused_with_both_names(bench):
+    with pytest.raises(DeviceFault, match=r'it calls itself UR10e, arm\.model is "UR5e"') as caught:
+        connect(bench.address, model="UR5e")
+    assert caught.value.code == "arm.wrong_model"
+    connect(bench.address, model="UR10e").close()
+
+
+@pytest.mark.parametrize(
+    ("told", "model", "same"),
+    [("UR10", "UR10e", True), ("UR10e", "UR10", False), ("UR3", "UR30", False), ("UR30", "UR3e", False),
+     ("could not understand: get robot model", "UR5e", True), ("ur20", "UR20", True)],
+)  # fmt: skip
+def test_an_e_series_arm_may_leave_out_its_e(told, model, same):
+    board = SimpleNamespace(ask=lambda question: told)
+    with nullcontext() if same else pytest.raises(DeviceFault, match=told):
+        require_named("arm", board, model)
 
 
 def test_a_program_that_another_client_starts_is_a_program_that_ended_and_can_be_recovered(arm, bench):

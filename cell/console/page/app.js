@@ -88,6 +88,7 @@ byId('hand-over').onchange = ({ target }) => {
   target.value = '';
 };
 byId('clear-stop').onclick = () => ask('clear_stop', { by: myName() });
+byId('recover').onclick = () => ask('recover', { by: myName() });
 
 function hold(state) {
   const holder = state.clients.find((client) => client.id === state.holder);
@@ -98,7 +99,7 @@ function hold(state) {
   remake(byId('hand-over'), others, () => [el('option', { value: '', textContent: 'Hand over to …' }),
     ...others.map((client) => el('option', { value: client.id, textContent: client.name || `screen ${client.id}` }))]);
   show(byId('hand-over'), others.length > 0);
-  byId('clear-stop').disabled = !mine();
+  byId('clear-stop').disabled = byId('recover').disabled = !mine();
 }
 
 // --- what the server tells ---

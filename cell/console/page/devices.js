@@ -2,6 +2,7 @@
 
 import { byId, el, remake, say, show, words } from './dom.js';
 
+const CLEARED = /^(arm\.(protective_stop|link_lost)|vehicle\.trouble)$/;
 const OLD_S = 0.5, LOUD_S = 30;
 
 export function devices(state) {
@@ -17,6 +18,12 @@ export function devices(state) {
   const fresh = fault !== undefined && state.t - fault.t < LOUD_S && !state.question && !(fault.over && going);
   show(byId('fault'), fresh);
   if (fresh) say(byId('fault'), told(fault));
+  // With no run to ask about it: a person clears it here.
+  const ill = state.run === null ? entries.map(([, device]) => device.fault).find((met) => CLEARED.test(met?.code)) : null;
+  show(byId('unlock'), Boolean(ill));
+  if (ill) say(byId('unlock').firstElementChild, `${ill.text}. Nothing clears it by itself. `);
+  show(byId('busy'), Boolean(state.busy) && state.run === null);
+  say(byId('busy'), state.busy ?? '');
   show(byId('stopped'), Boolean(state.safety?.stopped) && state.run === null);
 }
 

@@ -24,8 +24,9 @@ from cell.devices.described import Described
 from cell.devices.direct import VirtualCell
 from cell.inversion import NominalSurface
 from cell.job import Job
+from cell.run.faults import classify
 from cell.run.frames import FrameStore
-from cell.run.job_run import JobRun, classify
+from cell.run.job_run import JobRun
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import mesh_source
 from cell.run.run import Run
