@@ -41,7 +41,7 @@ def jog(
     device: Annotated[
         str | None,
         typer.Argument(
-            help="rail, arm or vehicle. Without it, a screen in this terminal, to jog by keys.",
+            help="rail, arm or vehicle.",
             autocompletion=completing.jogged,
         ),
     ] = None,
@@ -65,12 +65,13 @@ def jog(
     from cell.devices.jogging import jog as perform
     from cell.devices.jogging import needed_for, parse_jog
     from cell.supervisor import Cell
+    from drivers.errors import ConfigError
 
     if device is None:
-        from cell.cli.jog_screen import jog_by_keys
-
-        jog_by_keys(config, job, sim, seed, level, lift or [], reason, json)
-        return
+        raise ConfigError(
+            "say what to move: `cell jog rail +5mm`, `cell jog arm z +5mm`, `cell jog vehicle +0.1m`; with --sim all in "
+            "a simulated cell. `cell console` moves a device for as long as a button is held"
+        )
     wish = parse_jog(device, motion or [])
     lifted = lift or []
     with (

@@ -1,4 +1,4 @@
-"""Where the devices are and how they are, in lines of at most 80 columns: for the jog screen and for `cell watch`."""
+"""Where the devices are and how they are, in lines of at most 80 columns, for `cell watch`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a terminal sends is read as it is meant, and what is shown of devices and runs says what they say."""
+"""What `cell watch` shows of devices and runs says what they say."""
 
 from __future__ import annotations
 
@@ -13,44 +13,10 @@ from typer.testing import CliRunner
 
 from cell.cli.app import app
 from cell.config import CellConfig, load_config
-from cell.terminal.keys import Decoder, Focus, Heard, Key, Keyboard, Status
 from cell.terminal.positions import arm_lines, rail_lines, vehicle_lines
 from cell.terminal.watch import run_lines, shared
 from drivers.interfaces import ArmSafety, ArmState, RailState, VehicleState
 from statemachine.journal import Journal
-
-SENT: list[tuple[bytes, list[Heard]]] = [
-    (b"a", [Key("a")]),
-    (b"\x1b[C\x1bOD", [Key("right"), Key("left")]),
-    (b"\x1b[1;1:1C\x1b[1;1:2C\x1b[1;1:3C", [Key("right"), Key("right", "repeat"), Key("right", "release")]),
-    # The protocol's own example: ctrl and shift with a; and keys that legacy reports as control characters.
-    (b"\x1b[97;6u", [Key("ctrl-a")]),
-    (b"\x1b[99;5u\x1b[27u\x1b[113;1:3u", [Key("ctrl-c"), Key("escape"), Key("q", "release")]),
-    (b"\x1b[97:65;2u", [Key("a")]),
-    (b"\x1b[0n\x1b[?11u\x1b[?62;c", [Status(), Keyboard(11)]),
-    (b"\x1b[I\x1b[O", [Focus(True), Focus(False)]),
-    (b"\x03 \t\r", [Key("ctrl-c"), Key("space"), Key("tab"), Key("enter")]),
-    # A modifier by itself, a paste's frame, a mouse, an event that there is not: nothing of ours.
-    (b"\x1b[57441;2u\x1b[200~\x1b[<0;1;1M\x1b[1;1:9C", []),
-]
-
-
-@pytest.mark.parametrize(("sent", "heard"), SENT)
-def test_what_a_terminal_sends(sent: bytes, heard: list[Heard]) -> None:
-    assert Decoder().feed(sent) == heard
-    # However it is cut, it is the same.
-    decoder = Decoder()
-    assert [event for k in range(len(sent)) for event in decoder.feed(sent[k : k + 1])] == heard
-
-
-def test_an_escape_by_itself_is_a_key_and_noise_is_none() -> None:
-    decoder = Decoder()
-    assert decoder.feed(b"\x1b") == []
-    assert decoder.flush() == [Key("escape")]
-    noise = np.random.default_rng(1).integers(0, 256, 20_000).astype(np.uint8).tobytes()
-    decoder.feed(noise)
-    decoder.feed(b"\x1b[" + 500 * b"1")
-    assert decoder.feed(b"\x1b[C")[-1] == Key("right")
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +71,7 @@ def test_what_goes_on_is_told_by_its_journal(tmp_path: Path) -> None:
     assert "nothing goes on" in run_lines(tmp_path)[0]
 
 
-def test_without_a_cell_or_a_terminal_the_commands_say_what_they_lack(
+def test_without_a_cell_or_a_motion_the_commands_say_what_they_lack(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -115,4 +81,5 @@ def test_without_a_cell_or_a_terminal_the_commands_say_what_they_lack(
     assert told.stdout.count("there is no cell.toml here") == 3
     assert time.monotonic() - begun < 20
     refused = CliRunner().invoke(app, ["jog"])
-    assert "needs a terminal" in str(refused.exception)
+    assert "say what to move" in str(refused.exception)
+    assert "--sim all" in str(refused.exception)
