@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cell.calibration.store import nominal_camera
+from cell.check.contact import contact_problems
 from cell.check.depths import CALIBRATION_DEPTHS
 from cell.check.place import mesh_box, place_problems, surface_problems, way_problems
 from cell.check.reach import reach_problems
@@ -54,6 +55,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     problems = problems or list(_sight(job, config))
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent), *_stripe(job, config, extent[0][2], extent[1][2])]
+    problems += contact_problems(job, config, mesh)
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
     if problems:

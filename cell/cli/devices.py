@@ -69,8 +69,8 @@ def jog(
 
     if device is None:
         raise ConfigError(
-            "say what to move: `cell jog rail +5mm`, `cell jog arm z +5mm`, `cell jog vehicle +0.1m`; with --sim all in "
-            "a simulated cell. `cell console` moves a device for as long as a button is held"
+            "say what to move: `cell jog rail +5mm`, `cell jog arm z +5mm`, `cell jog vehicle +0.1m`; with --sim all "
+            "in a simulated cell. `cell console` moves a device for as long as a button is held"
         )
     wish = parse_jog(device, motion or [])
     lifted = lift or []

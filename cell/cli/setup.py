@@ -50,6 +50,7 @@ def init(
 
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
+    from cell.check.contact import contact_notes
     from cell.check.fit import require_fit
     from cell.config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
     from cell.console.meshes import link_meshes
@@ -77,6 +78,7 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         require_possible(loaded, loaded.cell.sim, DEVICES)
     examples = [key for key in example_addresses(loaded) if key.partition(".")[0] not in loaded.cell.sim]
     notes = [f"{key} is the example's, where no device is: write your own" for key in examples]
+    notes += contact_notes(checked, mesh)
     records = {name: loaded.device(name) for name in DEVICES}
     notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {

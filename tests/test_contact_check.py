@@ -1,0 +1,66 @@
+"""Jobs whose put-down makes no sense are refused with the value and what is allowed, before anything moves."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell.check.contact import contact_notes, contact_problems
+from cell.config import CellConfig, load_config
+from cell.job import Job, load_job, shipped_jobs
+from cell.toml_file import read_toml, validate
+
+POT = load_job("pot")[1].with_suffix(".toml")
+
+
+@pytest.fixture(scope="module")
+def config() -> CellConfig:
+    return load_config(None)
+
+
+def changed(key: str, value: Any) -> Job:
+    raw = read_toml(POT, "job", "")
+    section = raw
+    *parents, last = key.split(".")
+    for parent in parents:
+        section = section[parent]
+    section[last] = value
+    return validate(Job, raw, "job")
+
+
+@pytest.mark.parametrize("name", shipped_jobs())
+def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
+    job, mesh = load_job(name)
+    assert list(contact_problems(job, config, mesh)) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("place.contact_force", "119 N", r"119 N .*\(allowed: 2 to 102 N"),
+        ("place.contact_speed", "40 mm/s", "goes on by 2 mm.* at most 12 mm/s"),
+        ("place.contact_travel", "0.1 mm", "at least 0.3 mm"),
+        ("place.tolerance", "0.01 mm", "cannot be kept: grasp.sigma .* leave 0.*mm open"),
+        ("place.tolerance_angle", "0.1 mrad", "cannot be kept: grasp.sigma_angle"),
+        ("grasp.sigma", "5 mm", "leave 14 mm open"),
+        ("grasp.sigma_angle", "50 mrad", "leave 140 mrad open"),
+        ("grasp.size", ["400 mm", "400 mm", "20 mm"], "1 % of the part's footprint"),
+        ("grasp.size", ["70 mm", "36 mm", "1 mm"], "goes through the whole part, 8.39 mm"),
+        ("scan.exposure", "30 ms", "smears a line by 0.45 mm"),
+        ("place.surface_from_part.translation", ["0 mm", "0 mm", "10 mm"], "1.61 mm below .* in the air"),
+        ("place.surface_from_part.translation", ["40 mm", "0 mm", "0 mm"], "43 % of the part's footprint"),
+        ("place.surface_from_part.translation", ["300 mm", "0 mm", "0 mm"], "0 % of the part's footprint"),
+    ],
+)
+def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str, config: CellConfig) -> None:
+    problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".stl")))
+    assert any(re.search(told, problem) for problem in problems), problems
+
+
+def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
+    mesh: Path = POT.with_suffix(".stl")
+    deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
+    assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
