@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sqlite3
 import time
 from pathlib import Path
@@ -14,7 +15,7 @@ from cell import Cell
 from cell.cli.runs import abort
 from cell.config import CellConfig, default_toml, load_config
 from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
-from cell.run.lock import CellLock
+from cell.run.lock import CellLock, _name
 from cell.run.reading import Question, awaited_word, read_report, run_row
 from cell.storage import sealed
 from drivers.errors import CellError, ConfigError, InterlockError
@@ -86,6 +87,27 @@ def test_another_user_finds_the_cell_held(config: CellConfig) -> None:
             os._exit(0)
         os.waitpid(child, 0)
     assert os.read(reader, 4) == b"held"
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_name_that_is_taken_denies_nothing(
+    config: CellConfig, listens: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """No cell has it: who does, and how to go on, is told. Two of this user's cells still exclude each other."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as taken:
+        taken.bind(_name("arm", config.device("arm").held))
+        if listens:
+            taken.listen()
+        with pytest.raises(InterlockError, match=f"process {os.getpid()}" if listens else "CELL_LOCKS=own goes on"):
+            CellLock(config).__enter__()
+        monkeypatch.setenv("CELL_LOCKS", "own")
+        with CellLock(config), pytest.raises(InterlockError, match="is held by"):
+            CellLock(config).__enter__()
+    # A folder that others may enter, or that is another's, is not used.
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / f"assembly-cell-{os.getuid()}").mkdir(0o755)
+    with pytest.raises(InterlockError, match="mode 0755"):
+        CellLock(config).__enter__()
 
 
 def test_the_lock_of_a_killed_process_is_free(config: CellConfig) -> None:

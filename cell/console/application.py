@@ -96,7 +96,7 @@ class Guard:
         if plain and path == ENTER:
             return None if self._strangers.take() else (429, "too many requests; wait a moment")
         session = self._access.session(headers.get("cookie", ""))
-        asked = scope["subprotocols"] if live else ()
+        asked: list[str] = scope["subprotocols"] if live else []
         key = asked[1] if len(asked) == 2 and asked[0] == PROTOCOL else headers.get(KEY, "")
         ticket = _asked(scope, "ticket") if plain and SHOWN.fullmatch(path) else ""
         # The page itself and its files say nothing of the cell.
@@ -221,9 +221,9 @@ class Application:
                     if len(body) > MOST_BODY:
                         return _no("content", f"a command has at most {MOST_BODY} bytes", 413)
         except (TimeoutError, ClientDisconnect):
-            answer = _no("content", f"the command did not come within {BODY_S:g} s; send it again", 408)
-            answer.headers["connection"] = "close"
-            return answer
+            late = _no("content", f"the command did not come within {BODY_S:g} s; send it again", 408)
+            late.headers["connection"] = "close"
+            return late
         try:
             words = json.loads(body)
         except (ValueError, RecursionError):
@@ -253,7 +253,7 @@ class Application:
 
 def _asked(scope: Scope, name: str) -> str:
     """A value of the query. Not by Starlette's own parser, whose errors would show what was sent."""
-    return parse_qs(scope["query_string"].decode("latin-1")).get(name, [""])[0]
+    return str(parse_qs(scope["query_string"].decode("latin-1")).get(name, [""])[0])
 
 
 def _json(words: Any, status: int = 200) -> Response:

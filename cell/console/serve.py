@@ -76,7 +76,8 @@ class Patient(H11Protocol):
             return
         # Set with the first request; to its type it is there from the beginning.
         cycle: Any = self.cycle
-        if cycle is before and (cycle is None or cycle.response_complete):
+        answered = cycle is None or cycle.response_complete
+        if answered and cycle is before:
             self.transport.close()
         else:
             self.loop.call_later(IDLE_S, self._look, cycle)

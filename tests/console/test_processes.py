@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -55,6 +57,17 @@ def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:
     assert until(lambda: rehearsals.present is not None and rehearsals.present["state"] == "done")
     assert rehearsals.present["outcome"] == "cancelled"
     assert not running(process.pid)
+
+
+def test_a_dry_run_ends_with_its_input(tmp_path: Path) -> None:
+    """The console holds the other end, which closes with it."""
+    command = [sys.executable, "-m", "cell.console.rehearsal", "pot", "3", "nominal", ""]
+    process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None and process.stdin is not None
+    assert b"loading" in process.stdout.readline()
+    process.stdin.close()
+    assert process.wait(20.0) == 1
+    process.stdout.close()
 
 
 @pytest.mark.parametrize("hung", ["beat", "joined"])

@@ -266,13 +266,14 @@ def test_a_page_that_talks_nonsense_is_put_out(server: Served, said: str | bytes
         assert closed.value.rcvd is not None and closed.value.rcvd.code == code
 
 
-def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served) -> None:
+@pytest.mark.parametrize("said", ['{"type": "jog_end", "press": 1}', '{"type": "stop"}'])
+def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served, said: str) -> None:
     forget(server)
     with server.live() as page:
         client = json.loads(page.recv(timeout=10))["id"]
         with pytest.raises(ConnectionClosed):
             for _ in range(2000):
-                page.send('{"type": "jog_end", "press": 1}')
+                page.send(said)
                 time.sleep(0.0005)
     heard: list[object] = []
     while not heard or heard[-1] != Left(client):
