@@ -43,13 +43,13 @@ export function status(state) {
 }
 
 function positions({ joints, flange, rail, vehicle }) {
-  const three = (values, unit) => (values ? [...values].map(unit) : ['?', '?', '?']);
+  const three = (values, unit) => (values ? values.map((value) => unit(value)) : ['?', '?', '?']);
   const rows = [
-    ['Joints 1–3', ...three(joints?.slice(0, 3), (q) => deg(q, 2))],
-    ['Joints 4–6', ...three(joints?.slice(3), (q) => deg(q, 2))],
-    ['Flange, mm', ...three(flange?.slice(0, 3), (v) => (1e3 * v).toFixed(2))],
-    ['turned', ...three(flange?.slice(3), (v) => deg(v, 2))],
-    ['Vehicle', ...(vehicle ? [mm(vehicle.x, 0), mm(vehicle.y, 0), deg(vehicle.yaw, 2)] : ['?', '?', '?'])],
+    ['Joints 1–3', ...three(joints?.slice(0, 3), deg)],
+    ['Joints 4–6', ...three(joints?.slice(3), deg)],
+    ['Flange, mm', ...three(flange?.slice(0, 3), (v) => (1e3 * v).toFixed(1))],
+    ['turned', ...three(flange?.slice(3), deg)],
+    ['Vehicle', ...(vehicle ? [mm(vehicle.x, 0), mm(vehicle.y, 0), deg(vehicle.yaw)] : ['?', '?', '?'])],
     ['drives at', vehicle ? `${mm(vehicle.speed, 0)}/s` : '?', vehicle ? deg(vehicle.yaw_rate) + '/s' : '?', { true: 'braked', false: 'brake open' }[vehicle?.braked] ?? 'brake ?'],
     ['Rail', rail === null ? '?' : mm(rail, 2), '', ''],
   ];
