@@ -120,7 +120,7 @@ export class Sequence {
     const said = byId('dry-said');
     if (!dry) return say(said, '');
     const computed = dry.state !== 'running';
-    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
+    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason && dry.outcome !== 'placed' ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
     if (!computed && this.awaited === 'asked') this.awaited = 'computing';
     if (computed && this.awaited === 'computing') {
       this.awaited = null;
