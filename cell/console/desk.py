@@ -183,12 +183,15 @@ class Desk:
             busy = f"is starting {self.starting}" if self.starting else "is being asked something else"
             raise InterlockError("cell", f"{busy}; wait a moment, then look before you press again")
         self.starting = what
-        refused: list[Exception] = []
+        stops, refused = self.cell.stops, list[Exception]()
         ended, answered = threading.Event(), threading.Event()
 
         def perform() -> None:
             try:
                 begin()
+                # A stop that came after the press holds for what was begun late, too.
+                if self.cell.stops != stops and (run := self.cell.current) is not None:
+                    run.abort("the cell was stopped while this was starting")
             except Exception as error:
                 log.info("%s: %s", what, error, exc_info=not isinstance(error, CellError))
                 refused.append(error)

@@ -106,7 +106,7 @@ class Look:
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
             "starting": desk.starting,
             "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
-            "dry_run": desk.rehearsals.present, "behind": 0, "busy": busy_words(),
+            "dry_run": desk.rehearsals.present, "busy": busy_words(),
         }  # fmt: skip
 
     def _follow_run(self) -> None:

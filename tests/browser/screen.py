@@ -14,7 +14,7 @@ from queue import Empty, Queue
 from typing import Any
 from urllib.parse import urlsplit
 
-from playwright.sync_api import Browser, BrowserContext, Page, Playwright, Request, WebSocketRoute, expect
+from playwright.sync_api import Browser, Page, Playwright, Request, WebSocketRoute, expect
 
 from tests.wire.cells import started
 
@@ -79,17 +79,12 @@ class Screen:
 
     @classmethod
     def of(
-        cls,
-        browser: Browser,
-        link: str,
-        size: tuple[int, int] = WIDE,
-        touch: bool = False,
-        changes: dict[str, Any] | None = None,
+        cls, browser: Browser, link: str, size: tuple[int, int] = WIDE, changes: dict[str, Any] | None = None
     ) -> Screen:
         """A page that has followed the link and hears the cell; of its state it is told these `changes` instead."""
-        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=touch)
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]})
         if changes is not None:
-            told(context, changes)
+            context.route_web_socket("**/live", lambda link: changed(link, changes))
         screen = cls(context.new_page())
         screen.page.set_default_timeout(20_000)
         screen.page.on("request", screen._asked)
@@ -133,17 +128,13 @@ class Screen:
         self.page.context.close()
 
 
-def told(context: BrowserContext, changes: dict[str, Any]) -> None:
-    """Change what pages of this context are told of the cell's state by `changes`, from now on."""
+def changed(link: WebSocketRoute, changes: dict[str, Any]) -> None:
+    """Pass on a live link, with `changes` in what is told of the cell's state."""
+    server = link.connect_to_server()
 
-    def over(link: WebSocketRoute) -> None:
-        server = link.connect_to_server()
+    def came(message: str | bytes) -> None:
+        if isinstance(message, str) and (said := json.loads(message))["type"] == "state":
+            message = json.dumps({**said, **changes})
+        link.send(message)
 
-        def came(message: str | bytes) -> None:
-            if isinstance(message, str) and (said := json.loads(message))["type"] == "state":
-                message = json.dumps({**said, **changes})
-            link.send(message)
-
-        server.on_message(came)
-
-    context.route_web_socket("**/live", over)
+    server.on_message(came)

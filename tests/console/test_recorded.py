@@ -24,6 +24,4 @@ def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) 
     assert Archive(cell.runs_folder).replay(folder.name) is not None
     record.write_bytes(record.read_bytes()[:60])
     archive = Archive(cell.runs_folder)
-    run = archive.run(folder.name)
-    assert run is not None and not run["replay"]
-    assert archive.replay(folder.name) is None
+    assert not (archive.run(folder.name) or {"replay": True})["replay"] and archive.replay(folder.name) is None

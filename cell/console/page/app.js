@@ -39,12 +39,15 @@ const replay = new Replay(link, (pose) => scene?.pose(pose), () => {
 });
 new Pictures(link);
 
+// What the page shows by itself when it was done.
+const SHOWN = ['jog_step', 'start', 'home', 'calibrate', 'verify'];
+
 // A command of the holder; a refusal is shown in the cell's own words.
 async function ask(name, values) {
   // What was said before has had its time.
   if (name !== 'jog_step') show(byId('answer'), false);
   const answer = await link.do(name, values);
-  if (!answer.ok || answer.rows || name !== 'jog_step') notice(answer);
+  if (!answer.ok || !SHOWN.includes(name)) notice(answer);
   return answer;
 }
 

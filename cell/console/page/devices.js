@@ -1,9 +1,8 @@
-// Each device: its state, who holds it, how its link does, its last error with what to do; faults above all.
+// Each device: its state, who holds it, how its link does, its last error with what to do.
 
 import { byId, el, remake, say, show, words } from './dom.js';
 
 const CLEARED = /^(arm\.(protective_stop|link_lost)|vehicle\.trouble)$/;
-const OLD_S = 0.5, LOUD_S = 30;
 
 export function devices(state) {
   const entries = Object.entries(state.devices);
@@ -12,12 +11,6 @@ export function devices(state) {
   const rows = entries.map(([name, device]) => [name, device, last(name)]);
   remake(byId('device-list'), rows.map(([name, device, met]) => [name, device.simulated, device.fault, device.errors, met]), () => rows.map(row));
   entries.forEach(([name, device], k) => refresh(byId('device-list').children[k], name, device));
-  // The newest one loudly for half a minute; then it stays in its device's row.
-  const fault = faults.at(-1);
-  const going = state.run !== null || Boolean(state.starting);
-  const fresh = fault !== undefined && state.t - fault.t < LOUD_S && !state.question && !(fault.over && going);
-  show(byId('fault'), fresh);
-  if (fresh) say(byId('fault'), told(fault));
   // With no run to ask about it: a person clears it here.
   const ill = state.run === null ? entries.map(([, device]) => device.fault).find((met) => CLEARED.test(met?.code)) : null;
   show(byId('unlock'), Boolean(ill));
@@ -44,12 +37,10 @@ function row([name, device, met]) {
 
 function refresh(item, name, device) {
   item.classList.toggle('bad', !device.ok);
-  item.classList.toggle('old', (device.age_s ?? 0) > OLD_S);
   say(item.querySelector('.what'), device.state ?? '');
   const held = device.held_by ? `held by ${words(device.held_by)}` : '';
   const trip = device.rtt_ms === null || device.rtt_ms === undefined ? '' : `${device.rtt_ms.toFixed(1)} ms`;
-  const age = (device.age_s ?? 0) > OLD_S ? `${device.age_s.toFixed(1)} s old` : '';
-  say(item.querySelector('.link'), [held, trip, age].filter(Boolean).join(' · '));
+  say(item.querySelector('.link'), [held, trip].filter(Boolean).join(' · '));
 }
 
 byId('device-details').onclick = ({ target }) => {

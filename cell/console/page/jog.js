@@ -1,7 +1,7 @@
 // Manual mode: steps, and motion for as long as a button is held. The watchdog stands beside the device, not here: a
 // beat goes out while the button is held, and whatever ends the beats ends the motion.
 
-import { byId, deg, el, mm, quantity, remake, say, show, words } from './dom.js';
+import { byId, el, quantity, say, show, words } from './dom.js';
 
 const HOLD = 'hold';
 
@@ -50,7 +50,6 @@ export class Jog {
       byId('speed').value = Math.round(100 * state.speed);
       say(byId('speed-said'), `${Math.round(100 * state.speed)} %`);
     }
-    if (manual) this.readings(state);
   }
 
   groupOf(entry) {
@@ -86,9 +85,7 @@ export class Jog {
       this.wire(button, entry, way);
       return button;
     };
-    const reading = el('output', { className: 'reading' });
-    reading.entry = entry;
-    return el('div', { className: 'axis' }, sign(-1), el('span', { textContent: name }), reading, sign(1));
+    return el('div', { className: 'axis' }, sign(-1), el('span', { textContent: name }), sign(1));
   }
 
   wire(button, entry, sign) {
@@ -159,21 +156,5 @@ export class Jog {
   told(message) {
     if (message.press === this.held?.press && message.state !== 'moving') this.end(message.state);
     if (message.text) say(byId('jog-said'), message.text);
-  }
-
-  readings(state) {
-    byId('jog-axes').querySelectorAll('.reading').forEach((output) => say(output, this.reading(output.entry, state)));
-  }
-
-  reading({ device, axis }, state) {
-    if (device === 'rail') return state.rail === null ? '?' : mm(state.rail, 2);
-    if (device === 'vehicle') {
-      if (!state.vehicle) return '?';
-      return axis === 'yaw' ? deg(state.vehicle.yaw, 2) : mm(state.vehicle[axis] ?? state.vehicle.x);
-    }
-    if (axis.startsWith('j')) return state.joints ? deg(state.joints[axis[1] - 1], 2) : '?';
-    const at = ['x', 'y', 'z', 'rx', 'ry', 'rz'].indexOf(axis);
-    if (!state.flange || at < 0) return '';
-    return at < 3 ? mm(state.flange[at], 2) : '';
   }
 }

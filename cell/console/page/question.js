@@ -5,7 +5,7 @@ import { byId, el, mm, say, show, words } from './dom.js';
 
 const CHOICES = { confirm: 'I have looked: go on', again: 'Do it again', abort: 'End the run' };
 const REASONS = {
-  confirm: ['nothing touches the arm', 'what it touched was removed', 'a person had touched it'],
+  confirm: ['nothing touches the arm', 'removed what it touched', 'a person touched it'],
   refusal: ['wiped what was dirty', 'removed what was in the way', 'the light was changed', 'nothing is wrong: once more'],
 };
 
@@ -41,9 +41,9 @@ export class Question {
       el('p', { className: 'why', textContent: question.reason }),
       el('p', { textContent: doing(question, run) }),
       this.stands,
-      ...(question.picture ? [el('img', { src: question.picture, alt: 'What the cell saw' })] : []),
       ...(question.numbers?.length ? [numbers(question.numbers)] : []),
       el('ul', { className: 'then' }, ...question.choices.map(({ choice }) => el('li', {}, el('strong', { textContent: `${CHOICES[choice]}: ` }), then(question, choice, run)))),
+      ...(question.picture ? [el('img', { src: question.picture, alt: 'What the cell saw last' })] : []),
       el('div', { className: 'answer' },
         el('div', { className: 'choices', role: 'group', 'aria-label': 'Usual reasons' }, ...usual),
         this.reason,

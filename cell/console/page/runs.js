@@ -1,6 +1,6 @@
 // Earlier runs: their list, the trend of the place error, one run's report and pictures, and the way to its replay.
 
-import { byId, el, seconds, words } from './dom.js';
+import { byId, el, figure, seconds, words } from './dom.js';
 import { trend } from './trend.js';
 
 export class Runs {
@@ -44,12 +44,19 @@ export class Runs {
     const replay = el('button', { type: 'button', className: 'main', textContent: 'Replay in 3-D', onclick: () => this.link.tell('replay', { run, job: report?.job?.name ?? report?.job }) });
     return [
       el('h2', { textContent: run }),
-      el('p', { className: `outcome ${report?.outcome}`, textContent: `${report?.outcome ?? 'going on'}${report?.reason ? `: ${report.reason}` : ''}` }),
+      el('p', { className: `outcome ${report?.outcome}`, textContent: `${report?.outcome ?? 'going on'}${reached(report)}` }),
       el('div', { className: 'buttons' }, ...(replays ? [replay] : []), el('a', { href: this.link.ticketed(`${base}/report.html`), target: '_blank', rel: 'noopener', textContent: 'Report' })),
       el('ol', { className: 'plain' }, ...steps),
       ...(pictures ?? []).map((name) => el('img', { src: this.link.ticketed(`${base}/pictures/${encodeURIComponent(name)}`), alt: words(name), loading: 'lazy' })),
     ];
   }
+}
+
+// A placed run by its error, every other one by its reason.
+function reached(report) {
+  const [error, bound] = [report?.truth?.error_mm?.d?.mean, report?.place_bound_95?.d];
+  if (report?.outcome !== 'placed') return report?.reason ? `: ${report.reason}` : '';
+  return Number.isFinite(error) ? `, true place error ${figure(error)} mm` : Number.isFinite(bound) ? `, stated within ${figure(bound)} mm` : '';
 }
 
 function error(run) {

@@ -123,7 +123,7 @@ export class Sequence {
     show(byId('dry-bar'), !computed);
     byId('dry-fraction').value = dry?.fraction ?? 0;
     if (!dry) return say(said, '');
-    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
+    say(said, computed ? `Dry run of ${dry.job}: ${dry.outcome}${dry.reason && dry.outcome !== 'placed' ? `. ${dry.reason}` : ''}` : `Dry run of ${dry.job}: ${dry.text} …`);
     if (!computed && this.awaited === 'asked') this.awaited = 'computing';
     if (computed && this.awaited === 'computing') {
       this.awaited = null;

@@ -1,6 +1,6 @@
 // What the cell is at: one word that is read from two metres, a sentence beside it, and where everything stands.
 
-import { byId, deg, el, figure, mm, say, seconds, words } from './dom.js';
+import { byId, deg, el, figure, mm, remake, say, seconds, words } from './dom.js';
 
 const ENDS = { refused: 'REFUSED', faulted: 'FAULT', failed: 'FAULT', aborted: 'STOPPED' };
 
@@ -29,8 +29,8 @@ export function ended(last) {
   if (!last) return 'Nothing is going on.';
   const said = `Last ${words(last.kind)}: ${last.outcome}`;
   const error = last.figure;
-  if (error?.kind === 'true') return `${said}, ${figure(error.mm)} mm. That is the true place error (mean of 45 points), which only a simulated cell knows.`;
-  if (error) return `${said}: 95 % of the part's points are stated to lie within ${figure(error.mm)} mm. This was reckoned, not measured on the part.`;
+  if (error?.kind === 'true') return `${said}, true place error ${figure(error.mm)} mm (known in simulation alone)`;
+  if (error) return `${said}, stated within ${figure(error.mm)} mm (95 % of its points; reckoned, not measured)`;
   return said + (last.reason && last.outcome !== 'placed' && last.reason !== `${last.kind} done` ? `. ${last.reason}` : '');
 }
 
@@ -43,17 +43,16 @@ export function status(state) {
 }
 
 function positions({ joints, flange, rail, vehicle }) {
-  const three = (values, unit) => (values ? [...values].map(unit) : ['?', '?', '?']);
+  const three = (values, unit) => (values ? values.map((value) => unit(value)) : ['?', '?', '?']);
   const rows = [
-    ['Joints 1–3', ...three(joints?.slice(0, 3), (q) => deg(q, 2))],
-    ['Joints 4–6', ...three(joints?.slice(3), (q) => deg(q, 2))],
-    ['Flange, mm', ...three(flange?.slice(0, 3), (v) => (1e3 * v).toFixed(2))],
-    ['turned', ...three(flange?.slice(3), (v) => deg(v, 2))],
-    ['Vehicle', ...(vehicle ? [mm(vehicle.x, 0), mm(vehicle.y, 0), deg(vehicle.yaw, 2)] : ['?', '?', '?'])],
+    ['Joints 1–3', ...three(joints?.slice(0, 3), deg)],
+    ['Joints 4–6', ...three(joints?.slice(3), deg)],
+    ['Flange, mm', ...three(flange?.slice(0, 3), (v) => (1e3 * v).toFixed(1))],
+    ['turned', ...three(flange?.slice(3), deg)],
+    ['Vehicle', ...(vehicle ? [mm(vehicle.x, 0), mm(vehicle.y, 0), deg(vehicle.yaw)] : ['?', '?', '?'])],
     ['drives at', vehicle ? `${mm(vehicle.speed, 0)}/s` : '?', vehicle ? deg(vehicle.yaw_rate) + '/s' : '?', { true: 'braked', false: 'brake open' }[vehicle?.braked] ?? 'brake ?'],
     ['Rail', rail === null ? '?' : mm(rail, 2), '', ''],
   ];
-  const body = byId('positions').querySelector('tbody');
-  if (!body.childElementCount) body.append(...rows.map((row) => el('tr', {}, el('th', { scope: 'row', textContent: row[0] }), ...row.slice(1).map(() => el('td')))));
-  rows.forEach((row, k) => row.slice(1).forEach((text, column) => say(body.rows[k].cells[column + 1], text)));
+  remake(byId('positions').querySelector('tbody'), rows, () => rows.map(([name, ...cells]) => el('tr', {},
+    el('th', { scope: 'row', textContent: name }), ...cells.map((textContent) => el('td', { textContent })))));
 }
