@@ -92,6 +92,7 @@ class JobWork:
         """How a job ended whose first calibration ended with this error; its report is the calibration's."""
         if run.folder is None:
             raise error
+        run.control.over = True
         outcome, reason = outcome_of(error), f"in the calibration before the job: {error}"
         run.tell(Event("run_ended", None, {"outcome": outcome, "reason": reason}))
         report = {**read_report(run.folder), "outcome": outcome, "reason": reason}

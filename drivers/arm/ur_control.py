@@ -83,14 +83,14 @@ class ControlThread:
     def _run(self) -> None:
         while not self.finished.is_set():
             request: Request | None
-            # Whatever the last one took: from here on it has to be in time.
-            self._program.awake(math.inf)
             try:
                 request = self._requests.get(timeout=KICK_S)
             except queue.Empty:
                 request = None
             try:
                 if request is None:
+                    # Nothing moves: nothing comes late.
+                    self._program.awake(math.inf)
                     self._program.kick()
                 else:
                     self._serve(request)

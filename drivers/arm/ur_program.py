@@ -26,7 +26,7 @@ BLIND_S = 0.1
 """For how long on the wall the arm's own word may be behind what happens to it."""
 KICK_S, _KICK_BLIND = 0.02, 0.7
 """How often the watchdog is kicked, in s on the wall, and for which part of its time without a word from the arm."""
-LATE_KEPT_S = 1.0
+LATE_KEPT_S = 0.5
 _REST_S = 0.02
 _JOINT_TOLERANCE = 2e-3
 

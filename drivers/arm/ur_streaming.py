@@ -13,15 +13,15 @@ from typing import Any
 
 from drivers.arm.messages import Pace, Setup, Six, Snapshot
 from drivers.arm.trajectory import Trajectory
-from drivers.arm.ur_program import BLIND_S, BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
+from drivers.arm.ur_program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.clock import Clock
 
 _LOOKAHEAD, _GAIN = 0.05, 500
 _SERVO_BRAKING = 10.0
 _SLIP_S = 0.004
-_FEELING_S = 0.02
-"""How far streaming may run ahead of what the arm has reported, in s on the wall, where a contact is awaited; else
-`BLIND_S`."""
+_AHEAD_S, _FEELING_S = 0.04, 0.02
+"""How far streaming may run ahead of what the arm has reported, in s on the wall, and where a contact is awaited. What
+reaches the arm in one go after a halt of its computer is a jump of so much."""
 
 
 class Streaming:
@@ -50,7 +50,7 @@ class Streaming:
         """
         self._sent = []
         force_before = self._mean_force() if force_limit is not None else ()
-        allowed = BLIND_S if force_limit is None else _FEELING_S
+        allowed = _AHEAD_S if force_limit is None else _FEELING_S
         start = time.monotonic()
         seen, lead = self._latest().device_time, 0.0
         cycle, how, text = 0, "", ""
