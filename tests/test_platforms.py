@@ -72,7 +72,9 @@ def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch: pytest.
 
 
 def test_the_table_of_platforms_follows_from_what_lacks() -> None:
-    assert platforms.works(set(), set()) == ("yes", "yes", "yes", "")
-    assert platforms.works({"ur-rtde"}, {"ur-rtde"}) == ("no: ur-rtde", "yes", "yes", "")
-    assert platforms.works({"ompl", "ruckig"}, {"ompl"}) == ("yes", "over one corner: ompl", "yes", "ruckig")
-    assert platforms.works({"pin", "ompl"}, {"pin", "ompl"}) == ("no: pin",) * 3 + ("",)
+    assert platforms.works(set(), set()) == ("yes", "yes", "yes", "yes", "")
+    assert platforms.works({"ur-rtde"}, {"ur-rtde"}) == ("no: ur-rtde", "yes", "yes", "yes", "")
+    without = {"ompl", "embreex"}
+    last = ("over one corner: no ompl", "yes", "no: embreex", "ruckig")
+    assert platforms.works({"ruckig", *without}, without) == ("yes", *last)
+    assert platforms.works({"pin", "ompl"}, {"pin", "ompl"}) == ("no: pin",) * 4 + ("",)

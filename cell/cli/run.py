@@ -193,7 +193,8 @@ def _perform(
 ) -> NoReturn:
     """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
     from cell.cli import EXIT_INTERRUPTED
-    from cell.cli.display import ProgressDisplay, print_late, print_report
+    from cell.cli.display import print_late, print_report
+    from cell.cli.progress import ProgressDisplay
     from statemachine.watch import SignalInterrupt
 
     outcome = None

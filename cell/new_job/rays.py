@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import ConfigError
+from drivers.packages import lacking
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
@@ -24,6 +27,8 @@ class Rays:
     """Rays against the triangles of `vertices` (n, 3) m and `faces` (m, 3)."""
 
     def __init__(self, vertices: Array, faces: Faces) -> None:
+        if missing := lacking("embreex", "embreex"):
+            raise ConfigError(f"what a camera sees of the body cannot be found: {missing}")
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
