@@ -43,7 +43,7 @@ def find_config(path: Path | None, *, simulated: bool = False) -> Path | None:
     raise NoConfiguration(
         f"there is no {CONFIGURATION} in {Path.cwd()}, and nothing is done at an address that nobody gave: name your "
         "configuration with -c FILE, or let `cell init` write one and put your addresses into it. `cell dry-run`, or "
-        "--sim all, simulates a cell"
+        "the same command with --sim all, simulates a cell"
     )
 
 

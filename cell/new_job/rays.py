@@ -61,6 +61,13 @@ class Rays:
         _, met = self.hits(eyes, ways / length[:, None])
         return np.asarray(met > length - NEAR)
 
+    def lie_at(self, points: Array, eyes: Array) -> NDArray[np.bool_]:
+        """(n,) whether the first that each of `eyes` (n, 3) meets on its way to the point (n, 3) lies at that point."""
+        ways = points - eyes
+        length = np.linalg.norm(ways, axis=1)
+        _, met = self.hits(eyes, ways / length[:, None])
+        return np.asarray(np.abs(met - length) <= NEAR)
+
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
         """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.
 

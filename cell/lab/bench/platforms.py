@@ -39,7 +39,7 @@ by `python -m cell.lab.bench.platforms docs/platforms.md`, which needs `uv` and 
   the move is refused.
 - **Offline**: `cell dry-run --clock virtual`, `cell report`, `cell calibrate --from`.
 - **New job**: `cell new-job`, which casts rays with embreex.
-- **Built**: packages without a wheel, which pip builds from their sources; that needs a C++ compiler and CMake.
+- **Built**: packages without a wheel, whose sources pip has to build first; whether it can was not tried.
 
 | platform | Python | wires | ways | offline | new job | built |
 |---|---|---|---|---|---|---|
@@ -58,7 +58,9 @@ def refused(wanted: list[str], platform: str, python: str, *options: str) -> str
 def lacking(wanted: dict[str, str], platform: str, python: str) -> tuple[set[str], set[str]]:
     """Names of `wanted` (their requirements by name) without a wheel, and those of them without sources either."""
     wheels = ("--only-binary", ":all:")
+    # The arm's driver is for Linux, whatever ur-rtde is for.
     bare = {name for name in OPTIONAL if refused([wanted[name]], platform, python, *wheels)}
+    bare |= set() if "manylinux" in platform else {"ur-rtde"}
     while why := refused([line for name, line in wanted.items() if name not in bare], platform, python, *wheels):
         named = [name for name in wanted if name not in bare and re.search(rf"\b{re.escape(name)}[=<>]", why)]
         bare.add(next(name for name in named or wanted if refused([wanted[name]], platform, python, *wheels)))
@@ -71,8 +73,9 @@ def works(no_wheel: set[str], nothing: set[str]) -> tuple[str, str, str, str, st
     built = ", ".join(sorted(no_wheel - nothing))
     if barred := ", ".join(sorted(nothing - set(OPTIONAL))):
         return (f"no: {barred}",) * 4 + (built,)
-    wires, rays = (f"no: {name}" if name in nothing else "yes" for name in ("ur-rtde", "embreex"))
-    return wires, "over one corner: no ompl" if "ompl" in nothing else "yes", "yes", rays, built
+    yes = "if built" if built else "yes"
+    wires, rays = (f"no: {name}" if name in nothing else yes for name in ("ur-rtde", "embreex"))
+    return wires, "over one corner: no ompl" if "ompl" in nothing else yes, yes, rays, built
 
 
 def main(path: Path) -> None:
