@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.cli.progress import ProgressDisplay
-from cell.kept_loops import kept_loops
+from cell.cli.progress import ProgressDisplay, kept_loops
 from statemachine.step import Event
 
 LONG = "arm: it stopped [C153] because points came 15 ms late: this computer is too busy"

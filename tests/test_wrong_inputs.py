@@ -499,7 +499,6 @@ def test_a_file_that_is_none_is_refused(
         (("run",), ("there is no cell.toml", "-c FILE", "cell init", "`cell run --sim all`")),
         (("home",), ("there is no cell.toml", "`cell home --sim all`")),
         (("diag",), ("there is no cell.toml", "`cell diag --sim all`")),
-        (("jog",), ("there is no cell.toml", "`cell jog --sim all`")),
         (("commission",), ("there is no cell.toml", "cell commission --sim all")),
         (("calibrate",), ("there is no cell.toml",)),
         (("calibrate", "verify"), ("there is no cell.toml",)),

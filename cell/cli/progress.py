@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 
 from rich.console import Console
@@ -11,16 +15,29 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
-from cell.kept_loops import LOOPS, kept_loops
 from statemachine.step import Event
 
 SAID = ("note", "paused", "going_on")
 """Kinds of events whose text is shown as it is."""
 COMPILE = "compile"
 """The row of what is compiled."""
+LOOPS = 105
+"""About as many loops does a first dry run compile and keep on disk, those of the simulated world among them."""
 LOOK_S = 2.0
 COMPILED_S = 60.0
 """So long after the last loop was kept nothing more is waited for."""
+
+
+def kept_loops() -> list[float]:
+    """When each compiled loop was kept for this Python, in whichever process, seconds since the epoch."""
+    here = Path(__file__).parents[2]
+    roots = [Path(folder)] if (folder := os.environ.get("NUMBA_CACHE_DIR")) else [here / "cell", here / "sim_backends"]
+    times = []
+    for index in (path for root in roots for path in root.rglob("*.nbi")):
+        if index.name.endswith(f".py{sys.version_info.major}{sys.version_info.minor}.nbi"):
+            with suppress(OSError):
+                times.append(index.stat().st_mtime)
+    return times
 
 
 class ProgressDisplay:

@@ -16,7 +16,7 @@ import pinocchio as pin
 from cell.geometry.poses import from_parts
 from cell.new_job.mesh_file import Body
 from cell.new_job.overlap import before
-from cell.new_job.rays import ABOVE, Array, Faces, Rays
+from cell.new_job.rays import ABOVE, NEAR, Array, Faces, Rays
 from cell.new_job.units import METRES
 from drivers.errors import ConfigError
 
@@ -160,7 +160,7 @@ def _seen_share(pieces: Array, normals: Array, rays: Rays, earlier: Rays | None,
             places = points[ask].reshape(-1, 3)
             open_there = rays.open_between(places, places + FAR * way)
             if earlier is not None:
-                open_there &= ~earlier.lie_at(places, places + FAR * way)
+                open_there &= np.abs(earlier.behind(places, places + FAR * way)) > NEAR
             seen[ask] |= open_there.reshape(len(ask), len(weights))
         share[mine] = seen.mean(axis=1)
     return share
