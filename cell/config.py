@@ -10,12 +10,11 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Collection
-from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, SerializeAsAny, TypeAdapter, ValidationError, WrapValidator, model_validator
+from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
 
 from cell.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
 from cell.device_config import (
@@ -35,22 +34,24 @@ from cell.devices.switch_makes import line_problems
 from cell.obstacles import VehicleObstacle, once_each
 from cell.toml_file import Table, read_toml, validate
 from cell.units import number, shown
+from cell.which_config import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
 from drivers.errors import ConfigError
 
 __all__ = [
+    "CONFIGURATION",
+    "DEVICES",
     "ArmConfig",
     "CameraConfig",
     "CellConfig",
     "RailConfig",
     "VehicleConfig",
+    "beside",
     "default_toml",
     "find_config",
     "load_config",
+    "runs_folder",
     "validate",
 ]
-
-CONFIGURATION = "cell.toml"
-
 
 Confirm = Literal["person", "simulated"]
 """Who confirms what a person has to: a person, or the simulated cell itself."""
@@ -60,7 +61,7 @@ class CellSection(Table):
     """The cell as a whole."""
 
     name: Annotated[str, Name]
-    runs: Annotated[str, Folder] = "runs"
+    runs: Annotated[str, Folder] = RUNS
     calibrations: Annotated[str, Folder] = "calibrations"
     time_scale: Annotated[float, number(0.01, 100)] = 1.0
     truth: Annotated[str, AfterValidator(lambda text: text and checked_endpoint(text))] = ""
@@ -82,18 +83,6 @@ class CellSection(Table):
                 "real devices need time_scale = 1"
             )
         return self
-
-
-DEVICES = {
-    "arm": "arm",
-    "rail": "rail",
-    "vehicle": "vehicle",
-    "scan_camera": "camera",
-    "target_camera": "camera",
-    "laser": "laser",
-    "claw": "claw",
-}
-"""The cell's devices by the name of their table, and what kind each is."""
 
 
 def _devices(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -159,40 +148,6 @@ class CellConfig(Table):
 def default_toml() -> str:
     """Text of the configuration that ships, with the simulated cell's nominal geometry."""
     return files("cell").joinpath("defaults", "cell.toml").read_text(encoding="utf-8")
-
-
-def find_config(path: Path | None, *, simulated: bool = False) -> Path | None:
-    """The configuration's file: the one that is given, else `cell.toml` of the present folder.
-
-    Where there is neither, None (the configuration that ships) if `simulated`, that is, if no real device will be
-    asked for anything; else `ConfigError`: nothing moves at an address that nobody gave.
-    """
-    if path is not None:
-        return path
-    here = Path(CONFIGURATION)
-    if here.exists() or here.is_symlink():
-        return here
-    if simulated:
-        return None
-    raise ConfigError(
-        f"there is no {CONFIGURATION} in {Path.cwd()}, and nothing is done at an address that nobody gave: name your "
-        "configuration with -c FILE, or let `cell init` write one and put your addresses into it. `cell dry-run`, or "
-        "--sim all, simulates a cell"
-    )
-
-
-def beside(path: Path | None) -> Path:
-    """The folder of a configuration, where runs and calibrations go; without a file, the present folder."""
-    return Path.cwd() if path is None else path.resolve().parent
-
-
-def runs_folder(path: Path | None) -> Path:
-    """Where a configuration says that runs go, however wrong the rest of it is: what goes on is ended all the same."""
-    runs = usual = str(CellSection.model_fields["runs"].default)
-    with suppress(ConfigError, ValidationError, AttributeError):
-        named = {} if path is None else read_toml(path, "configuration", "cell init").get("cell", {})
-        runs = TypeAdapter(Annotated[str, Folder]).validate_python(named.get("runs", usual))
-    return beside(path) / runs
 
 
 def load_config(path: Path | None) -> CellConfig:

@@ -210,7 +210,7 @@ def job_path(name: str | Path) -> Path:
         return _job_folder() / f"{name}.toml"
     raise ConfigError(
         f"job {shown(str(name))} is neither a file, nor {shown(f'{name}.toml')} in the present folder, nor one that "
-        f"ships ({', '.join(shipped_jobs())})"
+        f"ships ({', '.join(shipped_jobs())}); `cell new-job` makes one for a mesh of yours"
     )
 
 
@@ -235,7 +235,7 @@ def ships(path: Path) -> bool:
 def load_job(name: str | Path) -> tuple[Job, Path]:
     """Read and check a job; also gives the path of its mesh, which exists. Raises `ConfigError`."""
     path = job_path(name)
-    job = validate(Job, read_toml(path, "job", "cell init"), str(path))
+    job = validate(Job, read_toml(path, "job", "cell new-job"), str(path))
     mesh = path.parent / job.surface.mesh
     if not mesh.is_file():
         raise ConfigError(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cell.cli import main
-from cell.cli.display import ProgressDisplay
+from cell.cli.progress import ProgressDisplay
 from cell.run.folder import new_run
 from statemachine.journal import Journal, Request
 from statemachine.step import Event

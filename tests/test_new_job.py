@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cell.check.fit import require_fit
 from cell.config import load_config
 from cell.job import SurfaceSection, load_job
+from cell.new_job.answers import laid_mesh
 from cell.new_job.make import Made, make_job
 from cell.new_job.mesh_file import read_drawing
 from cell.new_job.questions import Asker, checked
@@ -94,6 +95,30 @@ def test_only_what_lies_open_from_above_is_kept(tmp_path: Path) -> None:
     assert areas[heights < 0.020].sum() == pytest.approx(60e-3**2 - 30e-3**2, rel=0.03)
 
 
+OVER = {
+    "side by side": (((40, 30, 10), (0, 0, 5)), ((10, 10, 10), (40, 0, 5)), False, 1300.0),
+    "one on the other": (((40, 40, 10), (0, 0, 5)), ((20, 20, 10), (0, 0, 15)), False, 1600.0),
+    "one in the other": (((40, 40, 20), (0, 0, 10)), ((20, 20, 10), (0, 0, 10)), True, 1600.0),
+    "crossing": (((40, 30, 10), (0, 0, 5)), ((20, 20, 10), (15, 3, 9)), True, 1300.0),
+    "tops in one plane": (((40, 30, 10), (0, 0, 5)), ((40, 20, 10), (25, 0, 5)), True, 1700.0),
+}
+
+
+@pytest.mark.parametrize("case", OVER)
+def test_bodies_that_overlap_are_told_and_what_lies_double_counts_once(tmp_path: Path, case: str) -> None:
+    *boxes, overlap, area = OVER[case]
+    made = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
+    path = tmp_path / "two.stl"
+    trimesh.util.concatenate(made).export(path)
+    told: list[str] = []
+    laid, _ = laid_mesh(Asker({"unit": "mm"}, None, told.append), read_drawing(path))
+    assert any("2 bodies that share no corner" in text for text in told)
+    assert any("1 and 2 overlap" in text for text in told) is overlap
+    corners = open_side(laid).vertices[open_side(laid).faces]
+    seen = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2].sum()
+    assert 1e6 * seen == pytest.approx(area, rel=0.005)
+
+
 @pytest.mark.parametrize(("longest", "unit"), [(60.0, "mm"), (0.14, "m"), (5.0, "inch")])
 def test_a_unit_is_told_by_the_size_where_one_alone_makes_sense(longest: float, unit: str) -> None:
     found, words = told_by_size(longest)
@@ -119,6 +144,16 @@ def test_a_surface_that_repeats_itself_is_refused_by_its_pitch(tmp_path: Path) -
     with pytest.raises(RefusedError, match=r"looks the same elsewhere: shifted by .*6\.0") as refused:
         from_options(tmp_path, mesh=str(pattern))
     assert '--prior "1 mm"' in str(refused.value)
+
+
+def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cell.new_job.questions.PROGRESS_S", 0.0)
+    told: list[str] = []
+    mesh = str(relief(tmp_path / "wave.stl", lambda x, y: 6 + 2 * np.sin(x / 6)))
+    with pytest.raises(NotObservable):
+        make_job(Asker({"mesh": mesh}, None, told.append), load_config(None), tmp_path, False)
+    for words in ("triangles to look at …", "straight sweeps see …", "tilted sweep 8 of 8", "tells most", "other side"):
+        assert any(words in text for text in told), told
 
 
 def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -> None:

@@ -31,6 +31,23 @@ def test_an_error_is_imported_without_the_devices() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.parametrize("words", [["--help"], ["runs"], ["abort"], ["pause"], ["go-on"], ["confirm"]], ids=" ".join)
+def test_a_command_that_has_to_be_quick_loads_nothing_heavy(tmp_path: Path, words: list[str]) -> None:
+    code = """
+import atexit, sys
+heavy = {"numpy", "cv2", "pinocchio", "scipy", "numba", "transitions"}
+atexit.register(lambda: print("loaded:", *sorted(heavy & set(sys.modules))))
+sys.argv = ["cell", *sys.argv[1:]]
+from cell.cli import main
+main()
+"""
+    run = tmp_path / "runs" / "20260101T000000-abcd"
+    run.mkdir(parents=True)
+    (run / "report.json").write_text('{"outcome": "placed", "simulated": ["rail"], "wall_s": 61.0}')
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1].strip() == "loaded:", done.stderr
+
+
 def test_an_unknown_name_is_no_attribute() -> None:
     with pytest.raises(AttributeError, match="nothing"):
         cell.nothing  # noqa: B018

@@ -6,6 +6,7 @@ stop).
 
 from __future__ import annotations
 
+import shlex
 import sys
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
@@ -34,11 +35,18 @@ def _run() -> None:
         _complain(str(error))
         sys.exit(EXIT_INTERRUPTED)
     except ConfigError as error:
-        _complain(str(error))
+        _complain(f"{error}{_simulated_form(error)}")
         sys.exit(EXIT_USAGE)
     except (CellError, JournalError, OSError) as error:
         _complain(str(error))
         sys.exit(EXIT_FAILED)
+
+
+def _simulated_form(error: Exception) -> str:
+    """The command that was typed, for a simulated cell, where there is no configuration of a real one."""
+    from cell.which_config import NoConfiguration
+
+    return f": `{shlex.join(['cell', *sys.argv[1:], '--sim', 'all'])}`" if isinstance(error, NoConfiguration) else ""
 
 
 def _complain(text: str) -> None:

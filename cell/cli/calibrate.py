@@ -107,10 +107,14 @@ def calibrate(
     from cell.calibration.report import examine
     from cell.calibration.store import archive_of, solve_observations
     from cell.cli.calibration_tables import print_examination
-    from cell.cli.display import ProgressDisplay, print_calibration
+    from cell.cli.display import print_calibration
+    from cell.cli.progress import ProgressDisplay
     from cell.supervisor import Cell
 
-    with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
+    with (
+        Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell,
+        ProgressDisplay(compiles=True) as display,
+    ):
         calibration = cell.calibrate(display, job)
         where, loaded = cell.calibrations_folder, cell.config
     # The devices are free again; what follows takes the observations as they were stored.

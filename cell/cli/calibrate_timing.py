@@ -34,7 +34,7 @@ def timing(
     What is found is kept with the stored calibration and taken out of every sweep by the rail. A rolling shutter, and
     stamps that are not those of an exposure's beginning, are refused by name. Exit code 1 when it is refused.
     """
-    from cell.cli.display import ProgressDisplay
+    from cell.cli.progress import ProgressDisplay
     from cell.supervisor import Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:

@@ -62,7 +62,7 @@ def commission(
     """
     from rich.console import Console
 
-    from cell.cli.display import tell_question
+    from cell.cli.progress import tell_question
     from cell.commission.begin import begin, confirms_itself
     from cell.commission.protocol import write_protocol
     from cell.commission.sequence import CHECKS, chosen

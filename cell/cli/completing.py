@@ -45,7 +45,7 @@ def _is_job(path: Path) -> bool:
 
 def devices(incomplete: str) -> list[str]:
     """Devices of a cell."""
-    from cell.config import DEVICES
+    from cell.which_config import DEVICES
 
     return [name for name in DEVICES if name.startswith(incomplete)]
 

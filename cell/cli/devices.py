@@ -61,7 +61,7 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
-    from cell.cli.display import tell_question
+    from cell.cli.progress import tell_question
     from cell.devices.jogging import jog as perform
     from cell.devices.jogging import needed_for, parse_jog
     from cell.supervisor import Cell
@@ -95,7 +95,7 @@ def home(
     level: LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
-    from cell.cli.display import tell_question
+    from cell.cli.progress import tell_question
     from cell.config import DEVICES
     from cell.supervisor import HOMED, Cell
     from drivers.errors import ConfigError
@@ -130,7 +130,7 @@ def recover(
             raise ConfigError("a person has to look at the cell first: say who has, with --by NAME")
         if not typer.confirm("Have you looked at the cell, and is the way of the arm clear?"):
             raise typer.Exit(EXIT_FAILED)
-    from cell.cli.display import tell_question
+    from cell.cli.progress import tell_question
     from cell.supervisor import HOMED, Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, only=HOMED["arm"]) as cell:

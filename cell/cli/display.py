@@ -1,90 +1,19 @@
-"""Progress bars while a run goes on, the screen at its end, and the tables that are asked for."""
+"""The screen at the end of a run, and the tables that are asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from cell.cli.end_screen import duration, end_screen
-from cell.config import DEVICES
 from cell.report.figures import noise_rows
-from statemachine.runner import Event
-
-SAID = ("note", "paused", "going_on")
-"""Kinds of events whose text is shown as it is."""
+from cell.which_config import DEVICES
 
 COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
-
-
-def tell_question(event: Event, console: Console | None = None) -> None:
-    """An observer that says what a person is asked, and how it is answered; without a console on standard error."""
-    console = console or Console(stderr=True)
-    if event.kind == "confirm_needed":
-        number = event.data["number"]
-        said = f"waiting for a person, question {number}: {event.data['reason']}"
-        console.print(said, style="bold yellow", markup=False)
-        answer = f"cell confirm --question {number} (or cell abort)"
-        console.print(f"when that is done, in another shell here: {answer}", markup=False)
-    elif event.kind == "confirmed":
-        console.print(f"confirmed by {event.data['by']}", markup=False)
-
-
-class ProgressDisplay:
-    """Bars for the steps, a row each; an observer for `Cell.run` and `Cell.calibrate`. Writes to standard error."""
-
-    def __init__(self) -> None:
-        self.console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.fields[step]:<16}"),
-            BarColumn(bar_width=30),
-            TextColumn("{task.percentage:>3.0f}%"),
-            TimeElapsedColumn(),
-            TextColumn("{task.description}"),
-            console=self.console,
-        )
-        self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> ProgressDisplay:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._progress.stop()
-
-    def __call__(self, event: Event) -> None:
-        """Take an event of the runner."""
-        step = event.step
-        if event.kind in SAID and "text" in event.data:
-            self.console.print(str(event.data["text"]), markup=False)
-        elif event.kind in ("confirm_needed", "confirmed"):
-            tell_question(event, self.console)
-        elif step is None:
-            return
-        elif event.kind == "step_started":
-            self._task(step)
-        elif event.kind == "progress":
-            fraction = event.data["fraction"]
-            assert isinstance(fraction, float | int)
-            self._progress.update(self._task(step), completed=fraction, description=str(event.data["text"]))
-        elif event.kind == "step_done":
-            self._progress.update(self._task(step), completed=1.0, description="done")
-            self._progress.stop_task(self._task(step))
-        elif event.kind == "step_failed":
-            self._progress.update(self._task(step), description=f"[red]{event.data['reason']}"[:90])
-            self._progress.stop_task(self._task(step))
-
-    def _task(self, step: str) -> TaskID:
-        if step not in self._tasks:
-            self._tasks[step] = self._progress.add_task("", total=1.0, step=step)
-        return self._tasks[step]
 
 
 def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -112,6 +113,7 @@ def dry_run(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="With --console: where the page is.")] = 0,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
+    typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
     from cell.check.fit import require_fit
     from cell.config import find_config, load_config
     from cell.devices.injection import Injection
@@ -193,14 +195,17 @@ def _perform(
 ) -> NoReturn:
     """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
     from cell.cli import EXIT_INTERRUPTED
-    from cell.cli.display import ProgressDisplay, print_late, print_report
+    from cell.cli.display import print_late, print_report
+    from cell.cli.progress import ProgressDisplay
     from statemachine.watch import SignalInterrupt
 
     outcome = None
     try:
-        with opened() as cell:
-            with ProgressDisplay() as display:
-                outcome = work(cell, display)
+        with ExitStack() as shown:
+            display = shown.enter_context(ProgressDisplay(compiles=True))
+            cell = shown.enter_context(opened())
+            outcome = work(cell, display)
+            display.end()
             if json:
                 print_json(outcome.report)
             else:

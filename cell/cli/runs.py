@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -168,15 +169,22 @@ def report(
 
 
 def folder_of_runs(config: Path | None) -> Path:
-    """Where the runs are of the cell that is configured; raises `ConfigError` when it is not."""
-    from cell.config import beside, find_config, load_config
+    """Where the runs are of the cell that is configured; raises `ConfigError` where its file cannot be read."""
+    from cell.which_config import find_config, runs_folder
 
     path = find_config(config, simulated=True)
-    return beside(path) / load_config(path).cell.runs
+    try:
+        tomllib.loads("" if path is None else path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        from cell.config import tables_of
+
+        # Raises what is wrong, in words; it is slow to load.
+        tables_of(path)
+    return runs_folder(path)
 
 
 def _going_folder(config: Path | None) -> Path:
     """As `folder_of_runs`, for who ends or holds what goes on: the configuration may have become wrong meanwhile."""
-    from cell.config import find_config, runs_folder
+    from cell.which_config import find_config, runs_folder
 
     return runs_folder(find_config(config, simulated=True))

@@ -37,7 +37,7 @@ def verify(
     Exit code 0: good, or changed by less than matters at the job's place. 1: the place may be off by a third of its
     tolerance or more, with the suspected part, or the pictures fit worse than they did.
     """
-    from cell.cli.display import ProgressDisplay
+    from cell.cli.progress import ProgressDisplay
     from cell.supervisor import Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:

@@ -41,7 +41,8 @@ def begin(
     path = Path(CONFIGURATION) if config is None else config
     if not path.is_file():
         raise ConfigError(
-            f"there is no {path} to commission: `cell init` writes one; put in what you know, addresses first"
+            f"there is no {path} to commission: `cell init` writes one; put in what you know, addresses first. Or try "
+            "it with a simulated cell: `cell init`, then `cell commission --sim all`"
         )
     loaded = load_config(path)
     if sim is None:

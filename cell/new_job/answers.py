@@ -14,6 +14,7 @@ from cell.device_config import Mounting, Pose
 from cell.geometry.poses import from_parts
 from cell.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.new_job.mesh_file import Body, Drawn
+from cell.new_job.overlap import overlapping
 from cell.new_job.questions import Asker, checked, choice, pose, pose_words, three
 from cell.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
 from cell.new_job.text import deg, mm
@@ -23,6 +24,8 @@ from cell.units import parse_quantity, shown
 from cell.vision import parse_board
 from drivers.errors import ConfigError
 
+LISTED = 9
+"""Bodies that are told one by one."""
 PART_HEIGHT = 0.02
 """How thick a part is taken to be whose size nobody gave, m."""
 WIDEST_PART = (0.1, 0.07)
@@ -61,10 +64,14 @@ def _bodies(asker: Asker, drawn: Drawn) -> list[Body]:
         asker.tell(f"mesh: {note}")
     if len(drawn.bodies) == 1:
         return list(drawn.bodies)
-    asker.tell(f"mesh: {len(drawn.bodies)} bodies that do not touch, in the file's unit:")
-    for k, body in enumerate(drawn.bodies[:9]):
+    asker.tell(f"mesh: {len(drawn.bodies)} bodies that share no corner, in the file's unit:")
+    for k, body in enumerate(drawn.bodies[:LISTED]):
         sides = " x ".join(f"{side:.4g}" for side in body.size)
         asker.tell(f"  {k + 1}: {sides}, {len(body.triangles)} triangles, {'closed' if body.closed else 'open'}")
+    for one, other in overlapping(drawn.bodies[:LISTED]):
+        asker.tell(
+            f"  {one + 1} and {other + 1} overlap: what lies inside is no surface, and what lies double counts once"
+        )
 
     def parse(text: str) -> list[Body]:
         if text.strip() == "all":

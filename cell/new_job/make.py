@@ -68,10 +68,11 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         return next(iter(sweep_problems(tried, config, laid.box)), None)
 
     asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step, reachable)
+    proposal = propose(laid, job, config, step, reachable, asker.progress)
     if proposal.open and asker.given.get("turn") is None:
         # The light comes aslant from behind: from the other side it falls on other flanks.
-        other = propose(about(laid), job, config, step, reachable)
+        asker.tell("choosing sweeps from the other side as well …")
+        other = propose(about(laid), job, config, step, reachable, asker.progress)
         if not other.open:
             laid, proposal = (
                 about(laid),
@@ -87,6 +88,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         there = Path(place)
         written(proposal.surface, there / targets[1].name, f"{name}: what the sweeps see, mm, z up")
         (there / targets[0].name).write_text(job_text(proposal.job, heading), encoding="utf-8")
+        asker.tell("checking the job as the cell does, and whether the surface looks the same elsewhere …")
         notes = _checked(asker, there / targets[0].name, config, proposal)
         nominal = NominalSurface.load(there / targets[1].name, "mm")
         found = _place(asker, proposal, nominal, config)

@@ -145,7 +145,7 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> Body:
     if lone:
         notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
     if crowded:
-        notes.append(f"{crowded} edges belong to more than two triangles")
+        notes.append(f"{crowded} edges belong to more than two triangles: bodies meet there, or walls lie inside")
     return Body(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
 
 

@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import ConfigError
+from drivers.packages import lacking
+
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
@@ -24,6 +27,8 @@ class Rays:
     """Rays against the triangles of `vertices` (n, 3) m and `faces` (m, 3)."""
 
     def __init__(self, vertices: Array, faces: Faces) -> None:
+        if missing := lacking("embreex", "embreex"):
+            raise ConfigError(f"what a camera sees of the body cannot be found: {missing}")
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -51,10 +56,13 @@ class Rays:
 
     def open_between(self, points: Array, eyes: Array) -> NDArray[np.bool_]:
         """(n,) whether nothing lies between each of `eyes` (n, 3) and the point (n, 3) on the mesh."""
+        return np.asarray(self.behind(points, eyes) > -NEAR)
+
+    def behind(self, points: Array, eyes: Array) -> Array:
+        """(n,) how far behind the point (n, 3) that lies which each of `eyes` (n, 3) sees there first, m."""
         ways = points - eyes
         length = np.linalg.norm(ways, axis=1)
-        _, met = self.hits(eyes, ways / length[:, None])
-        return np.asarray(met > length - NEAR)
+        return self.hits(eyes, ways / length[:, None])[1] - length
 
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
         """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.

@@ -6,7 +6,7 @@ A body has an underside and inner walls that no sweep sees; taken along, they wo
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +15,8 @@ import pinocchio as pin
 
 from cell.geometry.poses import from_parts
 from cell.new_job.mesh_file import Body
-from cell.new_job.rays import ABOVE, Array, Faces, Rays
+from cell.new_job.overlap import before
+from cell.new_job.rays import ABOVE, NEAR, Array, Faces, Rays
 from cell.new_job.units import METRES
 from drivers.errors import ConfigError
 
@@ -112,32 +113,38 @@ def centred(laid: Laid) -> Laid:
     return raised(laid, -round(0.5 * float(low[2] + high[2]), 3))
 
 
-def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,)) -> Laid:
+def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str], None] = lambda text: None) -> Laid:
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
-    A triangle that is hidden in part is halved until its pieces are small. Raises `ConfigError` when next to nothing is
-    seen.
+    A triangle that is hidden in part is halved until its pieces are small. Where faces of overlapping bodies lie at
+    one place, the first body's counts. `tell` is told how far it is. Raises `ConfigError` when next to nothing is seen.
     """
     rays = Rays(laid.vertices, laid.faces)
+    body, earlier = before(laid.vertices, laid.faces)
     finest = max(FINEST, float(np.ptp(laid.vertices, axis=0).max()) / PIECES)
     corners, normals = laid.vertices[laid.faces], rays.normals
     towards = np.array(ways)
     facing = (normals @ towards.T > STEEPEST).any(axis=1)
-    pieces, normals = corners[facing], normals[facing]
+    pieces, normals, body = corners[facing], normals[facing], body[facing]
     kept = []
     while len(pieces):
-        share = _seen_share(pieces, normals, rays, towards, finest)
+        tell(f"what lies open to the scan head: {len(pieces)} triangles to look at")
+        share = np.zeros(len(pieces))
+        for k in np.unique(body):
+            mine = body == k
+            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier[k], towards, finest)
         longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
         mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
         kept.append(pieces[~mixed & (share > 0.5)])
-        pieces, normals = _halved(pieces[mixed]), np.repeat(normals[mixed], 2, axis=0)
+        pieces, normals, body = _halved(pieces[mixed]), np.repeat(normals[mixed], 2, axis=0), np.repeat(body[mixed], 2)
     triangles = np.concatenate(kept) if kept else np.empty((0, 3, 3))
     vertices, numbers = np.unique(np.round(triangles.reshape(-1, 3), 9), axis=0, return_inverse=True)
     return _required(replace(laid, vertices=vertices, faces=numbers.reshape(-1, 3)))
 
 
-def _seen_share(pieces: Array, normals: Array, rays: Rays, ways: Array, step: float) -> Array:
-    """(n,) which share of places `step` m apart on each triangle (n, 3, 3) is seen from one of the ways (k, 3)."""
+def _seen_share(pieces: Array, normals: Array, rays: Rays, earlier: Rays | None, ways: Array, step: float) -> Array:
+    """(n,) which share of places `step` m apart on each triangle (n, 3, 3) is seen from one of the ways (k, 3), and
+    does not lie on an `earlier` body as well."""
     longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
     divisions = np.clip(np.ceil(longest / step), 1, MOST_PLACES).astype(np.intp)
     share = np.zeros(len(pieces))
@@ -151,7 +158,10 @@ def _seen_share(pieces: Array, normals: Array, rays: Rays, ways: Array, step: fl
         for way in ways:
             ask = np.flatnonzero(normals[mine] @ way > STEEPEST)
             places = points[ask].reshape(-1, 3)
-            seen[ask] |= rays.open_between(places, places + FAR * way).reshape(len(ask), len(weights))
+            open_there = rays.open_between(places, places + FAR * way)
+            if earlier is not None:
+                open_there &= np.abs(earlier.behind(places, places + FAR * way)) > NEAR
+            seen[ask] |= open_there.reshape(len(ask), len(weights))
         share[mine] = seen.mean(axis=1)
     return share
 

@@ -8,6 +8,7 @@ themselves. What a platform has is what can be installed there; only where the d
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
@@ -23,7 +24,7 @@ PLATFORMS = {
     "Windows x86-64": "x86_64-pc-windows-msvc",
 }
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-OPTIONAL = ("ur-rtde", "ompl")
+OPTIONAL = ("ur-rtde", "ompl", "embreex")
 """Imported when they are needed; `pyproject.toml` asks for them where they have wheels."""
 HEAD = """# Platforms
 
@@ -37,40 +38,44 @@ by `python -m cell.lab.bench.platforms docs/platforms.md`, which needs `uv` and 
 - **Ways**: free moves of the arm. Without OMPL it takes a direct way or one over one corner; where neither is free,
   the move is refused.
 - **Offline**: `cell dry-run --clock virtual`, `cell report`, `cell calibrate --from`.
-- **Built**: packages without a wheel, which pip builds from their sources; that needs a C++ compiler and CMake.
+- **New job**: `cell new-job`, which casts rays with embreex.
+- **Built**: packages without a wheel, whose sources pip has to build first; whether it can was not tried.
 
-| platform | Python | wires | ways | offline | built |
-|---|---|---|---|---|---|
+| platform | Python | wires | ways | offline | new job | built |
+|---|---|---|---|---|---|---|
 """
 
 
-def resolved(wanted: list[str], platform: str, python: str, *options: str) -> bool:
-    """Whether the index has all of `wanted`, and all that it needs in turn, for this platform and Python."""
+def refused(wanted: list[str], platform: str, python: str, *options: str) -> str:
+    """Why the index has not all of `wanted`, and all that it needs, for this platform and Python; "" where it has."""
     command = ["uv", "pip", "compile", "--quiet", "--python-platform", platform, "--python-version", python, *options]
     done = subprocess.run([*command, "-"], input="\n".join(wanted), capture_output=True, text=True, timeout=300)
-    if done.returncode and "No solution found" not in done.stderr and "Failed to build" not in done.stderr:
+    if done.returncode and not any(word in done.stderr for word in ("No solution found", "Failed to build")):
         raise RuntimeError(f"the index was not asked: {done.stderr.strip()}")
-    return done.returncode == 0
+    return done.stderr if done.returncode else ""
 
 
 def lacking(wanted: dict[str, str], platform: str, python: str) -> tuple[set[str], set[str]]:
     """Names of `wanted` (their requirements by name) without a wheel, and those of them without sources either."""
     wheels = ("--only-binary", ":all:")
-    certain = [line for name, line in wanted.items() if name not in OPTIONAL]
-    # One question answers for most platforms; package by package only where it does not.
-    doubtful = OPTIONAL if resolved(certain, platform, python, *wheels) else tuple(wanted)
-    bare = {name for name in doubtful if not resolved([wanted[name]], platform, python, *wheels)}
-    # ur-rtde's and OMPL's sources need libraries that pip does not bring.
-    return bare, {name for name in bare if name in OPTIONAL or not resolved([wanted[name]], platform, python)}
+    # The arm's driver is for Linux, whatever ur-rtde is for.
+    bare = {name for name in OPTIONAL if refused([wanted[name]], platform, python, *wheels)}
+    bare |= set() if "manylinux" in platform else {"ur-rtde"}
+    while why := refused([line for name, line in wanted.items() if name not in bare], platform, python, *wheels):
+        named = [name for name in wanted if name not in bare and re.search(rf"\b{re.escape(name)}[=<>]", why)]
+        bare.add(next(name for name in named or wanted if refused([wanted[name]], platform, python, *wheels)))
+    # The sources of the optional ones need libraries that pip does not bring.
+    return bare, {name for name in bare if name in OPTIONAL or refused([wanted[name]], platform, python)}
 
 
-def works(no_wheel: set[str], nothing: set[str]) -> tuple[str, str, str, str]:
-    """Wires, ways, offline and built of a row of the table; `nothing` are those that cannot be built either."""
+def works(no_wheel: set[str], nothing: set[str]) -> tuple[str, str, str, str, str]:
+    """Wires, ways, offline, new job, built of a row of the table; `nothing` are those that cannot be built either."""
     built = ", ".join(sorted(no_wheel - nothing))
     if barred := ", ".join(sorted(nothing - set(OPTIONAL))):
-        return f"no: {barred}", f"no: {barred}", f"no: {barred}", built
-    wires = "no: ur-rtde" if "ur-rtde" in nothing else "yes"
-    return wires, "over one corner: ompl" if "ompl" in nothing else "yes", "yes", built
+        return (f"no: {barred}",) * 4 + (built,)
+    yes = "if built" if built else "yes"
+    wires, rays = (f"no: {name}" if name in nothing else yes for name in ("ur-rtde", "embreex"))
+    return wires, "over one corner: no ompl" if "ompl" in nothing else yes, yes, rays, built
 
 
 def main(path: Path) -> None:

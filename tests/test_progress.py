@@ -1,0 +1,87 @@
+"""Rows of a run's progress: one line each at 80 columns, their bars in one place, ended ones told from others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cell.cli.progress import ProgressDisplay, kept_loops
+from statemachine.step import Event
+
+LONG = "arm: it stopped [C153] because points came 15 ms late: this computer is too busy"
+
+
+def rows(capsys: pytest.CaptureFixture[str], display: ProgressDisplay, *events: Event) -> dict[str, str]:
+    with display:
+        for event in events:
+            display(event)
+    return {line[2:].split()[0]: line for line in capsys.readouterr().err.splitlines() if line.strip()}
+
+
+def test_at_80_columns_bars_keep_their_place_and_ended_rows_look_ended(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = rows(
+        capsys,
+        ProgressDisplay(),
+        Event("progress", "calibrate", {"fraction": 1.0, "text": "stored"}),
+        Event("step_started", "drive_to_target", {}),
+        Event("progress", "drive_to_target", {"fraction": 0.99, "text": LONG}),
+        Event("step_done", "drive_to_target", {}),
+        Event("progress", "laser_sweep", {"fraction": 0.42, "text": LONG}),
+        Event("step_failed", "place", {"reason": LONG}),
+    )
+    assert all(len(line) <= 80 for line in shown.values())
+    assert {line.index("━") for line in shown.values() if "━" in line} == {19}
+    assert [(name, line[0], line[40:44]) for name, line in shown.items()] == [
+        ("calibrate", "✓", "done"),
+        ("drive_to_target", "✓", "done"),
+        ("laser_sweep", " ", " 42%"),
+        ("place", "✗", "fail"),
+    ]
+    assert shown["drive_to_target"].split()[-1].startswith("0:00:")
+    assert "[C153]" in shown["laser_sweep"]
+
+
+def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("cell.cli.progress.LOOK_S", 0.01)
+    told: list[str] = []
+    monkeypatch.setattr(ProgressDisplay, "_show", lambda self, step, fraction, text: told.append(f"{step} {text}"))
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    old = tmp_path / f"old.{version}.nbi"
+    old.touch()
+    os.utime(old, (1.0, 1.0))
+    with ProgressDisplay(compiles=True):
+        for name in ("one", "two"):
+            (tmp_path / f"{name}.{version}.nbi").touch()
+        until = time.monotonic() + 20.0
+        while not told and time.monotonic() < until:
+            time.sleep(0.01)
+    assert told[0].startswith("compile once, about ")
+    assert told[-1] == "compile 2 loops, kept"
+    assert "compiling, once" in capsys.readouterr().err
+    assert len(kept_loops()) == 3
+
+
+def test_a_dry_run_says_something_before_it_loads_anything_heavy() -> None:
+    code = """
+import sys, typer
+def said(text, err=False):
+    print(text, err, *sorted({"numpy", "pinocchio", "cv2", "numba"} & set(sys.modules)))
+    raise SystemExit
+typer.echo = said
+sys.argv = ["cell", "dry-run"]
+from cell.cli import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[0] == "dry run of pot in the simulated world 1: loading True"
