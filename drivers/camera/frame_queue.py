@@ -28,7 +28,8 @@ class FrameQueue:
     """Frames in order, at most `capacity`; a frame that finds it full is dropped and counts as lost. One whose times
     cannot be true ends it: see `drivers.camera.stamps`.
 
-    `exposure` in s is what the camera was set to, where its frames tell theirs. `check` raises when no frame can come any more. `lost` counts the gaps in the frame ids of the frames handed out.
+    `exposure` in s is what the camera was set to, where its frames tell theirs. `check` raises when no frame
+    can come any more. `lost` counts the gaps in the frame ids of the frames handed out.
     """
 
     def __init__(

@@ -39,9 +39,7 @@ class Stamps:
             return None
         self._last = frame
         if not (math.isfinite(frame.exposure) and frame.exposure > 0.0):
-            return self._made(
-                "camera.exposure", f"frame {frame.frame_id} says it was exposed {frame.exposure:g} s"
-            )
+            return self._made("camera.exposure", f"frame {frame.frame_id} says it was exposed {frame.exposure:g} s")
         wanted = frame.exposure if self._exposure is None else self._exposure
         if abs(frame.exposure - wanted) > _SAME * wanted:
             return self._made(

@@ -744,6 +744,21 @@ def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(ho
     assert homed.model.settings.microsteps == 7
 
 
+@pytest.mark.parametrize("off", [1, -1, 2])
+def test_a_module_that_stands_one_count_off_its_target_has_arrived(
+    homed: Bench, monkeypatch: pytest.MonkeyPatch, off: int
+) -> None:
+    counted = homed.model.position
+    monkeypatch.setattr(homed.model, "position", lambda t: counted(t) + off)
+    motion = homed.rail.move_to(0.01)
+    if abs(off) == 1:
+        motion.wait(10.0)
+        assert homed.rail.state().position == pytest.approx(0.01, abs=1e-7)
+    else:
+        with pytest.raises(DeviceFault, match=r"its target is|has not ended"):
+            motion.wait(10.0)
+
+
 @pytest.mark.parametrize(("lost", "refused"), [(0.0, False), (0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
 def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool) -> None:
     world, clock = WorldClock(1.0), Clock(1.0)
