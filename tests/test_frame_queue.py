@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +19,41 @@ from drivers.interfaces import Frame, LinkStatistics
 
 
 def frame(number: int) -> Frame:
-    return Frame(np.zeros((1, 1), np.uint8), number, 0.01, 0.0, 0.0, 0.0)
+    return Frame(np.zeros((1, 1), np.uint8), number, 0.01, 0.02 * number, 0.02 * number, 1.0 + 0.02 * number)
 
 
-def queue(capacity: int = 8, check: Callable[[], None] = lambda: None) -> FrameQueue:
-    return FrameQueue("camera", Clock(), capacity=capacity, longest_gap=0.1, check=check, statistics=LinkStatistics())
+def queue(capacity: int = 8, check: Callable[[], None] = lambda: None, exposure: float | None = None) -> FrameQueue:
+    return FrameQueue(
+        "camera", Clock(), capacity=capacity, longest_gap=0.1, check=check, statistics=LinkStatistics(),
+        exposure=exposure,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code", "told"),
+    [
+        ({"device_time": math.nan}, "camera.stamp", "time stamp of frame 3 is nan s"),
+        ({"host_time": math.inf}, "camera.stamp", "time stamp of frame 3 is"),
+        ({"exposure": math.nan}, "camera.exposure", "says it was exposed nan s"),
+        ({"exposure": -0.01}, "camera.exposure", "says it was exposed -0.01 s"),
+        ({"exposure": 0.002}, "camera.exposure", "exposed 2.00 ms instead of 10.00 ms: it belongs to another setting"),
+        ({"device_time": 0.03}, "camera.stamp", "goes back by 10.0 ms from that of frame 2"),
+        ({"device_time": 0.04}, "camera.stamp", "goes back by -?0.0 ms"),
+        ({"device_time": 0.044}, "camera.stamp", "4.00 ms after .* frame 2, .* it belongs to another exposure"),
+        ({"host_time": 2.0}, "camera.stamp", "in the future: its exposure ends 950.0 ms after the picture came"),
+    ],
+)
+def test_a_frame_whose_times_cannot_be_true_ends_the_acquisition(wrong: dict[str, float], code: str, told: str) -> None:
+    """Those before it are handed out; after it none is."""
+    frames = queue(exposure=0.01)
+    frames.expect(1)
+    for made in (frame(0), frame(1), frame(2), replace(frame(3), **wrong), frame(4)):
+        frames.put(made)
+    assert [frames.next(0.1).frame_id for _ in range(2)] == [1, 2]
+    for _ in range(2):
+        with pytest.raises(DeviceFault, match=told) as met:
+            frames.next(0.1)
+        assert (met.value.code, met.value.recoverable) == (code, False)
 
 
 def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too() -> None:

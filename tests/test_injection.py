@@ -65,7 +65,7 @@ def test_the_door_without_wires_has_every_fault_but_those_of_a_wire() -> None:
         direct.require(name)
     assert set(direct.ON_WIRES) == {
         "arm.late_states", "rail.drop_reply", "rail.late_reply", "can.bus_off", "can.foreign_commands",
-        "can.second_vehicle",
+        "can.second_vehicle", "can.refused_frames",
     }  # fmt: skip
     for name in direct.ON_WIRES:
         with pytest.raises(ValueError, match=r"fault of the wire.*use --clock wall"):

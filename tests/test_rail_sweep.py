@@ -23,10 +23,11 @@ from cell.lab.bench.whole_job import NoFrames
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.frame_times import step_of_clock
-from cell.steps.laser_sweep import _home
+from cell.steps.laser_sweep import UNCHECKED, _home, laser_sweep
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from drivers.errors import DeviceFault
@@ -79,6 +80,42 @@ def sweep(
 
     collector = Collector(GEOMETRY, scan, keep, lambda fraction, text: None)
     return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
+
+
+@pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
+def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
+    fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
+    cell = VirtualCell(CONFIG, seed=4, level="ideal")
+    devices = cell.devices
+    devices.vehicle.brake()
+    devices.interlocks.work_with(CONFIG.calibration_hash())
+    devices.rail.home().wait(60.0)
+    mover = Mover(devices.arm, cell.clock, CONFIG, None)
+    mover.to_joints(HOME)
+    pose: pin.SE3 = from_ur(devices.arm.state().flange)
+    told: list[str] = []
+    if fault:
+        cell.fault(fault)
+    if mode == 1:
+        monkeypatch.setattr(devices.rail, "check_zero", lambda: None)
+
+    def swept() -> SweepRecord:
+        plans = [ScanPlan(pose, pose, 0.03, 0.05)]
+        return laser_sweep(
+            plans, SCAN, GEOMETRY, ERRORS, mover, devices, lambda frame: None, lambda: None,
+            lambda fraction, text: told.append(text),
+        )  # fmt: skip
+
+    if fault:
+        with pytest.raises(DeviceFault, match="lost steps") as met:
+            swept()
+        assert (met.value.code, met.value.recoverable) == ("rail.lost_steps", True)
+        assert not devices.rail.state().homed_here
+    else:
+        assert swept().doubts == ((UNCHECKED,) if mode == 1 else ())
+    assert "looking whether the rail has lost steps" in told
 
 
 def refused(code: str, meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> str:

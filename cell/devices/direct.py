@@ -26,6 +26,7 @@ from drivers.errors import ConfigError
 from drivers.quantities import UNTOLD
 from drivers.rail.following import CarriageWatch
 from drivers.rail.timing import EvenMotion
+from drivers.rail.zero_check import ZeroCheck
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
@@ -125,6 +126,7 @@ def setup_of(config: CellConfig) -> Setup:
             reverses(rail),
             EvenMotion.of,
             CarriageWatch,
+            ZeroCheck,
             _serial(rail),
         ),
         VehicleSetup(

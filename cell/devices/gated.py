@@ -19,6 +19,7 @@ from drivers.interfaces import (
     Arm,
     ArmMotion,
     ArmState,
+    ChecksZero,
     Claw,
     Motion,
     Nudged,
@@ -187,6 +188,15 @@ class GatedRail(Gated[Rail]):
             raise InterlockError(self.name, "this make of rail moves only when it is homed; home it first")
         command = Command("rail", "nudge", {"distance": distance})
         return self.gate.begin(command, lambda: bare.nudge(distance, speed), self.bare.stop)
+
+    def check_zero(self) -> Motion | None:
+        """See `ChecksZero`; None also for a make that does not offer it."""
+        bare = self.bare
+        if not isinstance(bare, ChecksZero):
+            return None
+        motion = self.gate.begin(Command("rail", "move_to", {"position": 0.0}), bare.check_zero, bare.stop)
+        self.motion = motion or self.motion
+        return motion
 
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """See `Rail.sweep`."""

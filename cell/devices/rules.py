@@ -193,8 +193,8 @@ def _kinematics(now: Situation, command: Command) -> str | None:
     return (
         f"the arm reports its flange {1e3 * way:.3f} mm and {1e3 * turn:.3f} mrad away from where this cell's model of "
         f"it has it (allowed {1e3 * SAME_M:g} mm, {1e3 * SAME_RAD:g} mrad), so it would go elsewhere than planned. See "
-        "that nobody has set another tool at the pendant, that arm.model and arm.address are right and that the "
-        "controller's port 30001 can be read; then connect anew, and calibrate the cell if the arm was exchanged"
+        "that nobody has set another tool at the pendant, that arm.address is this arm's and that the controller's "
+        "port 30001 can be read; then connect anew, and calibrate the cell if the arm was exchanged"
     )
 
 

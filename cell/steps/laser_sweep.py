@@ -40,6 +40,11 @@ SHIFT_SHARE = 0.25
 it to one side without any scatter; what else the place may be off by has the other three quarters.
 """
 
+UNCHECKED = (
+    "whether the rail lost steps in the sweep is not seen: this make of rail, or its rail.reference_mode, does not "
+    "show its reference switch"
+)
+
 
 def laser_sweep(
     plans: Sequence[ScanPlan],
@@ -56,7 +61,7 @@ def laser_sweep(
     """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
 
     `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep`
-    and `arm_sweep` raise.
+    and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
     """
     sweep = arm_sweep if scan.mode == "arm" else rail_sweep
     progress(0.01, "preparing")
@@ -73,7 +78,17 @@ def laser_sweep(
         collector = Collector(geometry, scan, keep_frame, tell)
         sweeping(collector)
         swaths.append(sweep(plan, mover, devices, errors, collector))
-    return SweepRecord(tuple(swaths))
+    return SweepRecord(tuple(swaths), doubts=() if scan.mode == "arm" else _counted(devices, progress))
+
+
+def _counted(devices: Devices, progress: Callable[[float, str], None]) -> tuple[str, ...]:
+    """Look whether the rail has lost steps, which its readings do not show: they are its counter's. For people, that
+    this cannot be seen. Raises `DeviceFault` (rail.lost_steps)."""
+    progress(0.99, "looking whether the rail has lost steps")
+    if (check := devices.rail.check_zero()) is None:
+        return (UNCHECKED,)
+    check.wait(30.0)
+    return ()
 
 
 def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
@@ -167,7 +182,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         here.sweeping,
     )
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
-    doubts = (*unwatched(head.witness), *doubts, *here.notes)
+    doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
     record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)
     for note in record.notes:
         context.note(text=note)

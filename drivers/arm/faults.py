@@ -36,8 +36,9 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "the arm is not known to be safe", False, "Use the emergency stop; see that it stands and the laser is off.",
     ),
     "arm.wrong_kinematics": (
-        "the arm is not the one that is configured", False,
-        "See that its address and model are right and that nobody has set another tool at the pendant.",
+        "the controller and the cell reckon with different kinematics", False,
+        "See that nobody has set another tool at the pendant, that arm.address is this arm's, and that the controller "
+        "has its own calibration (Settings, then see its calibration file); then connect anew.",
     ),
     "arm.wrong_model": (
         "the arm is not of the model that is configured", False, "Correct arm.model or arm.address in cell.toml.",

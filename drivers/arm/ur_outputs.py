@@ -50,13 +50,24 @@ def keep_low(address: str, outputs: tuple[int, ...], free: tuple[int, ...] = ())
     for index, choice in choices:
         kind, number = _terminal(index)
         lines.append(f"  set_runstate_{kind}_digital_output_to_value({number}, {choice})\n")
+    try:
+        _say(address, f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
+    except OSError as error:
+        why = f"is silent for {OFF_S:g} s" if isinstance(error, TimeoutError) else f"fails: {error}"
+        raise RuntimeError(
+            f"port {_SECONDARY_PORT} of the arm {why}, so the outputs that stay low were not set. Open that port "
+            "between this computer and the controller (Settings, Security, Services: secondary client interface)"
+        ) from error
+
+
+def _say(address: str, program: bytes) -> None:
     with socket.create_connection((address, _SECONDARY_PORT), timeout=OFF_S) as connection:
-        connection.sendall(f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
+        connection.sendall(program)
         read = 0
         while read < _GREETING:
             data = connection.recv(4096)
             if not data:
-                raise RuntimeError(f"port {_SECONDARY_PORT} of the arm was closed before it took the outputs' setting")
+                raise ConnectionResetError("it was closed before it took the setting")
             read += len(data)
 
 

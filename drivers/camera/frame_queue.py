@@ -7,8 +7,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from drivers.camera.stamps import Stamps
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError
+from drivers.errors import Aborted, DeadlineError, DeviceFault
 from drivers.interfaces import Frame, LinkStatistics
 
 _SLOW_DEVICE_WALL_S = 2.0
@@ -24,9 +25,11 @@ def frame_patience(clock: Clock, timeout: float) -> float:
 
 
 class FrameQueue:
-    """Frames in order, at most `capacity`; a frame that finds it full is dropped and counts as lost.
+    """Frames in order, at most `capacity`; a frame that finds it full is dropped and counts as lost. One whose times
+    cannot be true ends it: see `drivers.camera.stamps`.
 
-    `check` raises when no frame can come any more. `lost` counts the gaps in the frame ids of the frames handed out.
+    `exposure` in s is what the camera was set to, where its frames tell theirs. `check` raises when no frame
+    can come any more. `lost` counts the gaps in the frame ids of the frames handed out.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class FrameQueue:
         longest_gap: float,
         check: Callable[[], None],
         statistics: LinkStatistics,
+        exposure: float | None = None,
     ) -> None:
         self.lost = 0
         self._name = name
@@ -51,6 +55,8 @@ class FrameQueue:
         self._news = threading.Condition()
         self._closed = False
         self._aborted = False
+        self._stamps = Stamps(name, clock, exposure)
+        self._untrue: DeviceFault | None = None
 
     def expect(self, frame_id: int | None) -> None:
         """Tell the id of the first frame, so that the loss of the very first is known; None if unknown."""
@@ -59,6 +65,11 @@ class FrameQueue:
     def put(self, frame: Frame) -> None:
         """Add a frame; called by the receiving thread, never blocks."""
         with self._news:
+            if self._expected is None or frame.frame_id >= self._expected:
+                self._untrue = self._untrue or self._stamps.fault(frame)
+            if self._untrue is not None:
+                self._news.notify_all()
+                return
             if len(self._frames) >= self._capacity:
                 self._statistics.count("frames_dropped_by_host")
                 return
@@ -83,6 +94,8 @@ class FrameQueue:
             self._news.wait_for(self._settled, frame_patience(self._clock, timeout))
             if self._closed:
                 raise Aborted(f"{self._name}: the acquisition was stopped")
+            if not self._frames and self._untrue is not None:
+                raise self._untrue
             if not self._frames:
                 raise DeadlineError(
                     self._name,
@@ -112,7 +125,7 @@ class FrameQueue:
         while self._frames and self._expected is not None and self._frames[0].frame_id < self._expected:
             self._frames.popleft()
             self._statistics.count("stale_frames")
-        if self._frames or self._closed:
+        if self._frames or self._closed or self._untrue is not None:
             return True
         self._check()
         return False

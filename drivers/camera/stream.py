@@ -58,6 +58,7 @@ class StreamCamera:
         self._acquiring = threading.Lock()
         self._queues: tuple[FrameQueue, ...] = ()
         self._frame_rate: float | None = None
+        self._exposure: float | None = None
         self._link = FrameLink(name, address, clock, take_frame=self._take, lost=self._wake, statistics=self.statistics)
         try:
             self._about = self._identify()
@@ -112,7 +113,7 @@ class StreamCamera:
                     recoverable=False,
                     hint="Choose a value that the camera supports.",
                 )
-        self._frame_rate = frame_rate
+        self._frame_rate, self._exposure = frame_rate, exposure
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """One frame whose exposure began after the call: never a buffered one.
@@ -217,6 +218,7 @@ class StreamCamera:
             longest_gap=gap,
             check=self._link.check,
             statistics=self.statistics,
+            exposure=self._exposure,
         )
         self._queues = (*self._queues, queue)
         try:

@@ -23,7 +23,7 @@ from drivers.interfaces.device import (
     Reading,
     Vector,
 )
-from drivers.interfaces.rail import LONGEST_NUDGE_M, Nudged, Rail, RailState, Sweep
+from drivers.interfaces.rail import LONGEST_NUDGE_M, ChecksZero, Nudged, Rail, RailState, Sweep
 from drivers.interfaces.switches import Claw, Laser, SaysHowKnown
 from drivers.interfaces.vehicle import Vehicle, VehicleState
 from drivers.link_table import LinkTable
@@ -37,6 +37,7 @@ __all__ = [
     "ArmState",
     "Attended",
     "Camera",
+    "ChecksZero",
     "Claw",
     "Device",
     "Examined",

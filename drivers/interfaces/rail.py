@@ -68,6 +68,18 @@ class Nudged(Protocol):
         """
 
 
+@runtime_checkable
+class ChecksZero(Protocol):
+    """What a rail may offer besides `Rail`: to look whether it has lost steps since it was homed."""
+
+    def check_zero(self) -> Motion | None:
+        """Creep over the reference switch and end at 0; None where the switch cannot be asked.
+
+        The motion fails with `DeviceFault` (rail.lost_steps) when the count is off there: then it is not homed any
+        more.
+        """
+
+
 class Rail(Device, Protocol):
     """A linear axis that carries the scan head; positions in m from the home switch."""
 

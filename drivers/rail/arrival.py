@@ -13,6 +13,8 @@ from drivers.rail.zero import ZeroMark
 
 STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""
+_NEAR = 1
+"""Counts off its target at which a module may come to rest, without saying that it has reached it."""
 _STALL_FLAG = 1
 _DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
 
@@ -21,8 +23,9 @@ class Arrival:
     """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
 
     `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
-    it does not; None for a motion that needs none. Called again and again: True at the target; raises
-    `Aborted` after a stop and `DeviceFault` for rail.reset, rail.limit_switch, rail.missed_target and rail.stalled.
+    it does not; None for a motion that needs none. Called again and again: True at the target, or at most one count off
+    it at rest; raises `Aborted` after a stop, `DeviceFault` for rail.reset, rail.limit_switch, rail.missed_target and
+    rail.stalled.
     """
 
     def __init__(
@@ -52,15 +55,19 @@ class Arrival:
         self._samples.append((stamp, position / self._counts, round_trip))
         if self._link.stops != self._issued:
             raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
-        if position == self._target and self._link.get(Axis.POSITION_REACHED):
+        near = abs(position - self._target) <= _NEAR
+        if near and (self._link.get(Axis.POSITION_REACHED) or (position == self._last and not self._moving())):
             # A module that was reset stands at its target, too, if that is 0.
             self._require_zero()
             return True
         if position != self._last:
             self._last, self._moved = position, stamp
-        elif stamp - self._moved > self._standstill and self._link.get(Axis.VELOCITY) == 0:
+        elif stamp - self._moved > self._standstill and not self._moving():
             raise self._failure(position)
         return False
+
+    def _moving(self) -> bool:
+        return self._link.get(Axis.VELOCITY) != 0
 
     def _failure(self, position: int) -> DeviceFault:
         link = self._link

@@ -19,6 +19,7 @@ from drivers.quantities import check_positive, check_range, shown
 from drivers.rail.following import CarriageWatch
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
+from drivers.rail.zero_check import AHEAD_M, CREEP, ZeroCheck
 
 _AT_START_M = 20e-6
 
@@ -173,6 +174,26 @@ class RailAxis(ABC):
                 arrived=self._watched(self._arrival(goal, issued, [], homed=False), None),
                 halt=self._halt(issued),
                 duration=move_duration(distance, speed, self._acceleration),
+            )
+            return self._motion
+
+    def _check_zero(self, switch: Callable[[], bool], forget: Callable[[], None]) -> RailMotion:
+        """See `drivers.interfaces.ChecksZero`; `switch` reads the reference switch, `forget` gives the zero up."""
+        with self._starting:
+            issued = self._free()
+            self._require_zero()
+            duration = move_duration(self._position(), self._max_speed, self._acceleration)
+
+            def begin(position: float, speed: float) -> Callable[[], bool]:
+                self._send(position, speed, issued)
+                return self._arrival(position, issued, [])
+
+            self._motion = RailMotion(
+                self.name,
+                self._clock,
+                arrived=ZeroCheck(self.name, begin, self._position, switch, forget, self._max_speed),
+                halt=self._halt(issued),
+                duration=duration + 2.0 * AHEAD_M / CREEP,
             )
             return self._motion
 

@@ -15,9 +15,13 @@ from drivers.rail import health
 from drivers.rail.arrival import Arrival
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
+from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl_codec import Axis, Reference
 from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.zero import STALL_FLAG, ZeroMark
+
+_HOME_SWITCH_ON_BELOW = (5, 7)
+"""Reference modes whose zero is the edge below which the home switch is on."""
 
 
 class TmclRail(RailAxis):
@@ -122,6 +126,12 @@ class TmclRail(RailAxis):
             left_switch=bool(self._link.get(Axis.LEFT_SWITCH)),
             right_switch=bool(self._link.get(Axis.RIGHT_SWITCH)),
         )
+
+    def check_zero(self) -> RailMotion | None:
+        """See `drivers.interfaces.ChecksZero`: where the zero is a home switch that is searched leftwards."""
+        if self._reference_mode not in _HOME_SWITCH_ON_BELOW:
+            return None
+        return self._check_zero(lambda: bool(self._link.get(Axis.HOME_SWITCH)), self._zero.forget)
 
     def _position(self) -> float:
         return self._link.get(Axis.POSITION) / self._counts

@@ -46,6 +46,7 @@ class Axis(IntEnum):
     MAX_VELOCITY = 4
     MAX_ACCELERATION = 5
     POSITION_REACHED = 8
+    HOME_SWITCH = 9
     RIGHT_SWITCH = 10
     LEFT_SWITCH = 11
     RAMP_15 = 15

@@ -26,6 +26,10 @@ if "drivers.vehicle" not in serial.protocol_handler_packages:
 
 RECEIVE_TIMEOUT_S = 0.1
 SEND_TIMEOUT_S = 0.5
+MOST_REFUSED = 5
+"""So many frames in a row may an adapter refuse: after it is opened it may refuse a command or two."""
+_BELL, _TAKEN = "\a", ("\r", "z\r", "Z\r")
+"""How an slcan adapter answers what it refuses, and a frame that it has taken."""
 
 
 class CanLink:
@@ -60,6 +64,8 @@ class CanLink:
         self._closing = threading.Event()
         self._failure: str | None = None
         self._heard: list[tuple[float, can.Message]] | None = None
+        self._refused = 0
+        """Frames in a row that the adapter has refused, where it says so."""
         self._bus = self._open(interface, channel, bitrate, options)
         self._interface = interface
         self._last_words: LastWords | None = None
@@ -142,7 +148,10 @@ class CanLink:
             settings.setdefault("timeout", 0.02)
             channel = channel.replace("socket://", SCHEME, 1)
         try:
-            return can.Bus(channel=channel, interface=interface, **settings)
+            bus: can.BusABC = can.Bus(channel=channel, interface=interface, **settings)
+            if interface == "slcan":
+                self._hear_refusals(bus)
+            return bus
         except can.CanInterfaceNotImplementedError as error:
             raise ConfigError(f"{self._name}: CAN interface {interface!r} cannot be used: {error}") from error
         except (can.CanError, OSError, ValueError) as error:
@@ -151,6 +160,20 @@ class CanLink:
                 f"CAN bus {self._address} at {bitrate} bit/s cannot be opened: {error}. "
                 "Check interface, channel and adapter",
             ) from error
+
+    def _hear_refusals(self, bus: Any) -> None:
+        """python-can passes over what an adapter answers to the frames that it is given."""
+        read = bus._read
+
+        def reading(timeout: float | None) -> str | None:
+            said: str | None = read(timeout)
+            if said == _BELL:
+                self._refused += 1
+            elif said in _TAKEN:
+                self._refused = 0
+            return said
+
+        bus._read = reading
 
     def _after_death(self, frames: Sequence[can.Message]) -> LastWords | None:
         bus: Any = self._bus
@@ -177,6 +200,11 @@ class CanLink:
                 frame = self._bus.recv(RECEIVE_TIMEOUT_S)
                 # Also while others talk on the bus. A thread that was not run did not wait any longer.
                 self._idle(min(time.monotonic() - begun, RECEIVE_TIMEOUT_S))
+                if self._refused >= MOST_REFUSED:
+                    self._fail(
+                        f"the adapter refuses every frame, {self._refused} in a row: see whether it listens only, is "
+                        "bus-off or has another bit rate"
+                    )
                 if frame is not None:
                     if (heard := self._heard) is not None:
                         heard.append((time.monotonic(), frame))

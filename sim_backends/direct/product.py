@@ -106,6 +106,7 @@ class RailSetup:
     positions and round trips (n,) each.
 
     `watch` takes the rail's name, its clock and its travel in m, None for a nudge.
+    `check` takes the rail's name, how it is sent, its count, its home switch, how its zero is given up, and its speed.
     `serial` is the number by which the cell knows it; None where it tells its own.
     """
 
@@ -118,6 +119,7 @@ class RailSetup:
     reversed: bool
     even: Callable[[Vector, Vector, Vector], EvenMotion]
     watch: Callable[[str, Any, float | None], CarriageWatch]
+    check: Callable[..., Callable[[], bool]]
     serial: str | None = None
 
 

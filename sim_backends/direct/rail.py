@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -113,6 +114,28 @@ class DirectRail:
         self._motion = RailMove(self, target, self._watch(None))
         return self._motion
 
+    def check_zero(self) -> RailMove:
+        """Creep over the home switch and end at 0; see `drivers.interfaces.ChecksZero`."""
+
+        def begin(position: float, speed: float) -> Callable[[], bool]:
+            target = round(position * self._counts)
+            self._send(target, speed)
+            return RailMove(self, target).arrived
+
+        self._require_free()
+        self._require_zero()
+        model, clock = self.model, self.clock
+        check = self.setup.check(
+            self.name,
+            begin,
+            lambda: self.counted(clock.now()),
+            lambda: model.home_switch(clock.now()),
+            self.forget_zero,
+            self.setup.max_speed,
+        )
+        self._motion = RailMove(self, None, asked=check)
+        return self._motion
+
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """Where the rail has to stand before `sweep`."""
         return self._ends(start, stop, speed)[0]
@@ -208,13 +231,16 @@ class DirectRail:
     def _start(self, position: float, speed: float) -> int:
         """Send it there; the target in counts."""
         self._require_free()
+        self._require_zero()
+        target = round(position * self._counts)
+        self._send(target, speed)
+        return target
+
+    def _require_zero(self) -> None:
         if self._lost:
             raise self.reset_fault("since its last motion")
         if not self._homed:
             raise InterlockError(self.name, "is not homed, so positions mean nothing yet. Call home() first")
-        target = round(position * self._counts)
-        self._send(target, speed)
-        return target
 
     def _send(self, target: int, speed: float) -> None:
         now = self.clock.now()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,10 +20,19 @@ STANDSTILL_S = 0.5
 
 
 class RailMove:
-    """A motion of the rail to `target` in counts, or to its home switch (None), with an eye of `watch` on it."""
+    """A motion of the rail to `target` in counts, or to its home switch (None), with an eye of `watch` on it.
 
-    def __init__(self, rail: DirectRail, target: int | None, watch: CarriageWatch | None = None) -> None:
+    `asked` is what tells that a motion in several legs has ended."""
+
+    def __init__(
+        self,
+        rail: DirectRail,
+        target: int | None,
+        watch: CarriageWatch | None = None,
+        asked: Callable[[], bool] | None = None,
+    ) -> None:
         self._rail = rail
+        self._asked = asked
         self._watch = watch
         self._target = target
         self._issued = rail.stops
@@ -36,6 +46,12 @@ class RailMove:
         """True once the motion has ended, however it ended."""
         if not self._ended:
             self._judge()
+        return self._ended
+
+    def arrived(self) -> bool:
+        """As `done`; raises why it never will."""
+        if self.done and self._error is not None:
+            raise self._error
         return self._ended
 
     def wait(self, timeout: float) -> None:
@@ -70,6 +86,13 @@ class RailMove:
         elif (fault := self._seen(now)) is not None:
             rail.stop()
             self._end(fault)
+        elif self._asked is not None:
+            try:
+                if self._asked():
+                    self._end(None)
+            except CellError as error:
+                rail.stop()
+                self._end(error)
         elif self._target is None:
             if not model.searching(now) and model.velocity(now) == 0:
                 rail.found_zero()

@@ -20,7 +20,7 @@ __all__ = ["RailModel", "RailParams", "RailSettings"]
 EXCHANGED, LOST_STEPS = "rail.exchanged_switches", "rail.lost_steps"
 FAULTS = (EXCHANGED, LOST_STEPS)
 _LOST = 0.10
-"""Share of the steps that a motor with `LOST_STEPS` loses, as the counter goes on."""
+"""Share of the steps that a motor with `LOST_STEPS` loses on its way to the right, as the counter goes on."""
 _KEEP = 30.0
 _BACK_OFF = 0.0005
 
@@ -46,6 +46,7 @@ class RailModel:
         self.settings = RailSettings()
         self._rng = rng
         self._faults: set[str] = set()
+        self._losing = False
         self._lock = threading.RLock()
         self._edge = 0.0
         self._switch_distance = 0
@@ -127,7 +128,8 @@ class RailModel:
             return self._switch_distance
 
     def fault(self, name: str, t: float) -> None:
-        """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps.
+        """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps on its
+        way to the right.
 
         Raises ValueError for a name that is not in `FAULTS`.
         """
@@ -144,6 +146,7 @@ class RailModel:
     def move_to(self, t: float, position: int) -> None:
         """Start positioning to `position` (microsteps)."""
         with self._lock:
+            self._lose(t, position > self.position(t))
             x, v = self._begin(t)
             self._target, self._target_velocity, self._positioning = position, 0, True
             speed = self.settings.max_velocity / self._steps()
@@ -156,6 +159,7 @@ class RailModel:
     def rotate(self, t: float, velocity: int) -> None:
         """Turn at `velocity` (microsteps per second, sign is direction) until told otherwise; 0 stops on the ramp."""
         with self._lock:
+            self._lose(t, velocity > 0)
             x, v = self._begin(t)
             self._target_velocity, self._positioning = velocity, False
             self._follow(ramp.to_velocity(t, x, v, velocity / self._signed_steps(), self._acceleration()))
@@ -191,6 +195,7 @@ class RailModel:
     def search(self, t: float) -> None:
         """Start a reference search: fast to the switch, back, slowly to its edge, and call that zero."""
         with self._lock:
+            self._lose(t, False)
             x, v = self._begin(t)
             self._edge = float(self._rng.normal(0.0, self.params.repeatability)) if self.params.repeatability else 0.0
             self._target, self._target_velocity, self._positioning = 0, 0, False
@@ -234,24 +239,29 @@ class RailModel:
         return self.carriage(t) >= edge - 1e-9 if side else self.carriage(t) <= edge + 1e-9
 
     def _have(self, t: float, faults: set[str]) -> None:
-        """Have these faults from `t` on: the counter keeps its value, and what runs goes on."""
+        """Have these faults from `t` on; a positioning that runs goes on."""
         with self._lock:
-            count, searching, speed = self.position(t), self.searching(t), self.velocity(t)
-            x, v = self._begin(t)
             self._faults = faults
-            self._zero = x - count / self._signed_steps()
-            self._append([ramp.Piece(t, x, v, 0.0)], searching=False)
-            if searching:
-                self.search(t)
-            elif self._positioning and speed:
+            if self._positioning and self.velocity(t):
                 self.move_to(t, self._target)
-            elif speed:
-                self.rotate(t, self._target_velocity)
+            else:
+                self._lose(t, False)
+
+    def _lose(self, t: float, right: bool) -> None:
+        """From `t` on steps are lost or not; the counter keeps its value."""
+        losing = right and LOST_STEPS in self._faults
+        if losing == self._losing or self.searching(t):
+            return
+        count = self.position(t)
+        x, v = self._begin(t)
+        self._losing = losing
+        self._zero = x - count / self._signed_steps()
+        self._append([ramp.Piece(t, x, v, 0.0)], searching=False)
 
     def _steps(self) -> float:
         """What the counter counts while the motor turns once: more where it loses steps."""
         steps = self.params.steps_per_turn << self.settings.microsteps
-        return steps / (1.0 - _LOST) if LOST_STEPS in self._faults else steps
+        return steps / (1.0 - _LOST) if self._losing else steps
 
     def _signed_steps(self) -> float:
         return -self._steps() if self.backwards else self._steps()

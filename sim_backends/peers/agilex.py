@@ -20,7 +20,7 @@ from sim_backends.models.vehicle import Feedback, Mode, VehicleModel, VehiclePar
 from sim_backends.peers.slcan import CanFrame, SlcanBus
 
 FOREIGN, SECOND = "can.foreign_commands", "can.second_vehicle"
-FAULTS = ("can.bus_off", FOREIGN, SECOND, *VEHICLE_FAULTS)
+FAULTS = ("can.bus_off", "can.refused_frames", FOREIGN, SECOND, *VEHICLE_FAULTS)
 
 MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY = 0x211, 0x221, 0x291, 0x311, 0x361
@@ -78,7 +78,8 @@ class AgilexPeer:
         self._bus.stop()
 
     def fault(self, name: str) -> None:
-        """`can.bus_off`: the adapters drop out and have to be opened again. Until `clear`, `can.foreign_commands` is
+        """`can.bus_off`: the adapters drop out and have to be opened again. Until `clear`, `can.refused_frames` is
+        adapters that refuse every frame, `can.foreign_commands` is
         somebody else who commands 0.2 m/s ahead, `can.second_vehicle` another vehicle that stands and reports under the
         same identifiers. The others are the vehicle's own.
 
@@ -86,6 +87,8 @@ class AgilexPeer:
         """
         if name == "can.bus_off":
             self._bus.drop()
+        elif name == "can.refused_frames":
+            self._bus.refusing = True
         elif name in (FOREIGN, SECOND):
             self._others.add(name)
         elif name in VEHICLE_FAULTS:
@@ -96,6 +99,7 @@ class AgilexPeer:
     def clear(self) -> None:
         """Take away the vehicle's faults, and others from the bus."""
         self._others.clear()
+        self._bus.refusing = False
         self.model.clear(self._clock.now())
 
     def _run(self) -> None:

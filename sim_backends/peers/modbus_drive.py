@@ -212,8 +212,10 @@ class ModbusPeer(SerialServer):
                 self._late = True
             case "rail.reset":
                 self.drive.reset()
-            case _:
+            case _ if name in RAIL_FAULTS:
                 self.drive.fault(name)
+            case _:
+                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
 
     def clear(self) -> None:
         """Take away all faults; a drive that was reset stays so."""

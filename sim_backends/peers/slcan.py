@@ -37,6 +37,8 @@ class SlcanBus:
     """The bus. `receive` is called with each frame that a client sends, in that client's thread."""
 
     def __init__(self, name: str, receive: Callable[[CanFrame], None], serial: str = "SIM1") -> None:
+        self.refusing = False
+        """Whether every frame is refused, as by adapters that are bus-off."""
         self._receive = receive
         self._serial = serial
         self._lock = threading.Lock()
@@ -86,7 +88,7 @@ class SlcanBus:
         kind, rest = text[:1], text[1:]
         if kind in ("t", "T", "r", "R"):
             frame = _decode(text)
-            if frame is None or not adapter.open or adapter.listening:
+            if frame is None or not adapter.open or adapter.listening or self.refusing:
                 adapter.answer(_ERROR)
             elif adapter.rate != _BUS_RATE:
                 adapter.bus_error = True

@@ -45,8 +45,10 @@ class TmclPeer(SerialServer):
                 self._late = True
             case "rail.reset":
                 self.module.reset()
-            case _:
+            case _ if name in RAIL_FAULTS:
                 self.module.fault(name)
+            case _:
+                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
 
     def clear(self) -> None:
         """Take away all faults; a module that was reset stays so."""

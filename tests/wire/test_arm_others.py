@@ -15,7 +15,7 @@ from cable import Cable
 
 from cell.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
-from drivers.arm.faults import require_named
+from drivers.arm.faults import fault, require_named
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
@@ -194,3 +194,15 @@ def test_a_port_that_tells_no_kinematics_costs_two_seconds_and_is_named(bench):
         assert time.monotonic() - begun < usual + 4.0
         assert "port 30001" in arm.untold
         assert "sent none within 2 s" in arm.untold
+
+
+def test_a_silent_port_for_the_outputs_setting_is_named(bench):
+    with (
+        Cable(bench.address, but=(30002,), silent=(30002,)) as cable,
+        pytest.raises(NotConnectedError, match=r"port 30002 of the arm is silent for 1 s.*Open that port"),
+    ):
+        connect(cable.address, safe_off_outputs=(0,))
+
+
+def test_another_kinematics_does_not_send_people_to_the_model():
+    assert "model" not in str(fault("arm", "arm.wrong_kinematics", ""))

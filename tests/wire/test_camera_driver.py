@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import re
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +33,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
+from sim_backends.peers.frame_wire import message
 from sim_backends.peers.frames import CameraSpec, FramePeer
 from tests.wire.clocks import ahead
 
@@ -71,6 +75,45 @@ def bench() -> Iterator[Bench]:
         camera.close()
         peer.stop()
     assert not [thread for thread in threading.enumerate() if thread.name == "scan_camera reader"]
+
+
+# --- frames that cannot be true ---
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong", "told"),
+    [
+        ("device_ns", lambda ns: ns - 500_000_000, r"camera\.stamp.* goes back by"),
+        ("device_ns", lambda ns: ns + 5_000_000_000, r"camera\.stamp.* lies in the future"),
+        ("device_ns", lambda ns: math.nan, r"camera\.stamp.* is nan s"),
+        ("exposure_s", lambda s: math.nan, r"camera\.exposure.* exposed nan s"),
+        ("exposure_s", lambda s: -s, r"camera\.exposure.* exposed -"),
+        ("exposure_s", lambda s: 3 * s, r"camera\.exposure.* another setting"),
+    ],
+)
+def test_times_of_a_frame_that_cannot_be_true_are_refused_by_name(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, field: str, wrong: Callable[[float], float], told: str
+) -> None:
+    """The camera's sixth frame lies; the five before it are good."""
+    bench.camera.configure(0.004, 50.0)
+    sent: list[int] = []
+
+    def lying(header: dict[str, Any], payload: bytes = b"") -> bytes:
+        if header["op"] == "frame":
+            sent.append(header["frame_id"])
+            if len(sent) == 6:
+                header = {**header, field: wrong(header[field])}
+        return message(header, payload)
+
+    monkeypatch.setattr("sim_backends.peers.frames.message", lying)
+    with bench.camera.stream() as frames:
+        got = [frames.next(2.0).frame_id for _ in range(5)]
+        with pytest.raises(DeviceFault) as met:
+            frames.next(2.0)
+    assert got == sent[:5]
+    assert re.search(told, f"{met.value.code} {met.value}")
+    monkeypatch.undo()
+    bench.camera.grab()
 
 
 # --- clocks ---

@@ -744,6 +744,50 @@ def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(ho
     assert homed.model.settings.microsteps == 7
 
 
+@pytest.mark.parametrize("off", [1, -1, 2])
+def test_a_module_that_stands_one_count_off_its_target_has_arrived(
+    homed: Bench, monkeypatch: pytest.MonkeyPatch, off: int
+) -> None:
+    counted = homed.model.position
+    monkeypatch.setattr(homed.model, "position", lambda t: counted(t) + off)
+    motion = homed.rail.move_to(0.01)
+    if abs(off) == 1:
+        motion.wait(10.0)
+        assert homed.rail.state().position == pytest.approx(0.01, abs=1e-7)
+    else:
+        with pytest.raises(DeviceFault, match=r"its target is|has not ended"):
+            motion.wait(10.0)
+
+
+@pytest.mark.parametrize(("lost", "refused"), [(0.0, False), (0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
+def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool) -> None:
+    world, clock = WorldClock(1.0), Clock(1.0)
+    model = RailModel(RailParams(), np.random.default_rng(3))
+    peer = TmclPeer(model, world)
+    peer.start()
+    try:
+        rail = connect(peer.url, clock)
+        rail.home().wait(20.0)
+        counted = model.position(world.now())
+        model.set_position(world.now(), counted + round(lost * 200 * 256 / 0.002))
+        check = rail.check_zero()
+        assert check is not None
+        if refused:
+            with pytest.raises(DeviceFault, match=r"lost steps .* between .* by its count \(allowed 0 ± 0.05 mm\)"):
+                check.wait(10.0)
+            with pytest.raises(InterlockError, match="not homed"):
+                rail.sweep(0.01, 0.09, 0.02)
+        else:
+            check.wait(10.0)
+            assert rail.state().homed and abs(rail.state().position) < 1e-5
+        rail.close()
+        limited = connect(peer.url, clock, reference_mode=1)
+        assert limited.check_zero() is None
+        limited.close()
+    finally:
+        peer.stop()
+
+
 @pytest.mark.parametrize(
     ("params", "fault", "mode", "told", "longest"),
     [

@@ -31,13 +31,15 @@ class Wired:
 
     on: dict[int, bool] = field(default_factory=lambda: {LASER: False, CLAW: True})
     held: bool = True
+    stuck: bool = False
+    """A contact has welded: what is on stays on."""
     told: list[tuple[int, bool]] = field(default_factory=list)
 
     def board(self, first: int) -> RelayBoard:
         def setter(relay: int) -> object:
             def set_it(on: bool) -> None:
                 self.told.append((relay, on))
-                self.on[relay] = on
+                self.on[relay] = on or self.stuck
                 self.held = self.held and self.on[CLAW]
 
             return set_it, lambda: self.on[relay]
@@ -96,6 +98,19 @@ def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired) 
     claw.close()
     with pytest.raises(NotConnectedError):
         claw.ping()
+
+
+def test_a_relay_that_sticks_says_so_when_it_is_switched_off_and_when_it_is_closed(numato: str, wired: Wired) -> None:
+    laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
+    sticks = pytest.raises(DeviceFault, match="shows on after it was switched off")
+    with sticks, laser.lit():
+        wired.stuck = True
+    for act in (laser.stop, laser.close):
+        with pytest.raises(DeviceFault, match="shows on after it was switched off") as met:
+            act()
+        assert met.value.code == "laser.relay"
+    with pytest.raises(NotConnectedError):
+        laser.ping()
 
 
 def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wired: Wired) -> None:

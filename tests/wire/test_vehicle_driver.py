@@ -379,6 +379,21 @@ def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> No
     assert enabled.vehicle.statistics.errors["reopened"] == 1
 
 
+def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -> None:
+    with benched(1.0) as made:
+        made.vehicle.enable()
+        made.drive_for(0.3, 0.2)
+        made.peer.fault("can.refused_frames")
+        begun = made.clock.now()
+        with pytest.raises(DeviceFault, match=r"the adapter refuses every frame, \d+ in a row") as met:
+            made.drive_for(2.0, 0.2)
+        assert made.clock.now() - begun < 0.5
+        assert met.value.code == "vehicle.link_lost"
+        made.peer.clear()
+        made.vehicle.enable()
+        made.drive_for(0.3, 0.2)
+
+
 def test_silence_is_never_taken_for_a_fresh_reading(enabled: Bench) -> None:
     enabled.peer._stopping.set()  # the vehicle falls silent while the bus stays up
     enabled.clock.sleep(3.0)

@@ -70,8 +70,9 @@ def require_edge(
     if edge is None:
         raise RefusedError(
             f"the edge of the plate on the claw is not within {1e3 * BESIDE_M:g} mm of where the calibration saw it, "
-            f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, or the plate "
-            "is covered. Look at the screws of both, clean the plate, then run `cell calibrate`"
+            f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, the rail "
+            "loses steps, or the plate is covered. Look at the screws of both, at the rail's motor, clean the plate, "
+            "then run `cell calibrate`"
         )
     return replace(now, edge=edge)
 

@@ -8,7 +8,7 @@ import pytest
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
-from drivers.interfaces import LONGEST_NUDGE_M, Nudged, Rail
+from drivers.interfaces import LONGEST_NUDGE_M, ChecksZero, Nudged, Rail
 
 FAR_M, SPEED = 0.03, 0.02
 """Way in m and speed in m/s of the suite's motions at full motion; its rail takes ten times the speed."""
@@ -138,6 +138,28 @@ class RailContract(DeviceContract):
         rail.move_to(FAR_M * bench.motion).wait(PATIENCE_S)
         assert rail.state().position == pytest.approx(FAR_M * bench.motion, abs=EXACT_M)
 
+    def test_steps_that_were_lost_show_at_the_reference_switch_and_end_the_trust_in_the_zero(
+        self, bench: Bench[Rail]
+    ) -> None:
+        """Where a rail offers to look: a sound one ends at 0, one that lost steps is refused till it homes."""
+        rail = self.homed(bench)
+        if not isinstance(rail, ChecksZero) or (sound := rail.check_zero()) is None:
+            pytest.skip("its reference switch is not shown")
+        sound.wait(PATIENCE_S)
+        assert rail.state().position == pytest.approx(0.0, abs=EXACT_M)
+        for way in (0.003, 0.06):
+            with bench.faulty() as faults:
+                faults.cause("rail.lost_steps")
+                rail.move_to(way).wait(PATIENCE_S)
+            with pytest.raises(DeviceFault, match="lost steps since it was homed") as met:
+                check = rail.check_zero()
+                assert check is not None
+                check.wait(PATIENCE_S)
+            assert met.value.code == "rail.lost_steps"
+            with pytest.raises(InterlockError, match="not homed"):
+                rail.move_to(way)
+            rail.home().wait(PATIENCE_S)
+
     def test_exchanged_limit_switches_are_named_before_the_end_stop(self, bench: Bench[Rail]) -> None:
         """Beyond its travel the wrong one trips: it is stopped at once, and told which."""
         if not isinstance(bench.device, Nudged):
@@ -146,7 +168,7 @@ class RailContract(DeviceContract):
         with bench.faulty() as faults:
             faults.cause("rail.exchanged_switches")
             with pytest.raises(DeviceFault, match=r"right limit switch tripped .* sent left") as met:
-                bench.device.nudge(-0.006, 0.005).wait(PATIENCE_S)  # type: ignore[attr-defined]
+                bench.device.nudge(-0.006, 0.005).wait(PATIENCE_S)
             assert (met.value.code, met.value.recoverable) == ("rail.switches", False)
             self.stands(bench)
             assert rail.state().position > -0.0035
