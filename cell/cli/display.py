@@ -22,11 +22,19 @@ SAID = ("note", "paused", "going_on")
 COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 
 
+class _Unheard(Console):
+    """A console that goes quiet once nobody reads it; the library's ends the process, in the middle of a motion."""
+
+    def on_broken_pipe(self) -> None:
+        """See `rich.console.Console.on_broken_pipe`."""
+        self.quiet = True
+
+
 class ProgressDisplay:
     """Bars for the steps, a row each; an observer for `Cell.run` and `Cell.calibrate`. Writes to standard error."""
 
     def __init__(self) -> None:
-        self.console = Console(stderr=True)
+        self.console = _Unheard(stderr=True)
         self._progress = Progress(
             TextColumn("{task.fields[step]:<16}"),
             BarColumn(bar_width=30),

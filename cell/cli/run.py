@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -174,7 +175,7 @@ def _perform(
     opened: Callable[[], Cell], work: Callable[[Cell, Observer], RunOutcome], json: bool, noise: bool
 ) -> NoReturn:
     """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
-    from cell.cli import EXIT_INTERRUPTED
+    from cell.cli import EXIT_INTERRUPTED, say_unshown
     from cell.cli.display import ProgressDisplay, print_late, print_report
     from statemachine.watch import SignalInterrupt
 
@@ -183,10 +184,15 @@ def _perform(
         with opened() as cell:
             with ProgressDisplay() as display:
                 outcome = work(cell, display)
-            if json:
-                print_json(outcome.report)
-            else:
-                print_report({**outcome.report, "wall_s": outcome.wall_s}, str(outcome.folder), noise=noise)
+            try:
+                if json:
+                    print_json(outcome.report)
+                else:
+                    print_report({**outcome.report, "wall_s": outcome.wall_s}, str(outcome.folder), noise=noise)
+                sys.stdout.flush()
+            # The library that prints ends the process where nobody reads any more.
+            except (OSError, SystemExit) as error:
+                say_unshown(f"run {outcome.folder.name} ended {outcome.outcome}", error)
         code = outcome.exit_code
     except SignalInterrupt:
         if outcome is None:
