@@ -109,7 +109,7 @@ def require_as_configured(calibration: CellCalibration, config: CellConfig) -> N
             _require(f"{name}.flange_from_camera against its drawing, rad", _angle(np.trace(off.rotation) / 2 - 0.5))
         plane = LightPlane.from_baseline(laser.baseline, float(np.arctan(laser.tan_theta)))
         # One plane has two normals.
-        _require("scan.light_plane against its drawing, rad", _angle(abs(plane.n @ scan.light_plane.n)))
+        _require("scan.light_plane against its drawing, rad", _angle(abs(float(plane.n @ scan.light_plane.n))))
         off_plane = float(scan.light_plane.n @ laser.exit_point) - scan.light_plane.distance
         _require("scan.light_plane, the laser's exit off it, m", off_plane, -MOUNT_M, MOUNT_M)
         way = scan.rail_direction / np.linalg.norm(scan.rail_direction)
