@@ -162,24 +162,20 @@ def _no_number(text: str) -> Any:
     raise ValueError(f"it holds {text}, which is no number")
 
 
-def array_digests(arrays: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of each NumPy array by its name: of its type, its shape and its numbers."""
-    return {
-        name: hashlib.sha256(f"{array.dtype.str} {array.shape} ".encode() + array.tobytes()).hexdigest()
-        for name, array in arrays.items()
-    }
-
-
 def sealed_arrays(arrays: Mapping[str, Any]) -> str:
-    """What a NumPy archive keeps under `DIGEST` beside these arrays."""
-    return json.dumps(array_digests(arrays))
+    """What a NumPy archive keeps under `DIGEST`: SHA-256 of each array's type, shape and numbers by its name."""
+    return json.dumps(
+        {
+            name: hashlib.sha256(f"{array.dtype.str} {array.shape} ".encode() + array.tobytes()).hexdigest()
+            for name, array in arrays.items()
+        }
+    )
 
 
 def require_unchanged(arrays: dict[str, Any]) -> None:
     """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
     if DIGEST not in arrays:
         raise EditedError("its digest is missing")
-    told = json.loads(str(arrays.pop(DIGEST)))
-    now = array_digests(arrays)
+    told, now = json.loads(str(arrays.pop(DIGEST))), json.loads(sealed_arrays(arrays))
     if changed := sorted(name for name in told.keys() | now.keys() if told.get(name) != now.get(name)):
         raise EditedError(f"it was changed after it was written: {', '.join(changed)}")

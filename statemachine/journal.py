@@ -223,8 +223,12 @@ def read(folder: Path, *, whole: bool = False) -> Record:
     def rows(base: sqlite3.Connection) -> Record:
         if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
             raise JournalError(f"the journal in {folder} is damaged: {found[0] if found else 'no word of it'}")
+
+        def may(value: Any, kind: type[str] | type[float]) -> Any:
+            return _is(value, kind, needed=False)
+
         runs = tuple(
-            RunRow(_text(key), _real(started), _real(ended, None), _text(outcome, None), _text(reason, None),
+            RunRow(_is(key, str), _is(started, float), may(ended, float), may(outcome, str), may(reason, str),
                    _table(info), None if pid is None else int(pid))
             for key, started, ended, outcome, reason, info, pid in _checked(
                 base, "runs", "id, started, ended, outcome, reason, info, pid", "ORDER BY rowid"
@@ -234,14 +238,14 @@ def read(folder: Path, *, whole: bool = False) -> Record:
             raise JournalError(f"the journal in {folder} holds no run")
         own = "WHERE run = ? ORDER BY id", runs[-1].id
         steps = tuple(
-            StepRow(_text(name), int(attempt), _real(started), _real(ended, None), _text(state), _real(duration, None),
-                    None if result is None else _table(result), _text(error, None))
+            StepRow(_is(name, str), int(attempt), _is(started, float), may(ended, float), _is(state, str),
+                    may(duration, float), None if result is None else _table(result), may(error, str))
             for _, name, attempt, started, ended, state, duration, result, error in _checked(
                 base, "steps", "run, name, attempt, started, ended, state, duration_s, result, error", *own
             )
         )  # fmt: skip
         events = tuple(
-            EventRow(_real(at), _text(kind), _text(step, None), _table(data))
+            EventRow(_is(at, float), _is(kind, str), may(step, str), _table(data))
             for _, at, kind, step, data in _checked(base, "events", "run, at, kind, step, data", *own)
         )
         return Record(runs, steps, events)
@@ -271,25 +275,19 @@ def _crc(*values: object) -> int:
     return zlib.crc32(json.dumps(values, default=str).encode())
 
 
-_NEEDED = object()
-
-
-def _text(value: Any, otherwise: Any = _NEEDED) -> Any:
-    if isinstance(value, str) or (value is None and otherwise is None):
-        return value
-    raise ValueError(f"{str(value)[:40]} is no text")
-
-
-def _real(value: Any, otherwise: Any = _NEEDED) -> Any:
-    if value is None and otherwise is None:
+def _is(value: Any, kind: type[str] | type[float], *, needed: bool = True) -> Any:
+    """The value; `ValueError` where it is no text or no number, or missing."""
+    if value is None and not needed:
         return None
-    if isinstance(value, int | float) and math.isfinite(value):
-        return float(value)
-    raise ValueError(f"{str(value)[:40]} is no number")
+    if isinstance(value, int) and kind is float:
+        value = float(value)
+    if not isinstance(value, kind) or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueError(f"{str(value)[:40]!r} is no {'text' if kind is str else 'number'}")
+    return value
 
 
 def _table(text: Any) -> dict[str, Any]:
-    data = json.loads(_text(text))
+    data = json.loads(_is(text, str))
     if not isinstance(data, dict):
         raise ValueError(f"{str(data)[:40]} is no table")
     return data

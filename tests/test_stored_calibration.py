@@ -306,7 +306,7 @@ def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path: Path, tex
         (_scan(flange_from_camera=pin.SE3.Identity()), r"scan\.flange_from_camera against its drawing"),
         (_scan(rail_direction=np.array([-1.0, 0.0, 0.0])), "rail_direction against"),
         (_scan(light_plane=LightPlane.of((1.0, 0.0, -1 / 3.5), -0.135)), "exit off it"),
-        (_scan(camera=replace(nominal_camera(load_config(None).scan_camera), fx=800.0)), "fx over the drawn one"),
+        (_scan(camera=replace(nominal_camera(load_config(None).scan_camera), fx=800.0)), "fx and fy over the drawn"),
     ],
 )
 def test_one_that_does_not_fit_the_drawing_is_not_used(spoilt: CellCalibration, says: str) -> None:

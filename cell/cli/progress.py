@@ -53,6 +53,14 @@ def kept_loops() -> list[float]:
     return times
 
 
+class _Unheard(Console):
+    """A console that goes quiet once nobody reads it; the library's ends the process, in the middle of a motion."""
+
+    def on_broken_pipe(self) -> None:
+        """See `rich.console.Console.on_broken_pipe`."""
+        self.quiet = True
+
+
 class ProgressDisplay:
     """Bars for the steps, a row each; an observer for `Cell.run` and `Cell.calibrate`. Writes to standard error.
 
@@ -61,7 +69,7 @@ class ProgressDisplay:
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
-        self.console = Console(stderr=True)
+        self.console = _Unheard(stderr=True)
         self._progress = Progress(
             TextColumn("{task.fields[mark]}", table_column=Column(width=1)),
             TextColumn("{task.fields[step]:<16}"),

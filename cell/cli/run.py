@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -194,7 +195,7 @@ def _perform(
     opened: Callable[[], Cell], work: Callable[[Cell, Observer], RunOutcome], json: bool, noise: bool
 ) -> NoReturn:
     """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
-    from cell.cli import EXIT_INTERRUPTED
+    from cell.cli import EXIT_INTERRUPTED, say_unshown
     from cell.cli.display import print_late, print_report
     from cell.cli.progress import ProgressDisplay
     from statemachine.watch import SignalInterrupt
@@ -206,10 +207,15 @@ def _perform(
             cell = shown.enter_context(opened())
             outcome = work(cell, display)
             display.end()
-            if json:
-                print_json(outcome.report)
-            else:
-                print_report({**outcome.report, "wall_s": outcome.wall_s}, str(outcome.folder), noise=noise)
+            try:
+                if json:
+                    print_json(outcome.report)
+                else:
+                    print_report({**outcome.report, "wall_s": outcome.wall_s}, str(outcome.folder), noise=noise)
+                sys.stdout.flush()
+            # The library that prints ends the process where nobody reads any more.
+            except (OSError, SystemExit) as error:
+                say_unshown(f"run {outcome.folder.name} ended {outcome.outcome}", error)
         code = outcome.exit_code
     except SignalInterrupt:
         if outcome is None:
