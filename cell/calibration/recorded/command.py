@@ -26,6 +26,7 @@ from cell.calibration.recorded.solution import (
     agreeing,
     camera_of,
     note_perhaps_no_laser,
+    rough_camera,
     solve_frames,
 )
 from cell.calibration.solve.intrinsics import Intrinsics
@@ -74,7 +75,8 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
         )
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
-    frames, channel = read_frames(listing, spec, links, options.laser)
+    # A plan tells of boards and poses; to read stripes takes seconds for each picture.
+    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser)
     late = [one for one in series if not one.of and in_order_of_views(one, frames)]
     belonging += late
     strange = [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
@@ -127,7 +129,7 @@ def _from_frames(
     notes: list[str] = result["notes"]
     found: tuple[Intrinsics, Intrinsics] | None = None
     try:
-        found = camera_of(frames, options.camera)
+        found = rough_camera(frames, options.camera) if options.plan else camera_of(frames, options.camera)
     except RefusedError as error:
         notes.append(f"no intrinsics: {error}")
         if isinstance(error, CameraChanged):

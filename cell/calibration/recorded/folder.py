@@ -72,7 +72,9 @@ def read_frames(
 ) -> tuple[list[RecordedFrame], Channel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError when there are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError where there
+    are no pictures.
+    are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
