@@ -151,7 +151,7 @@ def _from_folder(folder: Path, board: str | None, options: Options, json: bool, 
     from cell.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
-    result = calibrate_folder(folder, None if board is None else parse_board(board), options)
+    result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), options)
     if json:
         print_json(result)
     else:

@@ -17,7 +17,6 @@ from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.conventions import check_reading
 from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
 from cell.calibration.recorded.listing import Listing, list_folder
-from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, in_order_of_views, match_series, read_series
@@ -67,7 +66,12 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
         return _of_pairs(pairs, options)
     listing = list_folder(folder)
     if not listing.pictures and listing.texts:
-        return _of_pairs(pairs, options) if pairs else _from_tables(listing, options)
+        if pairs:
+            return _of_pairs(pairs, options)
+        raise ConfigError(
+            f"{folder} holds no pictures, and no JSON file with pairs of poses: for a hand-eye without pictures give "
+            "a list of [base_from_flange, camera_from_board], each a 4×4 matrix in m"
+        )
     if spec is None:
         raise ConfigError(
             f"{folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
@@ -103,15 +107,6 @@ def _of_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]], options: Options) -> dic
     result = calibrate_pairs(pairs)
     if options.plan:
         result |= {"hand_eye": None, "checks": [], "refused": {}, "refused_values": {}}
-    return result
-
-
-def _from_tables(listing: Listing, options: Options) -> dict[str, Any]:
-    """The hand-eye from a table of the arm's poses and one of the board's."""
-    pairs, about, unread = pairs_of_tables(listing, options)
-    result = _of_pairs(pairs, options)
-    result["poses"] = about
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in unread]
     return result
 
 
