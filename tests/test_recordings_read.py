@@ -23,7 +23,7 @@ from cell.calibration.recorded.series import in_order_of_views, match_series, re
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
-from cell.vision.pictures import looks_raw, read_picture
+from cell.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -424,18 +424,6 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert "another unit" in frames[4].text
     others = [f for f in frames if f is not frames[4]]
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
-
-
-def test_a_raw_picture_of_a_colour_camera_is_called_so(tmp_path, pictures):
-    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
-    mosaic = image.astype(np.float64)
-    mosaic[0::2, 0::2] *= 0.55
-    mosaic[1::2, 1::2] *= 0.65
-    cv2.imwrite(str(tmp_path / "raw.png"), mosaic.astype(np.uint8))
-    (frame,), _ = read_frames(list_folder(tmp_path), BOARD)
-    assert frame.view is None
-    assert "a Bayer mosaic" in frame.text
-    assert not looks_raw(image)
 
 
 def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):
