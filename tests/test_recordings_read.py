@@ -23,7 +23,7 @@ from cell.calibration.recorded.series import in_order_of_views, match_series, re
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
-from cell.vision.pictures import looks_raw, read_picture
+from cell.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")
@@ -136,11 +136,6 @@ def tuples(folder: Path) -> None:
     one_file_each(folder, lambda p: str((tuple(p[:3, 3]), tuple(quaternion(p)))))
 
 
-def rotation_vectors_in_a_table(folder: Path) -> None:
-    rows = [row([*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for p in POSES]
-    (folder / "poses.txt").write_text("\n".join(rows))
-
-
 def wxyz_in_mm_with_names(folder: Path) -> None:
     rows = [f"frame{k + 3:02d}.png,{row([*1e3 * p[:3, 3], *quaternion(p, 'wxyz')], ',')}" for k, p in enumerate(POSES)]
     (folder / "robot.csv").write_text("image,a1,a2,a3,a4,a5,a6,a7\n" + "\n".join(rows))
@@ -184,11 +179,6 @@ def numpy_stack_by_columns(folder: Path) -> None:
     np.save(folder / "poses.npy", np.array([p.T for p in POSES]))
 
 
-def titles_above_matrices(folder: Path) -> None:
-    blocks = [f"Pose {k + 3}:\n" + "\n".join(map(row, p)) for k, p in enumerate(POSES)]
-    (folder / "poses.txt").write_text("\n\n".join(blocks))
-
-
 def times_before_rotation_vectors(folder: Path) -> None:
     rows = [
         row([1.7e9 + 3.7 * k, *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for k, p in enumerate(POSES)
@@ -203,19 +193,6 @@ def titles_above_rotation_and_position(folder: Path) -> None:
         for k, (p, turn) in enumerate(zip(POSES, turns, strict=True))
     ]
     (folder / "info.txt").write_text("\n".join(blocks))
-
-
-def as_ros_echoes_a_transform(folder: Path) -> None:
-    blocks = []
-    for k, p in enumerate(POSES):
-        turn = Rotation.from_matrix(p[:3, :3])
-        angles = "\n".join(
-            f"            in RPY ({u}) {turn.as_euler('xyz', degrees=u == 'degree').round(3).tolist()}"
-            for u in ("radian", "degree")
-        )
-        place = p[:3, 3].round(9).tolist()
-        blocks.append(f"At time {k}.5\n- Translation: {place}\n- Rotation: in Quaternion {quaternion(p)}\n{angles}")
-    (folder / "tf.txt").write_text("\n".join(blocks))
 
 
 def program_of_the_arm(folder: Path) -> None:
@@ -238,12 +215,6 @@ def halves_in_one_file(folder: Path) -> None:
     )
 
 
-def halves_in_two_files(folder: Path) -> None:
-    turns = "\n".join(row(line) for p in POSES for line in p[:3, :3])
-    (folder / "R_base.txt").write_text(turns)
-    (folder / "t_base.txt").write_text("\n".join(row(1e3 * p[:3, 3]) for p in POSES))
-
-
 def opencv_xml(folder: Path) -> None:
     parts = [
         f'<pose_{k + 3} type_id="opencv-matrix"><rows>4</rows><cols>4</cols><dt>d</dt><data>\n{row(p.ravel())}</data>'
@@ -264,38 +235,7 @@ def xml_with_joints_beside(folder: Path) -> None:
     (folder / "robot.xml").write_text(f"<stops>{''.join(parts)}</stops>")
 
 
-def as_a_pendant_shows_them(folder: Path) -> None:
-    lines = [
-        "{{X {:.6f}, Y {:.6f}, Z {:.6f}, A {:.8f}, B {:.8f}, C {:.8f}}}".format(*(1e3 * p[:3, 3]), *angles(p, "ZYX"))
-        for p in POSES
-    ]
-    (folder / "points.txt").write_text("\n".join(lines))
-
-
-def message(pose: np.ndarray) -> str:
-    place = "".join(f"    {n}: {v:.9f}\n" for n, v in zip("xyz", pose[:3, 3], strict=True))
-    turn = "".join(f"    {n}: {v:.9f}\n" for n, v in zip("xyzw", quaternion(pose), strict=True))
-    return f'header:\n  seq: 1\n  frame_id: "base"\npose:\n  position:\n{place}  orientation:\n{turn}'
-
-
-def messages_in_a_text(folder: Path) -> None:
-    (folder / "echo.txt").write_text("---\n".join(map(message, POSES)))
-
-
-def documents_of_yaml(folder: Path) -> None:
-    parts = [f"image: frame{k + 3:02d}.png\n{message(p)}" for k, p in enumerate(POSES)]
-    (folder / "poses.yaml").write_text("---\n" + "---\n".join(parts))
-
-
 JOINTS = np.random.default_rng(0).normal(0, 1.5, (len(POSES), 6))
-
-
-def joints_before_poses_without_names(folder: Path) -> None:
-    lines = [
-        row([1.7e9 + k, *JOINTS[k], *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()])
-        for k, p in enumerate(POSES)
-    ]
-    (folder / "record.csv").write_text("\n".join(lines))
 
 
 def as_the_arms_client_records_them(folder: Path) -> None:
@@ -305,11 +245,6 @@ def as_the_arms_client_records_them(folder: Path) -> None:
         for k, p in enumerate(POSES)
     ]
     (folder / "robot_data.csv").write_text("\n".join([" ".join(["timestamp", *names]), *lines]))
-
-
-def numbered_rows_in_any_order(folder: Path) -> None:
-    lines = [f"{k + 3} {row([*(1e3 * p[:3, 3]), *angles(p, 'xyz')])}" for k, p in enumerate(POSES)]
-    (folder / "poses.txt").write_text("\n".join([*lines[3:], *lines[:3]]))
 
 
 def links_of_which_one_is_the_flange(folder: Path) -> None:
@@ -326,11 +261,9 @@ def links_of_which_one_is_the_flange(folder: Path) -> None:
 
 SPELLINGS = {
     halves_in_one_file: ("matrix-4x4", "m", "order"),
-    halves_in_two_files: ("matrix-4x4", "mm", "order"),
     opencv_xml: ("matrix-4x4", "m", "name"),
     xml_with_joints_beside: ("xyz+rpy-rad", "mm", "name"),
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
-    rotation_vectors_in_a_table: ("xyz+rotvec-rad", "m", "order"),
     wxyz_in_mm_with_names: ("xyz+quaternion-wxyz", "mm", "name"),
     named_columns_in_another_order: ("xyz+quaternion-xyzw", "m", "number"),
     decimal_commas_with_bom_and_crlf: ("xyz+abc-deg", "mm", "order"),
@@ -339,16 +272,9 @@ SPELLINGS = {
     opencv_yaml: ("matrix-4x4", "m", "name"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
     program_of_the_arm: ("xyz+rotvec-rad", "m", "order"),
-    titles_above_matrices: ("matrix-4x4", "m", "name"),
     times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
     titles_above_rotation_and_position: ("xyz+rotvec-rad", "m", "name"),
-    as_ros_echoes_a_transform: ("xyz+quaternion-xyzw", "m", "order"),
-    as_a_pendant_shows_them: ("xyz+abc-deg", "mm", "order"),
-    messages_in_a_text: ("xyz+quaternion-xyzw", "m", "order"),
-    documents_of_yaml: ("xyz+quaternion-xyzw", "m", "name"),
-    joints_before_poses_without_names: ("xyz+rotvec-rad", "m", "order"),
     as_the_arms_client_records_them: ("xyz+rotvec-rad", "m", "order"),
-    numbered_rows_in_any_order: ("xyz+rpy-deg", "mm", "name"),
     links_of_which_one_is_the_flange: ("matrix-4x4", "m", "name"),
 }
 
@@ -399,6 +325,21 @@ def test_a_name_of_no_convention_is_refused_with_the_form(name):
         check_reading(name)
 
 
+def test_a_folder_for_each_pose_is_read(tmp_path, pictures, seen):
+    for k, (path, pose) in enumerate(zip(sorted(pictures.iterdir()), POSES, strict=True)):
+        folder = tmp_path / f"pose_{k + 1:02d}"
+        folder.mkdir()
+        (folder / "image.png").symlink_to(path)
+        (folder / "data.json").write_text(json.dumps({"stamp": k, "robot": [*pose[:3, 3], *quaternion(pose)]}))
+    listing = list_folder(tmp_path)
+    series, links, _ = read_series(listing)
+    belonging, _ = match_series(series, listing, links)
+    views = [seen[path.name].view for path in sorted(pictures.iterdir())]
+    frames = [RecordedFrame(p, listing.name(p), v) for p, v in zip(listing.pictures, views, strict=True)]
+    assert attach_poses(frames, belonging, CAMERA, Options()).about["matched_by"] == "folder"
+    assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
+
+
 def test_a_camera_that_stands_before_the_arm_is_recognised(recording, seen):
     one_file_each(recording, lambda p: row(np.linalg.inv(p).ravel()))
     _, understood, _ = understand(recording, seen)
@@ -444,12 +385,6 @@ def test_the_boards_poses_beside_the_pictures_are_not_taken_for_the_flanges(reco
     assert all(np.abs(f.base_from_flange.homogeneous - p).max() < 1e-6 for f, p in zip(frames, POSES, strict=True))
 
 
-def test_a_reading_that_was_asked_for_and_does_not_agree_is_refused(recording, seen):
-    tuples(recording)
-    _, understood, _ = understand(recording, seen, poses="xyz+quaternion-wxyz")
-    assert "no reading of the poses agrees" in understood.refused
-
-
 def test_a_wrong_pitch_is_named_with_the_right_one(recording, seen):
     one_file_each(recording, lambda p: row(np.vstack([np.c_[p[:3, :3], 1.25 * p[:3, 3]], p[3:]]).ravel()))
     frames, understood, _ = understand(recording, seen)
@@ -489,18 +424,6 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert "another unit" in frames[4].text
     others = [f for f in frames if f is not frames[4]]
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
-
-
-def test_a_raw_picture_of_a_colour_camera_is_called_so(tmp_path, pictures):
-    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
-    mosaic = image.astype(np.float64)
-    mosaic[0::2, 0::2] *= 0.55
-    mosaic[1::2, 1::2] *= 0.65
-    cv2.imwrite(str(tmp_path / "raw.png"), mosaic.astype(np.uint8))
-    (frame,), _ = read_frames(list_folder(tmp_path), BOARD)
-    assert frame.view is None
-    assert "a Bayer mosaic" in frame.text
-    assert not looks_raw(image)
 
 
 def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):
@@ -561,15 +484,6 @@ def test_what_is_wrong_is_named_with_its_file(recording, seen):
     assert "not there" in reasons["gone.png"]
 
 
-def test_one_pose_more_than_pictures_is_not_guessed(recording, seen):
-    rows = [row(p.ravel()) for p in [*POSES, POSES[0]]]
-    (recording / "poses.txt").write_text("\n".join(rows))
-    frames, understood, unread = understand(recording, seen)
-    assert "9 poses for 8 pictures" in dict(unread)["poses.txt"]
-    assert all(f.base_from_flange is None for f in frames)
-    assert "no flange poses" in understood.notes[0]
-
-
 def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
     for session in ("monday", "tuesday"):
         (tmp_path / session).mkdir()
@@ -601,24 +515,6 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
         path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
     _, _, unread = read_series(list_folder(recording))
     assert all(len(reason) > 5 for _, reason in unread)
-
-
-def in_little_light(image: np.ndarray, light: float, seed: int) -> np.ndarray:
-    """The picture by `light` as much light, with noise and a stripe."""
-    across = np.arange(image.shape[1]) - (300 + 0.1 * np.arange(image.shape[0]))[:, None]
-    noise = np.random.default_rng(seed).normal(0, 1, image.shape)
-    return np.clip(light * image + 180 * np.exp(-0.5 * (across / 2.0) ** 2) + noise + 3, 0, 255).astype(np.uint8)
-
-
-def test_three_pictures_of_one_place_are_one_frame(tmp_path, pictures):
-    image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(tmp_path / "03_board.png"), image)
-    cv2.imwrite(str(tmp_path / "03_laser_off.png"), (0.3 * image + 3).astype(np.uint8))
-    cv2.imwrite(str(tmp_path / "03_laser_on.png"), in_little_light(image, 0.3, 1))
-    frames, _ = read_frames(list_folder(tmp_path), BOARD)
-    (used,) = [f for f in frames if f.reason is None]
-    assert (used.name, used.stripe_from, used.stripe_off) == ("03_board.png", "03_laser_on.png", "03_laser_off.png")
-    assert {f.reason.value for f in frames if f is not used} == {"laser_picture"}
 
 
 def drawn_corners(image: np.ndarray, view) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 from cell.vision import parse_board
 from cell.vision.board.board import find_board
 from cell.vision.pictures import PictureRefused
+from drivers.errors import ConfigError
 
 TAG, GAP = 80, 24
 TURN = np.array([[0.9, 0.1, 30], [-0.05, 0.8, 60], [1e-4, 2e-4, 1]])
@@ -56,3 +57,27 @@ def test_tags_of_one_row_are_said_to_lie_on_one_line():
     one = np.where(cv2.warpPerspective(row, TURN, (640, 480)) > 0, photograph(False), 128).astype(np.uint8)
     with pytest.raises(PictureRefused, match="that were read lie on one line"):
         find_board(one, parse_board("aprilgrid:6x5:26mm:20mm"))
+
+
+def test_a_single_tag_is_a_board_and_two_are_not():
+    spec = parse_board("apriltag:36h11:50mm", single_tag=True)
+    assert (spec.name, len(spec.points())) == ("apriltag:36h11:50mm", 4)
+    image = photograph(False)
+    corners = cv2.perspectiveTransform(np.array([[[280.0, 176], [384, 176], [384, 280], [280, 280]]]), TURN)[0]
+    near = cv2.fillConvexPoly(np.zeros(image.shape, np.uint8), np.round(corners).astype(np.int32), 1)
+    found = find_board(np.where(near > 0, image, 180).astype(np.uint8), spec)
+    drawn = 60 + GAP + (TAG + GAP) * np.array([2, 1]) + TAG * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 0.5
+    assert np.abs(found.pixels - cv2.perspectiveTransform(drawn[None].astype(float), TURN)[0]).max() < 0.3
+    with pytest.raises(PictureRefused, match=r"30 tags .* is one"):
+        find_board(image, spec)
+    with pytest.raises(ConfigError, match="unknown kind 'apriltag'"):
+        parse_board("apriltag:36h11:50mm")
+
+
+def test_markers_beyond_the_named_board_propose_the_right_counts():
+    with pytest.raises(PictureRefused, match="By the markers read it has 6x5"):
+        find_board(photograph(False), parse_board("aprilgrid:4x5:26mm:20mm"))
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    sheet = cv2.aruco.CharucoBoard((9, 6), 0.03, 0.02, dictionary).generateImage((900, 620), marginSize=20)
+    with pytest.raises(PictureRefused, match="By the markers read it has 9x6"):
+        find_board(cv2.GaussianBlur(sheet, (0, 0), 1.0), parse_board("charuco:7x5:30mm:20mm"))

@@ -79,6 +79,9 @@ def calibrate(
             help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
         ),
     ] = None,
+    details: Annotated[
+        bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
@@ -90,7 +93,7 @@ def calibrate(
     from drivers.errors import ConfigError
 
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
-    given |= {"--camera": camera, "--laser": laser}
+    given |= {"--camera": camera, "--laser": laser, "--details": details}
     if source is None:
         for name, value in given.items():
             if value:
@@ -101,7 +104,7 @@ def calibrate(
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
         options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures", _laser(laser))
-        _from_folder(source, board, options, json)
+        _from_folder(source, board, options, json, details)
         return
     from cell.calibration.archive import read_archive
     from cell.calibration.report import examine
@@ -146,19 +149,19 @@ def _laser(text: str | None) -> Laser | None:
     return None if text == "none" else Laser(text or "auto")
 
 
-def _from_folder(folder: Path, board: str | None, options: Options, json: bool) -> None:
+def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:
     from cell.calibration.recorded.command import calibrate_folder
     from cell.cli.recorded_tables import print_recorded
     from cell.storage import sealed
     from cell.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
-    result = calibrate_folder(folder, None if board is None else parse_board(board), options)
+    result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), options)
     if json:
         # Kept in a file, it may come back with --camera.
         print_json(sealed(result))
     else:
-        print_recorded(result)
+        print_recorded(result, details)
     if not any(frame["used"] for frame in result["frames"]):
         raise ConfigError(
             f"no picture in {folder} could be used: is {board} the board in the pictures? The reasons are listed above"

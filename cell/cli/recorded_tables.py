@@ -1,4 +1,4 @@
-"""Tables of a calibration from a folder of recorded frames, for people; scripts take the JSON."""
+"""What a calibration from recorded frames says to people: a verdict for each part; scripts take the JSON."""
 
 from __future__ import annotations
 
@@ -9,134 +9,133 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+Result = Mapping[str, Any]
+PARTS = {"intrinsics": "camera", "hand_eye": "hand-eye", "light_plane": "light plane"}
 
-def print_recorded(result: Mapping[str, Any]) -> None:
-    """What was understood, frame by frame and of the poses, then what was found, then what could not be had."""
+
+def print_recorded(result: Result, details: bool = False) -> None:
+    """Which pictures were used, how poses were read, and one verdict for each part; with `details` all there is."""
     console = Console()
-    if result["board"] is not None:
-        console.print(_frames(result["frames"]))
-        _print_stripes(console, result)
-    else:
-        for pair in result["frames"]:
-            if not pair["used"]:
-                console.print(f"{pair['name']} not used: {pair['text']}", markup=False, soft_wrap=True)
-    _print_poses(console, result)
-    values = _table("calibration", ("quantity", "value", "unit"), right=1)
-    camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
-    if camera is not None:
-        for name in ("fx", "fy", "cx", "cy"):
-            values.add_row(f"camera {name}", f"{camera[name]:.3f} ± {camera['sigma_px'][name]:.3f}", "px")
-        for name in ("k1", "k2", "p1", "p2", "k3"):
-            values.add_row(f"camera {name}", f"{camera[name]:.5f}", "")
-        values.add_row("RMS of the board's points", f"{camera['rms_px']:.4f}", "px")
-    if hand is not None:
-        setup = f"hand-eye ({hand['setup'].replace('_', ' ')})"
-        for axis, value, sigma in zip("xyz", hand["translation_mm"], hand["sigma_mm"], strict=True):
-            values.add_row(f"{setup} {axis}", f"{value:.3f} ± {sigma:.3f}", "mm")
-        for axis, value, sigma in zip("xyz", hand["rotation_vector_rad"], hand["sigma_deg"], strict=True):
-            values.add_row(f"{setup} rotation {axis}", f"{value:.5f} ± {math.radians(sigma):.5f}", "rad")
-        values.add_row("scatter of the board", f"{hand['scatter_mm']:.3f}", "mm")
-        values.add_row("scatter of the board", f"{hand['scatter_deg']:.4f}", "deg")
-    if plane is not None:
-        values.add_row("light plane normal", ", ".join(f"{v:.5f}" for v in plane["normal"]), "")
-        values.add_row("light plane distance", f"{plane['distance_mm']:.3f}", "mm")
-        low, high = plane["depth_range_mm"]
-        values.add_row("light plane seen from the camera at", f"{low:.0f} … {high:.0f}", "mm")
-        values.add_row("light plane RMS", f"{plane['rms_mm']:.4f}", "mm")
-        if plane["sigma_place_mm"] is not None:
-            values.add_row("light plane σ where it was seen", f"{plane['sigma_place_mm']:.4f}", "mm")
-            values.add_row("light plane σ of its normal", f"{plane['sigma_normal_deg']:.4f}", "deg")
-    if values.row_count:
-        console.print(values)
-    if result["flatness"] is not None:
-        console.print(_flatness(result["flatness"]))
-    if result["checks"]:
-        console.print(_checks(result["checks"]))
-    for part, text in result["refused"].items():
-        console.print(f"REFUSED {part.replace('_', '-')}: {text}", markup=False, soft_wrap=True)
-    for note in result["notes"]:
-        console.print(note, markup=False, soft_wrap=True)
+
+    def say(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True, highlight=False)
+
+    frames = result["frames"]
+    say(f"{sum(f['used'] for f in frames)} of {len(frames)} used")
+    for frame in frames:
+        if not frame["used"]:
+            say(f"{frame['name']} not used: {frame['text']}")
+    _say_poses(say, result)
+    if details:
+        if result["board"] is not None:
+            rows = [
+                (
+                    f["name"],
+                    f["points"],
+                    f["pose_from"],
+                    f["stripe_from"] or ("here" if f["stripe"] else ""),
+                    f["rms_px"],
+                )
+                for f in frames
+            ]
+            console.print(_table("recorded frames", ("picture", "points", "pose", "stripe", "RMS in px"), rows))
+        for part, name in PARTS.items():
+            found = result[part] or result["refused_values"].get(part)
+            if found is not None:
+                title = name if result[part] is not None else f"{name}, REFUSED"
+                console.print(_table(title, ("quantity", "value"), _plain(found)))
+        if result["flatness"] is not None:
+            flat = result["flatness"]
+            frames_flat = [(f["name"], f["rms_mm"]) for f in flat["per_frame"]]
+            whole = [("all frames", flat["rms_mm"]), ("95 % within", flat["p95_mm"])]
+            title = f"flatness of the board in the {flat['frame']}, end to end, mm"
+            console.print(_table(title, ("points of", "RMS"), frames_flat + whole))
+        checks = [
+            (PARTS[c["part"]], c["name"], c["value"], c["doubt_from"], c["refused_from"], c["unit"], c["verdict"])
+            for c in result["checks"]
+        ]
+        console.print(_table("checks", ("of", "what", "found", "doubtful from", "refused from", "unit", ""), checks))
+        for note in result["notes"]:
+            say(note)
+    for line in verdicts(result):
+        say(line)
+    if not details:
+        say("More with --details.")
 
 
-def _print_stripes(console: Console, result: Mapping[str, Any]) -> None:
-    laser = result["laser"]
-    if laser is not None and any(frame["stripe"] or frame["stripe_text"] for frame in result["frames"]):
-        text = f"laser: read in {laser['channel']}"
-        if laser["asked"] == "auto":
-            votes = ", ".join(f"{name} in {count}" for name, count in laser["votes"].items()) or "in none"
-            text += f"; of {laser['looked']} pictures looked at it stands out best: {votes}"
-        console.print(text, markup=False, soft_wrap=True)
-    names = {"second_line": "a second line", "reflection": "a reflection"}
-    for key, name in names.items():
-        counts = {f["name"]: f["stripe_left_out"].get(key, 0) for f in result["frames"]}
-        if any(counts.values()):
-            parts = ", ".join(f"{count} in {frame}" for frame, count in counts.items() if count)
-            console.print(f"points not used for {name} beside them: {parts}", markup=False, soft_wrap=True)
+def verdicts(result: Result) -> list[str]:
+    """One line for each part: its value ± σ, used or refused, and the reason in one sentence."""
+    lines = []
+    for part, name in PARTS.items():
+        refused = result["refused"].get(part)
+        value = _values(part, result[part] or result["refused_values"].get(part))
+        texts = [
+            c["text"].split(": ", 1)[-1] for c in result["checks"] if c["part"] == part and c["verdict"] == "doubt"
+        ]
+        ran = sum(c["part"] == part for c in result["checks"])
+        if refused:
+            lines.append(f"{name}: REFUSED{f' (do not use: {value})' if value else ''}: {refused}")
+        elif value:
+            reason = f"doubtful: {texts[0]}" if texts else f"all {ran} checks are well"
+            lines.append(f"{name}: {value}; used; {reason}" + (f" ({len(texts) - 1} more doubts)" if texts[1:] else ""))
+        else:
+            said = (f"no {name.replace(' ', '-')}", f"no {name}", f"no {part}")
+            why = next((note for note in result["notes"] if any(word in note for word in said)), "not asked for")
+            lines.append(f"{name}: none: {why}")
+    return lines
 
 
-def _print_poses(console: Console, result: Mapping[str, Any]) -> None:
+def _values(part: str, found: Result | None) -> str:
+    if found is None:
+        return ""
+    if part == "intrinsics":
+        return ", ".join(f"{n} {found[n]:.2f} ± {found['sigma_px'][n]:.2f}" for n in ("fx", "fy", "cx", "cy")) + " px"
+    if part == "hand_eye":
+        pairs = zip("xyz", found["translation_mm"], found["sigma_mm"], strict=True)
+        place = ", ".join(f"{axis} {value:.2f} ± {sigma:.2f}" for axis, value, sigma in pairs)
+        return f"{found['setup'].replace('_', ' ')}, {place} mm, turn ± {max(found['sigma_deg']):.3f} deg"
+    sigma = found["sigma_place_mm"]
+    place = "" if sigma is None else f" ± {sigma:.3f}"
+    return f"normal {', '.join(f'{v:.4f}' for v in found['normal'])}, distance {found['distance_mm']:.2f}{place} mm"
+
+
+def _say_poses(say: Any, result: Result) -> None:
     poses = result["poses"]
     if poses is not None and poses.get("reading") is not None:
         chosen = "as given" if "poses" in poses["given"] else "chosen by the pictures"
-        lines = (
+        say(
             f"poses: {', '.join(poses['source'])}, {poses['text']} ({poses['reading']}, {chosen}), in {poses['unit']}; "
-            f"matched by {poses['matched_by']}; {poses['setup'].replace('_', ' ')} (if they are base_from_flange)",
-            f"evidence: {poses['evidence']}",
+            f"matched by {poses['matched_by']}; {poses['setup'].replace('_', ' ')} (if they are base_from_flange)\n"
+            f"evidence: {poses['evidence']}"
         )
-        for line in lines:
-            console.print(line, markup=False, soft_wrap=True)
+    laser = result["laser"]
+    if laser is not None and any(frame["stripe"] for frame in result["frames"]):
+        say(f"laser: read in {laser['channel']}")
     for file in result["unread"]:
-        console.print(f"not understood: {file['name']}: {file['reason']}", markup=False, soft_wrap=True)
+        say(f"not understood: {file['name']}: {file['reason']}")
 
 
-def _frames(frames: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("recorded frames", ("picture", "board", "pose", "stripe", "used", "RMS in px", "reason"), right=5)
-    for frame in frames:
-        rms = "" if frame["rms_px"] is None else f"{frame['rms_px']:.3f}"
-        table.add_row(
-            frame["name"],
-            f"{frame['points']} points" if frame["points"] else "",
-            frame["pose_from"] or "",
-            frame["stripe_from"] or ("here" if frame["stripe"] else ""),
-            "yes" if frame["used"] else "no",
-            rms,
-            frame["text"],
-        )
+def _plain(found: Result) -> list[tuple[str, Any]]:
+    """Numbers and lists of numbers of a part, without what is nested deeper."""
+    rows: list[tuple[str, Any]] = []
+    for key, value in found.items():
+        if isinstance(value, Mapping):
+            rows += [(f"{key} {name}", v) for name, v in value.items() if isinstance(v, (int, float))]
+        elif not isinstance(value, list) or all(isinstance(v, (int, float)) for v in value):
+            rows.append((key, value))
+    return rows
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*map(_shown, row))
     return table
 
 
-def _checks(checks: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("checks", ("of", "what", "found", "doubtful from", "refused from", "unit"), right=2)
-    for check in checks:
-        found = "not known" if check["value"] is None else f"{check['value']:.3g}"
-        mark = {"ok": "", "doubt": " ?", "refused": " !"}[check["verdict"]]
-        limit = "" if check["refused_from"] is None else f"{check['refused_from']:.3g}"
-        part = check["part"].replace("_", "-")
-        table.add_row(part, check["name"], found + mark, f"{check['doubt_from']:.3g}", limit, check["unit"])
-    return table
-
-
-def _flatness(flat: Mapping[str, Any]) -> Table:
-    title = f"flatness of the board in the {flat['frame']}, end to end, mm"
-    table = _table(title, ("points of", "RMS", "left out", "staged"), right=1)
-    other = [flat["leave_one_out"], flat["staged"]]
-
-    def shown(part: Mapping[str, Any] | None, key: str) -> str:
-        return "" if part is None or part[key] is None else f"{part[key]:.3f}"
-
-    for k, frame in enumerate(flat["per_frame"]):
-        rest = [shown(None if part is None else part["per_frame"][k], "rms_mm") for part in other]
-        table.add_row(frame["name"], shown(frame, "rms_mm"), *rest)
-    table.add_section()
-    table.add_row("all frames", shown(flat, "rms_mm"), *(shown(part, "rms_mm") for part in other))
-    table.add_row("95 % within", shown(flat, "p95_mm"), *(shown(part, "p95_mm") for part in other))
-    table.add_row(f"{flat['points']} points", *(["×".join(f"{v:.0f}" for v in flat["extent_mm"])] + [""] * 2))
-    return table
-
-
-def _table(title: str, columns: Sequence[str], right: int) -> Table:
-    """A table whose columns from `right` on hold numbers, the last one but text where it is a unit or a reason."""
-    table = Table(title=title)
-    for k, name in enumerate(columns):
-        table.add_column(name, justify="right" if k >= right and name not in ("unit", "reason") else "left")
-    return table
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_shown, value))
+    if isinstance(value, float):
+        return f"{value:.5g}" if math.isfinite(value) else "not known"
+    return "" if value is None else str(value)

@@ -20,8 +20,6 @@ Found = TypeVar("Found")
 
 BLACK_DN = 10
 SATURATED_SHARE = 0.6
-# Every other pixel of a picture is as bright as the rest to a per cent; those of a mosaic have colours of their own.
-RAW_SHARE = 0.08
 
 
 class Reason(StrEnum):
@@ -92,14 +90,6 @@ def _eight_bit(image: NDArray[np.generic], path: Path) -> Image:
         )
     bits = next(b for b in (8, 10, 12, 14, 16) if int(image.max()) < 1 << b)
     return np.asarray(np.asarray(image, dtype=np.uint16) >> (bits - 8), dtype=np.uint8)
-
-
-def looks_raw(image: Image) -> bool:
-    """True for an image (h, w) of a colour sensor's own pixels, red, green and blue side by side: a Bayer mosaic."""
-    phases = [float(image[i::2, j::2].mean()) for i in (0, 1) for j in (0, 1)]
-    alike = min(abs(phases[0] - phases[3]), abs(phases[1] - phases[2]))
-    spread = max(phases) - min(phases)
-    return spread > RAW_SHARE * max(phases) and alike < 0.5 * spread
 
 
 def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:

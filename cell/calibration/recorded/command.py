@@ -17,7 +17,6 @@ from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.conventions import check_reading
 from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
 from cell.calibration.recorded.listing import Listing, list_folder
-from cell.calibration.recorded.pair_tables import pairs_of_tables
 from cell.calibration.recorded.pairs import calibrate_pairs
 from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
 from cell.calibration.recorded.series import Series, in_order_of_views, match_series, read_series
@@ -26,6 +25,7 @@ from cell.calibration.recorded.solution import (
     agreeing,
     camera_of,
     note_perhaps_no_laser,
+    rough_camera,
     solve_frames,
 )
 from cell.calibration.solve.intrinsics import Intrinsics
@@ -66,7 +66,12 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
         return _of_pairs(pairs, options)
     listing = list_folder(folder)
     if not listing.pictures and listing.texts:
-        return _of_pairs(pairs, options) if pairs else _from_tables(listing, options)
+        if pairs:
+            return _of_pairs(pairs, options)
+        raise ConfigError(
+            f"{folder} holds no pictures, and no JSON file with pairs of poses: for a hand-eye without pictures give "
+            "a list of [base_from_flange, camera_from_board], each a 4×4 matrix in m"
+        )
     if spec is None:
         raise ConfigError(
             f"{folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
@@ -74,7 +79,8 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
         )
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
-    frames, channel = read_frames(listing, spec, links, options.laser)
+    # A plan tells of boards and poses; to read stripes takes seconds for each picture.
+    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser)
     late = [one for one in series if not one.of and in_order_of_views(one, frames)]
     belonging += late
     strange = [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
@@ -104,15 +110,6 @@ def _of_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]], options: Options) -> dic
     return result
 
 
-def _from_tables(listing: Listing, options: Options) -> dict[str, Any]:
-    """The hand-eye from a table of the arm's poses and one of the board's."""
-    pairs, about, unread = pairs_of_tables(listing, options)
-    result = _of_pairs(pairs, options)
-    result["poses"] = about
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in unread]
-    return result
-
-
 def _doubtful_lines(frames: list[RecordedFrame]) -> list[str]:
     """Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all."""
     texts = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
@@ -127,7 +124,7 @@ def _from_frames(
     notes: list[str] = result["notes"]
     found: tuple[Intrinsics, Intrinsics] | None = None
     try:
-        found = camera_of(frames, options.camera)
+        found = rough_camera(frames, options.camera) if options.plan else camera_of(frames, options.camera)
     except RefusedError as error:
         notes.append(f"no intrinsics: {error}")
         if isinstance(error, CameraChanged):

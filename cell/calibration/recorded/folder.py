@@ -28,14 +28,9 @@ from cell.geometry.poses import from_matrix
 from cell.vision.board.board import find_board
 from cell.vision.board.spec import BoardSpec
 from cell.vision.board.view import BoardView
-from cell.vision.pictures import PictureRefused, Reason, looks_raw, read_picture
+from cell.vision.pictures import PictureRefused, Reason, read_picture
 from cell.vision.stripe.extract import Laser, StripeProfile
 from drivers.errors import ConfigError
-
-RAW = (
-    "; it looks like a colour camera's raw picture (a Bayer mosaic: pixels side by side differ by their colour): "
-    "save it in colour or grey"
-)
 
 
 @dataclass(eq=False)
@@ -72,7 +67,9 @@ def read_frames(
 ) -> tuple[list[RecordedFrame], Channel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError when there are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError where there
+    are no pictures.
+    are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
@@ -80,15 +77,13 @@ def read_frames(
     seen: dict[str, RecordedFrame] = {}
     small: list[NDArray[np.float32] | None] = []
     for frame in frames:
-        image = None
         small.append(None)
         try:
             image = read_picture(frame.path)
             small[-1] = small_copy(image)
             frame.view = find_board(image, spec)
         except PictureRefused as refused:
-            raw = RAW if refused.reason is Reason.NO_BOARD and image is not None and looks_raw(image) else ""
-            frame.refuse(refused.reason, f"{refused}{raw}")
+            frame.refuse(refused.reason, str(refused))
         except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
             # One picture that upsets the search must not end the reading of the others.
             frame.refuse(Reason.UNREADABLE, f"the search for the board failed: {type(error).__name__}: {error}")

@@ -111,6 +111,12 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
             return chosen, plain
 
 
+def rough_camera(frames: Sequence[RecordedFrame], given: CameraModel | None) -> tuple[Intrinsics, Intrinsics]:
+    """A camera in closed form, without its lens: enough to tell how poses are to be read. Raises RefusedError."""
+    views = _views([merged(stop) for stop in by_stop(used(frames))])
+    return (given_camera(zhang(views, lens=False)[0] if given is None else given, views),) * 2
+
+
 def _refuse_without_pose(frames: Sequence[RecordedFrame], camera: CameraModel) -> bool:
     """Refuse frames in which the board's pose cannot be told, by about such a camera; True where there are some."""
     found = False

@@ -19,7 +19,7 @@ from cell.geometry.camera import Array
 from cell.vision.board.view import BoardView
 from cell.vision.pictures import PictureRefused
 from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
-from cell.vision.stripe.planes import Picture, read_colours
+from cell.vision.stripe.planes import MIXES, Picture, read_colours
 
 Shot = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -28,6 +28,9 @@ LOOKED_AT = 8
 # A laser stripe is brighter than the board's white, and runs on from row to row.
 LASER_OVER_WHITE, OVER_DN = 1.2, 5.0
 LEAST_SMOOTH_ROWS = 30
+SATURATED_DN, OUTSIDE_DN = 250.0, -1e6
+BESIDE_PX = 14
+"""A stripe's half-width and its halo are less; there it is darker than in its middle."""
 LEAST_SMOOTH_SHARE = 0.05
 # What is flat with the board reaches about so many pitches beyond its outermost points. There the stripe is straight,
 # to so many px but for a lens, in so many of its rows.
@@ -79,19 +82,46 @@ class Channel:
 def choose_channel(sources: Sequence[Source], laser: Laser | None) -> Channel:
     """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
 
-    Where none of them shows it, the others are read in grey.
+    Where none of them shows it there was no laser.
     """
     if laser is not Laser.AUTO or not sources:
         return Channel(laser, laser)
     some = [sources[k] for k in np.unique(np.linspace(0, len(sources) - 1, LOOKED_AT).astype(int))]
-    reads = {source.path: read_on_board(source, Channel(laser, laser)) for source in some}
+    # Most such recordings are of the board alone; to look for a line in every mix of colours takes seconds each.
+    lit = [source for source in some if source.off is not None or _may_show_line(source)]
+    reads = {source.path: read_on_board(source, Channel(laser, laser)) for source in lit}
     votes = Counter(_mix(read.profile) for read in reads.values() if read.profile is not None)
     if not votes:
-        # Most such recordings are of the board alone; to look for a line in every mix of colours takes seconds each.
-        return Channel(laser, Laser.GREY, len(some), {}, reads)
+        return Channel(laser, None, len(some), {}, reads)
     chosen = votes.most_common(1)[0][0]
     again = {path: read for path, read in reads.items() if read.profile is not None and _mix(read.profile) == chosen}
     return Channel(laser, Laser(chosen), len(some), dict(votes.most_common()), again)
+
+
+def _may_show_line(source: Source) -> bool:
+    """Whether some mix of colours has a thin line on the board that is brighter than its white: a quick look."""
+    try:
+        picture = subtracted(read_colours(source.path), None, StripeSettings())[0]
+    except PictureRefused:
+        return False
+    sheet = _sheet(source.view)
+    box = tuple(
+        slice(int(np.flatnonzero(sheet.any(axis=k)).min()), np.flatnonzero(sheet.any(axis=k)).max() + 1) for k in (1, 0)
+    )
+    for mix in MIXES if picture.coloured else ("grey",):
+        plane = picture.plane(mix)[0]
+        needed = min(LASER_OVER_WHITE * max(_white(plane, source.view), 0.0) + OVER_DN, SATURATED_DN)
+        part = np.where(sheet[box], cv2.GaussianBlur(plane[box], (0, 0), 1.0), OUTSIDE_DN)
+        for lines in (part, part.T):
+            wide = np.pad(lines, ((0, 0), (BESIDE_PX, BESIDE_PX)), constant_values=OUTSIDE_DN)
+            beside = np.maximum(wide[:, : lines.shape[1]], wide[:, -lines.shape[1] :])
+            ridge = np.where((lines > needed) & (beside > OUTSIDE_DN), lines - beside, OUTSIDE_DN)
+            at = ridge.argmax(axis=1)
+            lit = ridge.max(axis=1) > OVER_DN
+            follows = lit & np.r_[False, lit[:-1] & (np.abs(np.diff(at)) <= STRAIGHT_PX)]
+            if _straight(at.astype(np.float64), follows) > LEAST_SMOOTH_ROWS:
+                return True
+    return False
 
 
 def _mix(profile: StripeProfile) -> str:
@@ -100,10 +130,8 @@ def _mix(profile: StripeProfile) -> str:
 
 def read_on_board(source: Source, channel: Channel) -> ReadStripe:
     """The stripe on the board of a picture, along rows or columns, whichever shows more of it."""
-    if channel.chosen is None:
-        return ReadStripe()
-    if source.path in channel.reads:
-        return channel.reads[source.path]
+    if source.path in channel.reads or channel.chosen is None:
+        return channel.reads.get(source.path, ReadStripe())
     try:
         image = read_colours(source.path)
     except PictureRefused:
@@ -147,7 +175,7 @@ def _on_board(
     levels = plane[at[lit, 1], at[lit, 0]]
     level = float(np.median(levels))
     white = _white(plane, view)
-    needed = min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, 250.0)
+    needed = min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, SATURATED_DN)
     among = _among(view, profile.pixels()[lit])
     if level > needed and among.sum() >= LEAST_SMOOTH_ROWS:
         # Edges of the squares are no brighter there than the white, whatever shines outside.

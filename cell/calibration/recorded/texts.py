@@ -21,6 +21,7 @@ import yaml
 from cell.calibration.recorded.listing import PICTURES
 from cell.geometry.camera import Array
 
+STRUCTURED = (".json", ".yaml", ".yml", ".xml")
 COUNTS = (6, 7, 12, 16)
 """Numbers of a pose: 6, 7, 3×4, 4×4; one more in front is a time or a number."""
 NEEDED = "a pose has 6, 7, 12 or 16"
@@ -90,7 +91,7 @@ def read_content(path: Path) -> Content:
     data = structured(path.suffix.lower(), text)
     if data is not None:
         _walk(path, data, [], None, content)
-    if not content.records and not content.links and (data is None or isinstance(data, str)):
+    if not (content.records or content.links or content.halves) and path.suffix.lower() not in STRUCTURED:
         moves = [[float(v) for v in found.split(",")] for found in MOVE.findall(text)]
         content.records += [
             Record(path, "row", f"[{k}]", np.array(m), "rotation") for k, m in enumerate(moves) if len(m) == 6
@@ -131,7 +132,7 @@ def structured(suffix: str, text: str) -> Any:
     return None
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Plain maps, lists, numbers and words, whatever their tags say; 1e-3 is a number."""
 
 

@@ -182,17 +182,6 @@ def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
     return off
 
 
-def turns_apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> float:
-    """By how much the flange and the board turned differently between each two frames, as a share of the turn (median).
-
-    A reading in which nothing turns agrees with nothing: its share is 1 as well.
-    """
-    hand, eye = _turns(flanges).ravel(), _turns(boards).ravel()
-    share = np.abs(hand - eye) / np.maximum(np.maximum(hand, eye), LEAST_ANGLE)
-    votes = turn_votes(flanges, boards).ravel()
-    return float(weighted_median(share, votes)) if votes.max() > 0 else 1.0
-
-
 def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
     """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none."""
     votes = np.sin(0.5 * np.maximum(_turns(flanges), _turns(boards))) ** 2

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cell.geometry.camera import Array
 from cell.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
 from cell.vision.board.corner_fit import fit_corners
+from cell.vision.board.counts import propose_counts
 from cell.vision.board.ends import check_hidden_sides, smoothed
 from cell.vision.board.plane_map import PlaneMap
 from cell.vision.board.spec import BoardSpec
@@ -65,8 +66,11 @@ def _why(image: Image, spec: BoardSpec, most: int) -> str:
     """What else the picture shows: markers of another dictionary, or of another layout."""
     picture = next(_variants(image))
     if most >= LEAST_MARKERS:
-        _, ids = _markers(picture, spec)
-        return f"those read have ids up to {ids.max()} and do not lie as on this board; are its columns and rows right?"
+        corners, ids = _markers(picture, spec)
+        return (
+            f"those read have ids up to {ids.max()} and do not lie as on this board; are its columns and rows right?"
+            f"{propose_counts(spec, corners, ids)}"
+        )
     best, name = best_dictionary(picture)
     if best >= LEAST_MARKERS:
         return f"there are {best} markers of {name}; name the board with :{name} at its end"
@@ -149,7 +153,7 @@ def _check_alone(spec: BoardSpec, corners: Array, ids: NDArray[np.intp], used: N
         raise PictureRefused(
             Reason.NO_BOARD,
             f"{foreign} markers in the picture are none of {spec.name}, which has {spec.cols * spec.rows // 2}: is it "
-            "the board that the set-up names?",
+            f"the board that the set-up names?{propose_counts(spec, corners, ids)}",
         )
     if (~used).sum() >= LEAST_MARKERS and _solve(spec, corners[~used], ids[~used], legacy) is not None:
         raise PictureRefused(

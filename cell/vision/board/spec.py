@@ -25,6 +25,7 @@ FORM = "a board is named KIND:COLSxROWS:PITCH with the unit, such as chessboard:
 MARKED: tuple[Kind, ...] = ("charuco", "aprilgrid")
 # Tags are 1/1.3 of their pitch where nothing is said, the usual gap of 0.3 tags between them.
 MARKER_SHARE = {"charuco": 0.7, "aprilgrid": 1 / 1.3}
+FAMILIES = ("16h5", "25h9", "36h10", "36h11")
 DEFAULT_DICTIONARY = {"charuco": "DICT_5X5_100", "aprilgrid": "DICT_APRILTAG_36h11"}
 
 
@@ -47,10 +48,17 @@ class BoardSpec:
     @property
     def name(self) -> str:
         """The board's name as `parse_board` reads it."""
+        if self.single:
+            return f"apriltag:{self.dictionary.removeprefix('DICT_APRILTAG_')}:{self.marker * 1e3:g}mm"
         name = f"{self.kind}:{self.cols}x{self.rows}:{self.pitch * 1e3:g}mm"
         if self.kind in MARKED:
             name += f":{self.marker * 1e3:g}mm:{self.dictionary}"
         return name
+
+    @property
+    def single(self) -> bool:
+        """True for one tag by itself, whatever its number."""
+        return self.kind == "aprilgrid" and self.cols == self.rows == 1
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -108,9 +116,17 @@ class BoardSpec:
         return self.kind == "chessboard" and (self.cols + self.rows) % 2 == 0
 
 
-def parse_board(text: str) -> BoardSpec:
-    """The board of a name; ConfigError says which part of the name is wrong and how it should look."""
+def parse_board(text: str, single_tag: bool = False) -> BoardSpec:
+    """The board of a name; ConfigError says which part of the name is wrong and how it should look.
+
+    With `single_tag` one AprilTag is a board, too, such as apriltag:36h11:50mm: its four corners are the points.
+    """
     parts = text.strip().split(":")
+    if single_tag and parts[0] == "apriltag":
+        if len(parts) != 3 or parts[1] not in FAMILIES:
+            raise ConfigError(f"board {text!r}: a tag is named apriltag:FAMILY:SIDE with {', '.join(FAMILIES)}")
+        side = _length(text, parts[2], "side")
+        return BoardSpec("aprilgrid", 1, 1, side / MARKER_SHARE["aprilgrid"], side, f"DICT_APRILTAG_{parts[1]}")
     if len(parts) < 3:
         raise ConfigError(f"board {text!r} has {len(parts)} of at least 3 parts: {FORM}")
     kind = next((k for k in KINDS if k == parts[0]), None)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
 from cell.vision.board.charuco import best_dictionary
+from cell.vision.board.counts import propose_counts
 from cell.vision.board.spec import BoardSpec
 from cell.vision.board.view import BoardView
 from cell.vision.pictures import Image, PictureRefused, Reason
@@ -40,6 +41,8 @@ class _Layout:
 def find_tags(image: Image, spec: BoardSpec) -> BoardView:
     """The tags' corners in an 8-bit image (h, w). Raises PictureRefused."""
     corners, tags = _read(image, spec)
+    if spec.single:
+        return _single(image, spec, corners)
     if len(tags) < LEAST_TAGS:
         raise PictureRefused(Reason.NO_BOARD, f"{len(tags)} tags of {spec.name} were read, {_instead(image, spec)}")
     if len(set(tags.tolist())) < len(tags):
@@ -74,6 +77,20 @@ def find_tags(image: Image, spec: BoardSpec) -> BoardView:
     return BoardView(spec, size, ids[order], measured[good][order], sigma[good][order])
 
 
+def _single(image: Image, spec: BoardSpec, corners: Array) -> BoardView:
+    """The corners of the one tag in view. Raises PictureRefused for none, and for several."""
+    if len(corners) != 1:
+        raise PictureRefused(
+            Reason.AMBIGUOUS if len(corners) else Reason.NO_BOARD,
+            f"{len(corners)} tags of {spec.dictionary} were read, {spec.name} is one: show it alone, in focus; several "
+            "that are fixed to each other are an aprilgrid",
+        )
+    measured, sigma = _by_sides(image, corners)
+    if not np.isfinite(sigma).all():
+        raise PictureRefused(Reason.NO_BOARD, f"not all sides of {spec.name} could be measured; go nearer, in focus")
+    return BoardView(spec, (image.shape[1], image.shape[0]), np.arange(4), measured, sigma)
+
+
 def _read(image: Image, spec: BoardSpec) -> tuple[Array, NDArray[np.intp]]:
     """Corners (n, 4, 2) in px and ids (n,) of the tags, with a black border of one bit or of two."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
@@ -84,12 +101,12 @@ def _read(image: Image, spec: BoardSpec) -> tuple[Array, NDArray[np.intp]]:
         found, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
         if len(found) > len(best[1]):
             best = np.array(found, dtype=np.float64).reshape(-1, 4, 2), np.asarray(ids, dtype=np.intp).ravel()
-    own = best[1] < spec.cols * spec.rows
+    own = np.full(len(best[1]), spec.single) | (best[1] < spec.cols * spec.rows)
     if (~own).sum() >= 2:
         raise PictureRefused(
             Reason.NO_BOARD,
             f"tags with ids up to {best[1].max()} are in the picture, {spec.name} has {spec.cols * spec.rows}: is it "
-            "the board that the set-up names?",
+            f"the board that the set-up names?{propose_counts(spec, *best)}",
         )
     return best[0][own], best[1][own]
 
