@@ -10,19 +10,26 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from scipy.stats import chi2
 
+import cell.steps.place as place_step
 from cell.devices.direct import VirtualCell
-from cell.inversion import NominalSurface
+from cell.geometry.poses import difference
+from cell.inversion import NominalSurface, PlacePose
 from cell.inversion.moved import SurfaceMotion, surface_motion
 from cell.job import Job
-from cell.lab.bench.whole_job import JobRecord, NoFrames
+from cell.lab.bench.scan_errors import own_base
+from cell.lab.bench.whole_job import JobRecord, NoFrames, run_whole_job
 from cell.reconstruction import Cloud, flange_motions, merge
 from cell.reconstruction.cloud import Filled
 from cell.steps.kinds import PLACE
 from cell.steps.second_look import LINES, SecondLook, require_in_place, require_points, sparse
 from cell.steps.swath import MAX_LOST_FRACTION
+from cell.steps.touch import felt_touch
 from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
+from sim_backends.world.world import World
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext
 from tests.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
@@ -90,7 +97,7 @@ def looked(
 def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: Path) -> None:
     look = looked(placed_pot, tmp_path)
     found = look.moved
-    assert look.notes == ()
+    assert look.notes == () and look.creep is None
     assert np.linalg.norm(found.motion[:3]) < 0.2e-3 and np.linalg.norm(found.motion[3:]) < 0.5e-3
     assert not found.moved and found.times < 0.9
     assert found.matched == pytest.approx(1.0, abs=0.1)
@@ -261,3 +268,38 @@ def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord) -> None
     with pytest.raises(RefusedError, match=r"0 points were seen in 30 profiles .* gone, or the laser"):
         require_points(nothing)
     assert compared(placed_pot, nothing, nothing).moved
+
+
+# --- what creeps ---
+
+
+def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
+    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rate = np.array([2.2e-6, -6e-6, -4.8e-6, -3.8e-6, 2.8e-6, 1.8e-6])
+    worlds, touched, stands = [], [], World.world_from_base
+
+    def creeping(world: World, t: float) -> np.ndarray:
+        worlds[:] = [world]
+        return stands(world, t) @ pin.SE3(pin.exp3(rate[3:] * t), rate[:3] * t).homogeneous
+
+    def felt(*given: object) -> object:
+        touched.append(worlds[0].clock.now())
+        return felt_touch(*given)
+
+    monkeypatch.setattr(World, "world_from_base", creeping)
+    monkeypatch.setattr(place_step, "felt_touch", felt)
+    job, nominal = pot(speed=0.015)
+    record = run_whole_job(CONFIG, job, nominal, 2, "nominal", calibrated=placed_pot)
+    (world,), placing = worlds, record.results["place"]
+    assert record.outcome == "placed" and any("creeps against the arm by" in note for note in placing.notes)
+    # It is the station that moves, seen from the arm.
+    assert placing.look.creep.rate[:3] == pytest.approx(-rate[:3], abs=5e-6)
+    surface = np.linalg.inv(creeping(world, touched[-1])) @ world.scene.world_from_surface
+    true = own_base(record) * pin.SE3(surface)
+
+    def distance(pose: PlacePose) -> float:
+        off = difference(pose.base_from_surface, true)
+        return float(off @ np.linalg.solve(pose.covariance, off))
+
+    assert distance(placing.pose) < chi2.ppf(0.95, 6) < distance(record.results["invert_pose"])

@@ -169,7 +169,7 @@ class _Cells:
         own = np.round(at[:, 3])
         free = np.linalg.qr(np.hstack([poses * (own == k)[:, None] for k in np.unique(own)]))[0]
         ray = np.einsum("ni,ni->n", scan.stripe_spread[found.index], normals)
-        ray = ray / np.linalg.norm(scan.stripe_spread[found.index], axis=1)
+        ray = ray / np.maximum(np.linalg.norm(scan.stripe_spread[found.index], axis=1), 1e-12)
         return cls(
             heights=raw - free @ (free.T @ raw),
             raw=raw,
@@ -301,5 +301,7 @@ def _ahead(cloud: Cloud) -> Array:
 
 def _pitch(cloud: Cloud) -> float:
     """From line to line, m."""
-    flanges = np.linalg.norm(np.diff(cloud.flanges[:, :3, 3], axis=0), axis=1)
-    return max(1e-6, float(np.median(np.abs(np.diff(cloud.rail)) + flanges)))
+    ways = np.abs(np.diff(cloud.rail))
+    if len(cloud.flanges) == cloud.shape[0]:
+        ways = ways + np.linalg.norm(np.diff(cloud.flanges[:, :3, 3], axis=0), axis=1)
+    return max(1e-6, float(np.median(ways)))

@@ -75,6 +75,12 @@ class Creep:
             covariance=pose.covariance + unknown,
         )
 
+    def as_dict(self) -> dict[str, object]:
+        """Figures for the journal."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        both = (("um_s", "urad_s", self.rate), ("sigma_um_s", "sigma_urad_s", sigma))
+        return {name: (1e6 * part).round(2).tolist() for a, b, v in both for name, part in ((a, v[:3]), (b, v[3:]))}
+
     @property
     def words(self) -> str:
         """For people."""

@@ -78,6 +78,8 @@ def make_report(
         "truth": None,
     }
     if isinstance(pose, PlacePose):
+        # Where something creeps, the part went elsewhere than where the sweep saw the place.
+        pose = getattr(result.results.get("place"), "pose", None) or pose
         report["place_pose"] = _pose(pose, job)
         report["place_sigma"] = _sigma(pose)
         report["place_bound_95"] = stated_bound(job, nominal, pose, repeatability, job.grasp.covariance)

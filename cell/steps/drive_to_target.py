@@ -11,7 +11,7 @@ import pinocchio as pin
 from cell.job import Job
 from cell.motion.bodies import Body
 from cell.run.pace import Pace
-from cell.steps.approach import Planar, drive_line, turn_to
+from cell.steps.approach import Planar, drive_line, turn_to, wrap
 from cell.steps.camera_poses import look_pose
 from cell.steps.moves import HOME
 from cell.steps.photograph import BoardFix
@@ -28,6 +28,8 @@ from statemachine.runner import StepContext
 MAX_TRIES = 5
 SETTLE_S = 0.3
 """The suspension's, after the vehicle has come to rest."""
+UNSTEADY = 0.4
+"""Share of the tolerance by which two photographs of a standing vehicle may differ before the picture is the cause."""
 PASSED = 0.02
 """So far, m, from where it was sent a vehicle that does not see the board is brought there first: readings that came
 late let it drive on, which the later ones tell."""
@@ -166,7 +168,16 @@ def drive_to_target(
         else:
             go(target)
     vehicle.brake()
-    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", "check the floor and the wheels")
+    one, two = (place_from_vehicle(photograph()) for _ in range(2))
+    apart, turned = max(abs(one.x - two.x), abs(one.y - two.y)), abs(wrap(one.yaw - two.yaw))
+    remedy = "check the floor and the wheels"
+    if max(apart / approach.tolerance, turned / approach.tolerance_angle) > UNSTEADY:
+        remedy = (
+            f"while it stands, the board's place changes by {1e3 * apart:.1f} mm and {math.degrees(turned):.2f} deg "
+            "from photograph to photograph: see whether warm air shimmers before the camera, a fan blows, or board or "
+            "camera are loose; the wheels are not the cause"
+        )
+    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", remedy)
 
 
 def stand_at_target(

@@ -66,6 +66,7 @@ class PlaceResult:
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
             "surface_moved": None if self.look is None else self.look.moved.as_dict(),
+            "creep": None if self.look is None or self.look.creep is None else self.look.creep.as_dict(),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
             "base_from_flange_units": {"translation": "m", "rotation_vector": "rad"},
         }

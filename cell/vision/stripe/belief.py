@@ -12,9 +12,6 @@ from cell.vision.stripe.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, W
 
 # A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
 MISFIT_SIGMAS = 3.0
-# From so many times that on something else is in the line: what the fit leaves of it, in squared deviations over all
-# pixels, is about what it moves the centre by.
-STRAY = 1.5
 
 
 @compiled
@@ -36,8 +33,7 @@ def believe(
         if keep and fisher < max(1.0, 0.5 * width):
             pixels = 8 * width + 2
             allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / pixels)
-            misfit = fitted[CHI2, r] / allowed
-            fitted[SIGMA, r] *= np.sqrt(excess * (max(1.0, misfit) + pixels * max(0.0, misfit - STRAY)))
+            fitted[SIGMA, r] *= np.sqrt(excess * max(1.0, fitted[CHI2, r] / allowed))
             saturated[r] = start[r, 0, CORE] > 0
         else:
             fitted[FIT_CENTRE, r] = fitted[SIGMA, r] = fitted[AMPLITUDE, r] = fitted[WIDTH, r] = np.nan
