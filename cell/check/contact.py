@@ -60,8 +60,8 @@ def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
         )
     if (blur := job.scan.exposure * job.scan.speed) > 0.5 * place.tolerance:
         yield (
-            f"scan.exposure {1e3 * job.scan.exposure:g} ms at scan.speed {1e3 * job.scan.speed:g} mm/s smears a line by "
-            f"{1e3 * blur:.3g} mm (allowed: half of place.tolerance, {500 * place.tolerance:g} mm)"
+            f"scan.exposure {1e3 * job.scan.exposure:g} ms at scan.speed {1e3 * job.scan.speed:g} mm/s smears a line "
+            f"by {1e3 * blur:.3g} mm (allowed: half of place.tolerance, {500 * place.tolerance:g} mm)"
         )
     yield from _height_problems(job, *under_part(job, mesh))
 

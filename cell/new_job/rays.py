@@ -62,7 +62,7 @@ class Rays:
         """(n,) how far behind the point (n, 3) that lies which each of `eyes` (n, 3) sees there first, m."""
         ways = points - eyes
         length = np.linalg.norm(ways, axis=1)
-        return self.hits(eyes, ways / length[:, None])[1] - length
+        return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length)
 
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
         """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.
