@@ -30,7 +30,7 @@ class Pulse:
         """No beat comes after this; idempotent."""
         self._closed.set()
         if self._thread is not threading.current_thread():
-            self._thread.join()
+            self._thread.join(2.0)
 
     def _run(self) -> None:
         # Linux has a niceness for each thread.
