@@ -183,8 +183,11 @@ def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
 
 
 def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
-    """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none."""
-    votes = np.sin(0.5 * np.maximum(_turns(flanges), _turns(boards))) ** 2
+    """Weights (n, n) of each two frames' vote on a rotation: views that do not turn agree with any, and have none.
+
+    By the smaller turn of flange and board: a picture that is the wrong way round must not outvote the others.
+    """
+    votes = np.sin(0.5 * np.minimum(_turns(flanges), _turns(boards))) ** 2
     np.fill_diagonal(votes, 0.0)
     return np.asarray(votes)
 
