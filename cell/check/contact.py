@@ -16,8 +16,6 @@ from cell.job import Job
 G = 9.81
 REACTION_S = 0.05
 """From the touch until the arm stands: state packet, two set points, servoJ's look-ahead and the stop."""
-RADIAL_95 = 2.8
-"""95 % of a normal error in three directions lies within so many standard deviations."""
 LEAST_OVER = 0.5
 """Share of the part's footprint that lies over the surface, at least."""
 GRID = 21
@@ -47,11 +45,11 @@ def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
         ("tolerance", scatter, place.tolerance, "mm"),
         ("tolerance_angle", turning, place.tolerance_angle, "mrad"),
     ):
-        if RADIAL_95 * least > asked:
+        if least > asked:
             sigma = "grasp.sigma" if unit == "mm" else "grasp.sigma_angle"
             yield (
                 f"place.{key} {1e3 * asked:g} {unit} cannot be kept: {sigma} and the arm's repeatability alone leave "
-                f"{1e3 * RADIAL_95 * least:.3g} {unit} open at 95 % (allowed: at least that)"
+                f"{1e3 * least:.3g} {unit} open, one standard deviation (allowed: more than that)"
             )
     if place.contact_travel < 3 * grasp.sigma:
         yield (

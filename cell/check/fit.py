@@ -55,9 +55,9 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     problems = problems or list(_sight(job, config))
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent), *_stripe(job, config, extent[0][2], extent[1][2])]
-    problems += contact_problems(job, config, mesh)
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
+    problems += contact_problems(job, config, mesh)
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 
