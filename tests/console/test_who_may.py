@@ -288,7 +288,7 @@ def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Serve
     ask = (
         f"GET /live HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        f"Sec-WebSocket-Key: {'a' * 22}==\r\n\r\n"
+        f"Sec-WebSocket-Key: {'a' * 22}==\r\nSec-WebSocket-Protocol: cell, {server.key}\r\n\r\n"
     )
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as lost:
         lost.sendall(ask.encode())
