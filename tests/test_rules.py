@@ -14,7 +14,7 @@ from cell.devices.interlocks import Command, Interlocks, Situation
 from cell.devices.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
 from cell.geometry.poses import to_ur
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, InterlockError
+from drivers.errors import ConfigError, DeadlineError, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, VehicleState
 
 MOVE = Command("arm", "move_joints", {"joints": np.zeros(6)})
@@ -72,8 +72,9 @@ def test_what_is_written_down_here_lets_arm_and_vehicle_move() -> None:
 
 
 @pytest.mark.parametrize(
-    "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006}], ids=str
-)
+    "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006},
+               {"speed": math.nan}, {"yaw_rate": math.nan}], ids=str
+)  # fmt: skip
 def test_a_vehicle_that_rolls_or_turns_either_way_is_not_parked(moving: dict[str, float]) -> None:
     with pytest.raises(InterlockError, match=r"vehicle drives at .*vehicle_parked"):
         rules(replace(STANDS, **moving)).require(MOVE)
@@ -86,9 +87,9 @@ def test_a_brake_that_is_open_or_not_known_is_not_locked(braked: bool | None) ->
 
 
 @pytest.mark.parametrize("joint", range(6))
-@pytest.mark.parametrize("speed", [0.06, -0.06])
+@pytest.mark.parametrize("speed", [0.06, -0.06, math.nan])
 def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed: float) -> None:
-    turning = arm_state(joint_speeds=speed * np.eye(6)[joint])
+    turning = arm_state(joint_speeds=np.where(np.arange(6) == joint, speed, 0.0))
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
         rules(arm=turning).require(DRIVE)
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_still"):
@@ -136,6 +137,15 @@ def test_the_flange_is_compared_in_place_and_in_turn(shift: float, turn: float, 
         interlocks.require(MOVE)
 
 
+@pytest.mark.parametrize("part", range(6))
+def test_a_flange_or_a_joint_that_is_no_number_fits_nothing(part: int) -> None:
+    nan = np.where(np.arange(6) == part, math.nan, 0.0)
+    with pytest.raises(InterlockError, match="same_kinematics"):
+        rules(arm=arm_state(flange=to_ur(LOOK) + nan)).require(MOVE)
+    with pytest.raises(InterlockError, match="arm_stowed"):
+        rules(arm=arm_state(joints=POSTURE + nan)).require(DRIVE)
+
+
 def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
     old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
     with pytest.raises(DeadlineError, match="newest state is"):
@@ -163,6 +173,18 @@ def test_a_rule_is_lifted_inside_its_context_only() -> None:
         interlocks.require(MOVE)
         with interlocks.lifted(["way_clear"]):
             interlocks.require(MOVE)
+        interlocks.require(MOVE)
+    with pytest.raises(InterlockError, match="vehicle_parked"):
+        interlocks.require(MOVE)
+
+
+@pytest.mark.parametrize("name", [rule.name for rule in RULES if not rule.liftable or rule.check is None])
+def test_a_rule_that_is_not_liftable_is_not_lifted_beside_one_that_is(name: str) -> None:
+    interlocks = rules(replace(STANDS, speed=0.1), arm_state(flange=to_ur(LOOK * LOOK)))
+    for names in ([name], ["vehicle_parked", name], [name, "way_clear"]):
+        with pytest.raises(ConfigError, match=f"{name}: no interlock that can be lifted"), interlocks.lifted(names):
+            pytest.fail("it was lifted")
+    with interlocks.lifted(["vehicle_parked"]), pytest.raises(InterlockError, match="same_kinematics"):
         interlocks.require(MOVE)
     with pytest.raises(InterlockError, match="vehicle_parked"):
         interlocks.require(MOVE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from pathlib import Path
@@ -170,6 +171,16 @@ def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -
     assert done == ["fails", "lasts", "last"]
     assert problems == ["a: not confirmed, it cannot", "b: not confirmed, it took longer than 5 s"]
     assert cell.clock.now() < 10.0
+
+
+def test_an_action_that_goes_on_past_its_end_confirms_nothing(cell: VirtualCell) -> None:
+    def stubborn() -> None:
+        with contextlib.suppress(Cancelled):
+            cell.clock.sleep(10.0)
+
+    assert waiting_on(cell.clock).each({"a": stubborn, "b": lambda: cell.clock.sleep(4.0)}, 5.0) == [
+        "a: not confirmed, it took longer than 5 s"
+    ]
 
 
 def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_told() -> None:
