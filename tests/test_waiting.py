@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,13 @@ def cell() -> VirtualCell:
     return made
 
 
-def run_step(cell: VirtualCell, folder: Path, first: StepCall, control: RunControl | None = None) -> RunResult:
+def run_step(
+    cell: VirtualCell,
+    folder: Path,
+    first: StepCall,
+    control: RunControl | None = None,
+    stop: Callable[[], object] = lambda: None,
+) -> RunResult:
     """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
     journal = Journal(folder, "here")
     try:
@@ -47,7 +54,7 @@ def run_step(cell: VirtualCell, folder: Path, first: StepCall, control: RunContr
             journal=journal,
             clock=cell.clock,
             classify=classify,
-            safe_stop=lambda reason: stop_cell(cell.devices),
+            safe_stop=lambda reason: (stop_cell(cell.devices), stop())[0],
             control=control or RunControl(),
         ).run()
     finally:
@@ -91,6 +98,16 @@ def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothin
     assert result.code == "step.deadline"
     assert len(told) == 3
     assert cell.clock.now() < 2.0 + 3 * Policy(()).grace_s + 2.0
+
+
+@pytest.mark.parametrize(("each_s", "outcome"), [(3.0, "done"), (4.0, "faulted")])
+def test_a_safe_stop_whose_parts_are_in_time_and_whose_whole_is_not_is_not_confirmed(
+    cell: VirtualCell, tmp_path: Path, each_s: float, outcome: str
+) -> None:
+    parts = dict.fromkeys("abc", lambda: cell.clock.sleep(each_s))
+    result = run_step(cell, tmp_path, lambda context: None, stop=lambda: waiting_on(cell.clock).each(parts, 5.0))
+    assert result.outcome.value == outcome
+    assert ("did not end within 10 s" in str(result.reason)) == (outcome == "faulted")
 
 
 def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell, tmp_path: Path) -> None:
