@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -193,9 +194,20 @@ def test_a_rule_that_is_not_liftable_is_not_lifted_beside_one_that_is(name: str)
 def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
     interlocks = rules()
     light = Command("laser", "lit")
-    with interlocks.purpose("sweep"):
+    with interlocks.purpose("sweep"), ThreadPoolExecutor(1) as other:
         with interlocks.purpose("test"):
             pass
         interlocks.require(light)
+        # Another thread has said nothing.
+        assert isinstance(other.submit(interlocks.require, light).exception(), InterlockError)
     with pytest.raises(InterlockError, match="laser_purpose"):
         interlocks.require(light)
+
+
+def test_an_output_is_tried_inside_its_context_only() -> None:
+    interlocks = rules(outputs={0: "laser", 1: "claw"})
+    with interlocks.tried(2):
+        with interlocks.tried(3):
+            pass
+        assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, True, False]
+    assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, False, False]
