@@ -58,22 +58,17 @@ def test_the_usual_units_are_those_of_the_library_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "inf mm", "5 furlongs/", None]
+    "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "-1e999 mm", "inf mm", "5 furlongs/", None]
 )
 def test_anything_but_a_number_with_a_fitting_unit_is_refused(text: object) -> None:
-    with pytest.raises(ValueError, match=r"unit|quantity|range"):
-        parse_quantity(text, "mm", 0, 100)
+    for limits in ((0, 100), ()):
+        with pytest.raises(ValueError, match=r"unit|quantity|range"):
+            parse_quantity(text, "mm", *limits)
 
 
 def test_a_value_out_of_range_is_named_with_its_range() -> None:
     with pytest.raises(ValueError, match=r'"120 mm" is outside the allowed range \(allowed: 0 to 100 mm\)'):
         parse_quantity("120 mm", "mm", 0, 100)
-
-
-@pytest.mark.parametrize("text", ["1e999 mm", "-1e999 mm", "1e999 km"])
-def test_what_is_beyond_all_numbers_is_refused_where_there_is_no_range(text: str) -> None:
-    with pytest.raises(ValueError, match="outside the allowed range"):
-        parse_quantity(text, "mm")
 
 
 def test_the_shipped_configuration_is_valid() -> None:
@@ -90,7 +85,6 @@ def test_the_shipped_configuration_is_valid() -> None:
         ({"rail__lead": "2000 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": "50.1 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": "0.09 mm"}, ["rail.lead", "0.1 to 50 mm"]),
-        ({"rail__lead": "-2 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": None}, ["rail.lead", "missing"]),
         ({"rail__travel": ["100 mm", "0 mm"]}, ["rail", "the first must be smaller"]),
         ({"rail__microsteps": 3}, ["rail.microsteps"]),

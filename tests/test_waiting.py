@@ -42,7 +42,7 @@ def run_step(
     folder: Path,
     first: StepCall,
     control: RunControl | None = None,
-    stop: Callable[[], object] = lambda: None,
+    stop: Callable[[], object] = list,
 ) -> RunResult:
     """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
     journal = Journal(folder, "here")
