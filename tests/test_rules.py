@@ -223,3 +223,11 @@ def test_an_output_is_tried_inside_its_context_only() -> None:
             pass
         assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, True, False]
     assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, False, False]
+
+
+def test_a_lit_laser_bars_driving_and_not_the_end_of_it() -> None:
+    lit = Told("laser", None)
+    lit.is_on = True
+    with pytest.raises(InterlockError, match="laser_off_to_drive"):
+        rules(laser=lit).require(DRIVE)
+    rules(laser=lit).require(Command("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))
