@@ -173,16 +173,6 @@ def test_a_named_exception_is_retried_from_a_cell_at_rest(tmp_path):
     assert [row.state for row in bench.record.steps if row.name == "board_photo"] == ["failed", "failed", "done"]
 
 
-def test_who_asked_for_the_end_sees_no_other_attempt(tmp_path):
-    def failing_late(context):
-        bench.runner.control.abort("enough")
-        raise TimeoutError("no frame")
-
-    bench = Bench(tmp_path, board_photo=failing_late).policy("board_photo", 10.0, 2, ("TimeoutError",))
-    assert bench.run().outcome is Outcome.ABORTED
-    assert bench.log.count("board_photo") == 1
-
-
 def test_retries_run_out(tmp_path):
     bench = Bench(tmp_path, board_photo=failing(*[TimeoutError("no frame")] * 5))
     bench.policy("board_photo", 10.0, 2, ("TimeoutError",))
