@@ -111,9 +111,11 @@ class InLine:
         """One after another; `timeout` is of the virtual clock. See `Waiting.each`."""
         problems = []
         for what, action in actions.items():
-            call = self.do(what, action, _within(self._clock, timeout), timeout)
-            if call.error is not None:
-                problems.append(f"{what}: not confirmed, {call.error}")
+            late = _within(self._clock, timeout)
+            call = self.do(what, action, late, timeout)
+            # Also an action that caught its end and went on confirms nothing.
+            if (why := call.error or late()) is not None:
+                problems.append(f"{what}: not confirmed, {why}")
         return problems
 
 

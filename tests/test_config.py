@@ -58,11 +58,12 @@ def test_the_usual_units_are_those_of_the_library_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "inf mm", "5 furlongs/", None]
+    "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "-1e999 mm", "inf mm", "5 furlongs/", None]
 )
 def test_anything_but_a_number_with_a_fitting_unit_is_refused(text: object) -> None:
-    with pytest.raises(ValueError, match=r"unit|quantity|range"):
-        parse_quantity(text, "mm", 0, 100)
+    for limits in ((0, 100), ()):
+        with pytest.raises(ValueError, match=r"unit|quantity|range"):
+            parse_quantity(text, "mm", *limits)
 
 
 def test_a_value_out_of_range_is_named_with_its_range() -> None:
@@ -82,6 +83,8 @@ def test_the_shipped_configuration_is_valid() -> None:
         ({"rail__laed": "2 mm"}, ["rail.laed", "unknown key"]),
         ({"rail__lead": 2}, ["rail.lead", "has no unit"]),
         ({"rail__lead": "2000 mm"}, ["rail.lead", "0.1 to 50 mm"]),
+        ({"rail__lead": "50.1 mm"}, ["rail.lead", "0.1 to 50 mm"]),
+        ({"rail__lead": "0.09 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": None}, ["rail.lead", "missing"]),
         ({"rail__travel": ["100 mm", "0 mm"]}, ["rail", "the first must be smaller"]),
         ({"rail__microsteps": 3}, ["rail.microsteps"]),

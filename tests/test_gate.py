@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -29,6 +30,17 @@ def test_work_that_entered_before_a_stop_begins_nothing_after_it() -> None:
     with pytest.raises(Aborted):
         gate.begin(MOVE, lambda: begun.append("motion"), lambda: None)
     assert begun == []
+
+
+def test_who_listens_hears_what_passed_and_what_was_refused_with_why() -> None:
+    gate, heard = open_gate(), []
+    gate.listener = SimpleNamespace(command=lambda command, refused: heard.append((command, refused)))
+    gate.enter(CancelToken())
+    gate.require(MOVE)
+    gate.shut()
+    with pytest.raises(Aborted) as barred:
+        gate.require(MOVE)
+    assert heard == [(MOVE, None), (MOVE, str(barred.value))]
 
 
 def test_a_stop_that_comes_while_something_begins_undoes_it() -> None:

@@ -575,7 +575,9 @@ def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell) -> None:
     assert {report["kind"]: report.get("interlocks_lifted") for report in reports}["homing"] == ["own_switch"]
 
 
-@pytest.mark.parametrize("names", [["no_such_rule"], ["after_a_stop"], ["laser_attended"], []])
+@pytest.mark.parametrize(
+    "names", [["no_such_rule"], ["after_a_stop"], ["laser_attended"], ["way_clear", "same_kinematics"], []]
+)
 def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell: Cell, names: list[str]) -> None:
     with pytest.raises(ConfigError), cell.maintenance("why not", lift=names):
         pass

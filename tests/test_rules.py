@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +16,7 @@ from cell.devices.interlocks import Command, Interlocks, Situation
 from cell.devices.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
 from cell.geometry.poses import to_ur
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, InterlockError
+from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, VehicleState
 
 MOVE = Command("arm", "move_joints", {"joints": np.zeros(6)})
@@ -72,8 +74,9 @@ def test_what_is_written_down_here_lets_arm_and_vehicle_move() -> None:
 
 
 @pytest.mark.parametrize(
-    "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006}], ids=str
-)
+    "moving", [{"speed": 0.006}, {"speed": -0.006}, {"yaw_rate": 0.006}, {"yaw_rate": -0.006},
+               {"speed": math.nan}, {"yaw_rate": math.nan}], ids=str
+)  # fmt: skip
 def test_a_vehicle_that_rolls_or_turns_either_way_is_not_parked(moving: dict[str, float]) -> None:
     with pytest.raises(InterlockError, match=r"vehicle drives at .*vehicle_parked"):
         rules(replace(STANDS, **moving)).require(MOVE)
@@ -86,9 +89,9 @@ def test_a_brake_that_is_open_or_not_known_is_not_locked(braked: bool | None) ->
 
 
 @pytest.mark.parametrize("joint", range(6))
-@pytest.mark.parametrize("speed", [0.06, -0.06])
+@pytest.mark.parametrize("speed", [0.06, -0.06, math.nan])
 def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed: float) -> None:
-    turning = arm_state(joint_speeds=speed * np.eye(6)[joint])
+    turning = arm_state(joint_speeds=np.where(np.arange(6) == joint, speed, 0.0))
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
         rules(arm=turning).require(DRIVE)
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_still"):
@@ -136,6 +139,38 @@ def test_the_flange_is_compared_in_place_and_in_turn(shift: float, turn: float, 
         interlocks.require(MOVE)
 
 
+class Late(Told):
+    """A vehicle whose newest reading is too old for the first `silent` times that it is asked."""
+
+    def __init__(self, silent: float, braked: bool, fault: bool) -> None:
+        super().__init__("vehicle", replace(STANDS, braked=braked))
+        self.silent, self.fault = silent, fault
+
+    def state(self, max_age: float = 0.1) -> Any:
+        self.silent -= 1
+        if self.silent >= 0 and max_age < math.inf:
+            raise DeadlineError(self.name, "its newest reading is old")
+        return self.newest
+
+    def check(self) -> None:
+        if self.fault:
+            raise DeviceFault(self.name, "vehicle.silent", "it is silent", recoverable=True, hint="")
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "error"),
+    [(Late(2, True, True), None), (Late(math.inf, True, False), None), (Late(math.inf, True, True), DeviceFault),
+     (Late(math.inf, False, False), DeadlineError)],
+)  # fmt: skip
+def test_a_late_reading_is_waited_for_and_an_old_one_is_enough_of_a_vehicle_that_is_braked_and_not_silent(
+    vehicle: Late, error: type[Exception] | None
+) -> None:
+    with nullcontext() if error is None else pytest.raises(error):
+        interlocks = rules()
+        interlocks.situation.vehicle = vehicle  # type: ignore[assignment]
+        interlocks.require(MOVE)
+
+
 def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
     old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
     with pytest.raises(DeadlineError, match="newest state is"):
@@ -171,9 +206,28 @@ def test_a_rule_is_lifted_inside_its_context_only() -> None:
 def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
     interlocks = rules()
     light = Command("laser", "lit")
-    with interlocks.purpose("sweep"):
+    with interlocks.purpose("sweep"), ThreadPoolExecutor(1) as other:
         with interlocks.purpose("test"):
             pass
         interlocks.require(light)
+        # Another thread has said nothing.
+        assert isinstance(other.submit(interlocks.require, light).exception(), InterlockError)
     with pytest.raises(InterlockError, match="laser_purpose"):
         interlocks.require(light)
+
+
+def test_an_output_is_tried_inside_its_context_only() -> None:
+    interlocks = rules(outputs={0: "laser", 1: "claw"})
+    with interlocks.tried(2):
+        with interlocks.tried(3):
+            pass
+        assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, True, False]
+    assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, False, False]
+
+
+def test_a_lit_laser_bars_driving_and_not_the_end_of_it() -> None:
+    lit = Told("laser", None)
+    lit.is_on = True
+    with pytest.raises(InterlockError, match="laser_off_to_drive"):
+        rules(laser=lit).require(DRIVE)
+    rules(laser=lit).require(Command("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))

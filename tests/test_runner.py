@@ -511,6 +511,15 @@ def test_a_safe_stop_that_fails_makes_the_run_faulted(tmp_path):
     assert "the laser is still on" in result.reason
 
 
+def test_a_safe_stop_that_ends_too_late_makes_the_run_faulted(tmp_path):
+    bench = Bench(tmp_path)
+    bench.runner.policy = replace(bench.runner.policy, stop_deadline_s=0.2)
+    bench.on_stop = lambda: bench.runner.clock.sleep(0.6)
+    result = bench.runner.run()
+    assert result.outcome is Outcome.FAULTED
+    assert "did not end within 0.2 s" in result.reason
+
+
 def test_a_resumed_run_does_only_what_is_open(tmp_path):
     bench = Bench(tmp_path, laser_sweep=lambda context: context.results["board_photo"] + "!")
     result = bench.run(done={"drive_to_target": None, "board_photo": "stored"})

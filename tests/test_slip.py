@@ -184,10 +184,10 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
     small.require(), some.require()
     with pytest.raises(RefusedError, match=r"scan head has slipped by \+0\.165 mm along"):
         far.require()
-    for along, across in ((-1.1, 0.0), (0.0, 1.1), (0.0, -1.1), (-0.8, 0.8)):
+    for along, across in ((-1.1, 0.0), (0.0, 1.1), (0.0, -1.1), (-0.8, 0.8), (np.nan, 0.0), (0.0, np.nan)):
         with pytest.raises(RefusedError, match="scan head has slipped"):
             Slip(along * LARGEST_M, across * LARGEST_M, 0.0).require()
-    for lag in (-1.1 * LARGEST_LAG_S, 1.1 * LARGEST_LAG_S):
+    for lag in (-1.1 * LARGEST_LAG_S, 1.1 * LARGEST_LAG_S, np.nan):
         with pytest.raises(RefusedError, match="later"):
             Slip(0.0, 0.0, lag).require()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cell.calibration import Priors
-from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
+from cell.calibration.solve.faults import SCALE_RANGE, refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
 from cell.calibration.solve.joint import solve_joint, solve_staged
 from cell.calibration.solve.reference import Reference
 from cell.calibration.solve.results import Quality, ScanCalibration, TargetCalibration
@@ -220,6 +220,13 @@ def check(observations: list) -> None:
     poses = [board_pose(o.view, joint.adjusted.state.camera).camera_from_board for o in observations]
     refuse_slipped("scan", names, joint.adjusted, joint.views, poses)
     refuse_wrong_lead(joint.adjusted.state.rail_direction, CONFIG.rail.lead)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.999 * SCALE_RANGE[0], 1.001 * SCALE_RANGE[1], np.nan])
+def test_a_lead_outside_its_range_is_refused_with_what_the_screw_seems_to_have(scale):
+    with pytest.raises(RefusedError, match=r"per mm commanded.*rail\.lead is configured as 2 mm"):
+        refuse_wrong_lead(scale * ALONG, 0.002)
+    refuse_wrong_lead(1.001 * SCALE_RANGE[0] * ALONG, 0.002), refuse_wrong_lead(0.999 * SCALE_RANGE[1] * ALONG, 0.002)
 
 
 def exchanged(observations: list, i: int, j: int) -> list:

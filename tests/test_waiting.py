@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +37,13 @@ def cell() -> VirtualCell:
     return made
 
 
-def run_step(cell: VirtualCell, folder: Path, first: StepCall, control: RunControl | None = None) -> RunResult:
+def run_step(
+    cell: VirtualCell,
+    folder: Path,
+    first: StepCall,
+    control: RunControl | None = None,
+    stop: Callable[[], object] = list,
+) -> RunResult:
     """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
     journal = Journal(folder, "here")
     try:
@@ -46,7 +54,7 @@ def run_step(cell: VirtualCell, folder: Path, first: StepCall, control: RunContr
             journal=journal,
             clock=cell.clock,
             classify=classify,
-            safe_stop=lambda reason: stop_cell(cell.devices),
+            safe_stop=lambda reason: (stop_cell(cell.devices), stop())[0],
             control=control or RunControl(),
         ).run()
     finally:
@@ -90,6 +98,16 @@ def test_a_step_that_catches_its_end_and_goes_on_is_told_again_and_begins_nothin
     assert result.code == "step.deadline"
     assert len(told) == 3
     assert cell.clock.now() < 2.0 + 3 * Policy(()).grace_s + 2.0
+
+
+@pytest.mark.parametrize(("each_s", "outcome"), [(3.0, "done"), (4.0, "faulted")])
+def test_a_safe_stop_whose_parts_are_in_time_and_whose_whole_is_not_is_not_confirmed(
+    cell: VirtualCell, tmp_path: Path, each_s: float, outcome: str
+) -> None:
+    parts = dict.fromkeys("abc", lambda: cell.clock.sleep(each_s))
+    result = run_step(cell, tmp_path, lambda context: None, stop=lambda: waiting_on(cell.clock).each(parts, 5.0))
+    assert result.outcome.value == outcome
+    assert ("did not end within 10 s" in str(result.reason)) == (outcome == "faulted")
 
 
 def test_a_request_in_the_journal_is_seen_while_the_step_waits(cell: VirtualCell, tmp_path: Path) -> None:
@@ -170,6 +188,16 @@ def test_each_action_is_done_whatever_becomes_of_the_others(cell: VirtualCell) -
     assert done == ["fails", "lasts", "last"]
     assert problems == ["a: not confirmed, it cannot", "b: not confirmed, it took longer than 5 s"]
     assert cell.clock.now() < 10.0
+
+
+def test_an_action_that_goes_on_past_its_end_confirms_nothing(cell: VirtualCell) -> None:
+    def stubborn() -> None:
+        with contextlib.suppress(Cancelled):
+            cell.clock.sleep(10.0)
+
+    assert waiting_on(cell.clock).each({"a": stubborn, "b": lambda: cell.clock.sleep(4.0)}, 5.0) == [
+        "a: not confirmed, it took longer than 5 s"
+    ]
 
 
 def test_in_threads_none_waits_for_another_and_what_is_not_confirmed_in_time_is_told() -> None:

@@ -238,6 +238,22 @@ def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next() -> None:
     site.whereabouts.pose()
 
 
+@pytest.mark.parametrize("seen", [True, False])
+def test_the_anchor_is_lost_with_an_interruption_and_says_which(seen: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = Site()
+    site.whereabouts.enter(JOB)
+    site.whereabouts.see(Planar.of(JOB.approach.start.se3())) if seen else site.whereabouts.say_at_start()
+    told = site.vehicle.state
+
+    def interrupted(*age: float) -> VehicleState:
+        return replace(told(*age), interruptions=1, interruption="somebody else drove it")
+
+    monkeypatch.setattr(site.vehicle, "state", interrupted)
+    site.whereabouts.enter(JOB)
+    with pytest.raises(RefusedError, match="not known: somebody else drove it"):
+        site.whereabouts.pose()
+
+
 def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:
     """Turned by 30° and said to be at its start: it goes that way once, sees nothing, and is not driven again."""
     site = Site()

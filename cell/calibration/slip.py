@@ -79,14 +79,14 @@ class Slip:
 
     def require(self) -> None:
         """Raise `RefusedError` for a head that has slipped too far, or pictures that come too late."""
-        if self.size > LARGEST_M:
+        if not self.size <= LARGEST_M:
             raise RefusedError(
                 f"the scan head has slipped by {1e3 * self.along:+.3f} mm along and {1e3 * self.across:+.3f} mm across "
                 f"the rail since the calibration, allowed are {1e3 * LARGEST_M:g} mm, or the plate on the claw that "
                 "shows it has moved: look at the screws of head and plate, then run `cell calibrate`",
                 Measured("scan head slipped by", 1e3 * self.size, "mm", most=1e3 * LARGEST_M),
             )
-        if abs(self.lag) > LARGEST_LAG_S:
+        if not abs(self.lag) <= LARGEST_LAG_S:
             raise RefusedError(
                 f"the scan camera's pictures come {1e3 * self.lag:+.1f} ms later against the rail's readings than at "
                 f"the calibration, allowed are ±{1e3 * LARGEST_LAG_S:g} ms: a sweep would lie elsewhere as a whole. "

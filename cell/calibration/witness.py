@@ -189,7 +189,7 @@ def pointing(
     leaves less open: a laser that is cold again points where it did at the calibration.
     """
     found = turn_seen(before, now, camera, plane, exit_point)
-    if abs(found.turn) > LARGEST_RAD:
+    if not abs(found.turn) <= LARGEST_RAD:
         raise RefusedError(
             f"the laser points {1e3 * found.turn:+.2f} mrad from where it pointed at the calibration, allowed are "
             f"±{1e3 * LARGEST_RAD:g} mrad, or the plate on the claw that shows it has moved: look at the plate and at "
@@ -207,7 +207,7 @@ def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPl
     Its deviation has the picture's noise and a plate that is off by `PLATE_M`. Raises `RefusedError` when the two looks
     cannot be compared.
     """
-    if abs(now.rail - before.rail) > SAME_RAIL_M:
+    if not abs(now.rail - before.rail) <= SAME_RAIL_M:
         raise RefusedError(
             f"the laser's witness was looked at with the rail at {1e3 * now.rail:.2f} mm, at the calibration at "
             f"{1e3 * before.rail:.2f} mm, allowed are ±{1e3 * SAME_RAIL_M:.2f} mm: set laser.witness to "

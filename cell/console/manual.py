@@ -228,7 +228,8 @@ class Manual:
                 press.beat = None
                 if not motion.done:
                     device.stop()
-        if why is None and motion.done:
+        # What switching off has stopped is done, too, short of its end.
+        if why is None and not self._off.is_set():
             motion.wait(1.0)
             return "the way of one press ends here; press again"
         return why or "manual mode was switched off"

@@ -57,10 +57,6 @@ class Gate:
         self._entered.stops = self._stops
         self._entered.token = token
 
-    def leave(self) -> None:
-        """This thread's work has ended; it is now as one that never entered."""
-        self._entered.stops = self._entered.token = None
-
     @contextmanager
     def entered(self, token: CancelToken) -> Iterator[None]:
         """Inside this context this thread does work that `token` ends; afterwards it is what it was before."""

@@ -42,7 +42,7 @@ def _parked(now: Situation, command: Command) -> str | None:
     if now.vehicle is None:
         return "the vehicle is not connected, so nobody knows whether it is parked. Open the cell with it"
     state = _newest(now, now.vehicle)
-    if max(abs(state.speed), abs(state.yaw_rate)) > STILL:
+    if not (abs(state.speed) <= STILL and abs(state.yaw_rate) <= STILL):
         return f"the vehicle drives at {state.speed:.3f} m/s, {state.yaw_rate:.3f} rad/s. Call vehicle.brake() first"
     if not state.braked:
         brake = "open" if state.braked is False else "not known to be locked"
@@ -72,13 +72,13 @@ def _arm_now(now: Situation, arm: Arm) -> ArmState:
     """The arm's newest state, without waiting for a newer one; `DeadlineError` when it is too old."""
     state = arm.state(math.inf)
     age, allowed = now.clock.now() - state.stamp, LATE_S * max(1.0, now.clock.rate)
-    if age > allowed:
+    if not age <= allowed:
         raise DeadlineError(arm.name, f"its newest state is {age:.2f} s old, allowed {allowed:.2f} s. See its link")
     return state
 
 
 def _moves(now: Situation, state: ArmState) -> str | None:
-    if (now.last is not None and not now.last.done) or np.abs(state.joint_speeds).max() > TURNING:
+    if (now.last is not None and not now.last.done) or not np.abs(state.joint_speeds).max() <= TURNING:
         return "the arm moves. Wait for its motion first"
     return None
 

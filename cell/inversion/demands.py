@@ -1,4 +1,7 @@
-"""What a scan has to be like for its place pose to be believed: reasons to refuse it, in words and figures."""
+"""What a scan has to be like for its place pose to be believed: reasons to refuse it, in words and figures.
+
+Each comparison asks whether the figure is good: one that is no number is refused as well.
+"""
 
 from __future__ import annotations
 
@@ -55,17 +58,17 @@ def fit_figures(
 
 def require_fit(found: Registration, coverage: float, demands: Demands) -> None:
     """Refuse a scan that is not like the surface."""
-    if coverage < demands.coverage:
+    if not coverage >= demands.coverage:
         raise RefusedError(
             f"the scan covers {100 * coverage:.0f} % of the nominal surface, at least "
             f"{100 * demands.coverage:.0f} % is needed. Lengthen the sweep or check where the surface lies"
         )
-    if found.share < demands.share:
+    if not found.share >= demands.share:
         raise RefusedError(
             f"{100 * found.share:.0f} % of the points over the nominal surface fit it, at least "
             f"{100 * demands.share:.0f} % must. Is it the right surface, clean and whole?"
         )
-    if found.rms > demands.rms:
+    if not found.rms <= demands.rms:
         raise RefusedError(
             f"the points lie {1e3 * found.rms:.3f} mm (rms) off the nominal surface, at most "
             f"{1e3 * demands.rms:.3f} mm is allowed. Is the surface deformed, or the calibration disturbed?"
@@ -80,8 +83,8 @@ def require_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
     """
     allowed = _departure(tolerance, nominal)
     medians = _squares(scan, pose, nominal)
-    departed = float(np.mean(np.abs(medians) > allowed)) if len(medians) else 1.0
-    if departed > demands.departed:
+    departed = float(np.mean(~(np.abs(medians) <= allowed))) if len(medians) else 1.0
+    if not departed <= demands.departed:
         raise RefusedError(
             f"{100 * departed:.0f} % of the scanned area lies more than {1e3 * allowed:.2f} mm off the nominal "
             f"surface, at most {100 * demands.departed:.0f} % may. Is the surface deformed, worn "
@@ -98,7 +101,7 @@ def require_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
 def require_agreement(found: Dissent, tolerance: Tolerance, demands: Demands) -> float:
     """Refuse a surface of which a quarter by itself puts the place elsewhere; else how far it does beyond its noise,
     in tolerances."""
-    if found.excess > demands.dissent:
+    if not found.excess <= demands.dissent:
         x, y, z = 1e3 * found.middle
         shift, turn = 1e3 * demands.dissent * tolerance.translation, 1e3 * demands.dissent * tolerance.rotation
         raise RefusedError(
@@ -139,7 +142,7 @@ def require_board(shared: Array, prior: Prior, correction: Array) -> float:
     A direction that the scan does not determine stays where the board put it and adds nothing.
     """
     distance = float(correction @ np.linalg.solve(prior.covariance + shared, correction))
-    if distance > BOARD_DISAGREES:
+    if not distance <= BOARD_DISAGREES:
         raise RefusedError(
             f"scan and board disagree: the surface lies {1e3 * float(np.linalg.norm(correction[:3])):.2f} mm and "
             f"{np.degrees(np.linalg.norm(correction[3:])):.2f} deg from where the board puts it (squared distance "

@@ -68,7 +68,7 @@ class SurfaceMotion:
     @property
     def moved(self) -> bool:
         """Whether it has moved, or is not there any more."""
-        return self.matched < LEAST_MATCHED or self.times > 1.0
+        return not (self.matched >= LEAST_MATCHED and self.times <= 1.0)
 
     def hidden(self, base_from_surface: pin.SE3, tolerance: Tolerance, radius: float) -> list[str]:
         """In words the motions, about the surface's axes, that would be larger than `tolerance` before they show."""

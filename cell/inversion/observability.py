@@ -112,7 +112,7 @@ def judge(
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
     sizes = 3.0 * np.sqrt(np.maximum(values, 0.0))
     worst = _motion(sizes[-1] * vectors[:, -1] * unit, float(sizes[-1]), tolerance, radius)
-    beyond = sizes > 1.0
+    beyond = ~(sizes <= 1.0)
     weak = [
         _motion(size * way * unit, float(size), tolerance, radius)
         for size, way in zip(sizes[beyond], vectors.T[beyond], strict=True)

@@ -173,7 +173,7 @@ def rocking_covariance(rocking: Rocking, base_from_vehicle: pin.SE3, at: Array) 
 
 def require_firm(angle: float, moved: float, what: str, hz: float | None = None) -> None:
     """Raise `RefusedError` for a vehicle that rocks by ±`angle` rad, which moves `what` by ±`moved` m."""
-    if angle > LARGEST_RAD:
+    if not angle <= LARGEST_RAD:
         often = "" if hz is None else f" at {hz:.1f} Hz"
         raise RefusedError(
             f"the vehicle rocks by ±{1e3 * angle:.2f} mrad{often}, which moves {what} by ±{1e3 * moved:.2f} mm; "

@@ -199,7 +199,7 @@ def stand_at_target(
     whereabouts.see(stands)
     error = Planar.of(job.approach.target.se3()).inverse() * stands
     most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
-    if max(abs(error.x), abs(error.y)) > most or abs(error.yaw) > most_angle:
+    if not (abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle):
         raise _off_target(
             error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
         )

@@ -110,14 +110,14 @@ def photograph(
 
 
 def _require(pose: BoardPose, limits: PhotoSection) -> None:
-    if pose.obliquity > limits.max_obliquity:
+    if not pose.obliquity <= limits.max_obliquity:
         seen, allowed = math.degrees(pose.obliquity), math.degrees(limits.max_obliquity)
         raise RefusedError(
             f"the board is seen {seen:.1f} deg from square, allowed up to {allowed:.0f} deg; photograph it from "
             "further in front",
             Measured("board, from square", seen, "deg", most=allowed),
         )
-    if pose.rms_px > limits.max_residual:
+    if not pose.rms_px <= limits.max_residual:
         raise RefusedError(
             f"the board's dots miss their places by {pose.rms_px:.3g} px RMS, allowed up to {limits.max_residual:.3g} "
             "px; is the target camera still in focus and calibrated, and the board flat?",

@@ -119,7 +119,7 @@ def place(
         flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force
     )
     # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
-    if stopped or np.linalg.norm(arm.state().wrench[:3]) > plan.contact_force:
+    if stopped or not np.linalg.norm(arm.state().wrench[:3]) <= plan.contact_force:
         height = depth()
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(

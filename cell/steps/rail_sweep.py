@@ -51,7 +51,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     middle = collector.require_frames(devices.scan_camera.name, lines, errors.lost)
     collector.require_one_clock(devices.scan_camera.name, errors)
     moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
-    if moved > MAX_FLANGE_MOTION:
+    if not moved <= MAX_FLANGE_MOTION:
         raise DeviceFault(
             arm.name,
             "arm.moved_in_sweep",
@@ -60,7 +60,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
             hint="See what pushed the arm; the sweep is of no use.",
         )
     allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
-    if sweep.unevenness > allowed:
+    if not sweep.unevenness <= allowed:
         raise DeviceFault(
             rail.name,
             "rail.uneven_sweep",

@@ -72,7 +72,7 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
     docs/theory.md, section 10.
     """
     shift = speed * sum(one.bound for one in known)
-    if shift > errors.shift:
+    if not shift <= errors.shift:
         worst = max(known, key=lambda one: one.bound)
         told = " and ".join(f"those of the {one.kind} to ±{1e3 * one.bound / errors.rate:.1f} ms" for one in known)
         raise DeviceFault(

@@ -6,9 +6,11 @@ import json
 import os
 import threading
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cell.console.desk import SOON_S, Desk
@@ -116,6 +118,47 @@ def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk:
     assert not cell.devices.gate.is_open
     desk.do("c1", {"do": "clear_stop", "by": "Ann"})
     assert cell.devices.gate.is_open
+
+
+@pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
+@pytest.mark.parametrize("end", ["release", "page gone", "another button", "manual off", "silence"])
+def test_what_ends_a_held_button_stops_the_motion(
+    cell: Cell, desk: Desk, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
+) -> None:
+    """Virtual time passes here alone: what moves on after the end would be seen to."""
+    cell.home("rail")
+    told: list[str] = []
+    moved: Any = getattr(cell.devices, device)
+    monkeypatch.setattr(moved.bare, "attended", lambda: nullcontext(lambda: None), raising=False)
+    monkeypatch.setattr("cell.console.holding.ATTENDED_S", 60.0)
+    monkeypatch.setattr(desk, "_say", lambda client, words: told.append(words["state"]))
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    desk.do("c1", {"do": "manual", "on": True})
+
+    def beat(number: int) -> None:
+        desk.beat("c1", {"type": "jog", "press": number, "device": device, "axis": axis, "sign": 1, "at": None})
+
+    def place() -> Any:
+        return moved.state().position if device == "rail" else moved.state().joints
+
+    begun = place()
+    beat(1)
+    assert until(lambda: told == ["moving"])
+    cell.devices.clock.sleep(0.3)
+    assert np.abs(place() - begun).max() > 1e-4
+    ends: dict[str, Any] = {
+        "release": lambda: desk.jog_end("c1"), "page gone": lambda: desk.left("c1"), "another button": lambda: beat(2),
+        "manual off": lambda: desk.do("c1", {"do": "manual", "on": False}),
+        "silence": lambda: monkeypatch.setattr("cell.console.holding.ATTENDED_S", 0.0),
+    }  # fmt: skip
+    ends[end]()
+    assert until(lambda: told == ["moving", "ended"])
+    stood = place()
+    cell.devices.clock.sleep(0.5)
+    assert np.abs(place() - stood).max() < 1e-5
+    beat(1)
+    cell.devices.clock.sleep(0.5)
+    assert np.abs(place() - stood).max() < 1e-5
 
 
 def test_holding_is_offered_only_where_something_beside_the_program_would_stop_it(cell: Cell) -> None:

@@ -56,7 +56,10 @@ def test_another_page_ends_what_a_page_holds_and_begins_nothing() -> None:
     assert presses.beat("c2", 1, *Z_UP) is None
     assert press.over() is not None
     presses.left("c1")
-    assert presses.beat("c3", 1, *Z_UP) is not None
+    other = presses.beat("c3", 1, *Z_UP)
+    assert other is not None and other.over() is None
+    presses.left("c3")
+    assert other.over() == "the page is gone"
 
 
 def test_a_beat_that_was_long_under_way_begins_nothing() -> None:

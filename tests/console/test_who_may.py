@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from cell.console.access import Access
 from cell.console.messages import Beat, CloudPart, Joined, Left, Show
 from cell.console.serve import PING_S
 from tests.console.server import Served, serving, until
@@ -44,6 +45,14 @@ def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Serv
     assert again.status == 403
     assert link not in again.text
     assert "set-cookie" not in again.headers
+
+
+def test_a_link_works_once_also_before_the_next_is_made() -> None:
+    access = Access(("127.0.0.1",), 1, secure=False)
+    replaced, link = access.link(), access.link()
+    assert access.enter(replaced) is None
+    assert access.enter(link) is not None
+    assert access.enter(link) is None
 
 
 @pytest.mark.parametrize("path", ["/", "/static/app.js", "/api/cell", "/api/runs", "/api/trend", "/nowhere"])
