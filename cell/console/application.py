@@ -36,6 +36,7 @@ KEY = "x-cell-key"
 SHOWN = re.compile(r"/api/runs/[^/]+/(pictures/[^/]+|report\.html)")
 """What a browser asks for by its address alone: there a ticket stands for the key."""
 ENTERED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Assembly cell</title>
+<link rel="icon" href="/static/icon.svg" type="image/svg+xml">
 <meta http-equiv="refresh" content="0;url=/#key={key}"><a href="/#key={key}">To the cell</a></html>
 """
 LOST = "open the link that `cell console` printed in its terminal; it works once, for one tab of the browser"

@@ -19,7 +19,7 @@ from drivers.quantities import check_positive, check_range, shown
 from drivers.rail.following import CarriageWatch
 from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
-from drivers.rail.zero_check import AHEAD_M, CREEP, ZeroCheck
+from drivers.rail.zero_check import LONGEST_S, ZeroCheck
 
 _AT_START_M = 20e-6
 
@@ -193,7 +193,7 @@ class RailAxis(ABC):
                 self._clock,
                 arrived=ZeroCheck(self.name, begin, self._position, switch, forget, self._max_speed),
                 halt=self._halt(issued),
-                duration=duration + 2.0 * AHEAD_M / CREEP,
+                duration=duration + LONGEST_S,
             )
             return self._motion
 

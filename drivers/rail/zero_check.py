@@ -12,7 +12,13 @@ LOST_M = 0.05e-3
 AHEAD_M = 0.2e-3
 """So far before and behind 0 the carriage creeps."""
 CREEP = 0.5e-3
-"""Speed over the edge, m/s: from one reading to the next the count goes on by less than `LOST_M`."""
+"""Speed over the edge, m/s."""
+SURE_M = 0.5 * LOST_M
+"""Between two readings the edge is known to no more than the way between them: over a longer one the carriage creeps
+once more, at half the speed."""
+MOST_CREEPS = 3
+LONGEST_S = (2**MOST_CREEPS - 1) * 2.0 * AHEAD_M / CREEP
+"""What all the creeping may take."""
 
 Arrived = Callable[[], bool]
 
@@ -39,8 +45,10 @@ class ZeroCheck:
         self._speed = speed
         self._arrived = begin(AHEAD_M, speed)
         self._stage = 0
+        self._creeps = 0
         self._off_at = AHEAD_M
-        """Count when the switch was off last."""
+        """Count when the switch was off last, and when it was on first."""
+        self._on_at = -AHEAD_M
 
     def __call__(self) -> bool:
         """Read, judge and go on."""
@@ -62,7 +70,8 @@ class ZeroCheck:
             raise self._lost(f"a limit switch is hit on the way to {shown(AHEAD_M, 'm')}") from fault
         if self._switch():
             raise self._lost(f"its reference switch is on at {shown(AHEAD_M, 'm')} already")
-        self._stage, self._arrived = 1, self._begin(-AHEAD_M, CREEP)
+        self._stage, self._arrived = 1, self._begin(-AHEAD_M, CREEP * 0.5**self._creeps)
+        self._off_at, self._on_at = AHEAD_M, -AHEAD_M
 
     def _creep(self) -> None:
         before, on = self._position(), self._switch()
@@ -71,12 +80,21 @@ class ZeroCheck:
             if self._arrived():
                 raise self._lost(f"its reference switch is still off at {shown(-AHEAD_M, 'm')}")
             return
-        on_at = self._position()
-        if on_at > LOST_M or self._off_at < -LOST_M:
+        self._on_at = max(self._on_at, self._position())
+        if self._on_at > LOST_M or self._off_at < -LOST_M:
             raise self._lost(
-                f"its reference switch went on between {shown(self._off_at, 'm')} and {shown(on_at, 'm')} by its count"
+                f"its reference switch went on between {shown(self._off_at, 'm')} and {shown(self._on_at, 'm')} by its "
+                "count"
             )
-        if self._arrived():
+        if not self._arrived():
+            return
+        if self._off_at - self._on_at > SURE_M and self._creeps + 1 < MOST_CREEPS:
+            # Readings came too late to tell.
+            self._creeps += 1
+            self._stage, self._arrived = 0, self._begin(AHEAD_M, self._speed)
+        elif self._off_at + self._on_at > 2 * LOST_M or self._off_at + self._on_at < -2 * LOST_M:
+            raise self._lost(f"its reference switch went on about {shown(0.5 * (self._off_at + self._on_at), 'm')}")
+        else:
             self._stage, self._arrived = 2, self._begin(0.0, self._speed)
 
     def _lost(self, what: str) -> DeviceFault:
