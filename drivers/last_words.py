@@ -88,7 +88,7 @@ class LastWords:
     def require_unspoken(self, code: str) -> None:
         """Raise `DeviceFault` with `code`, once, after the helper has stopped the device of a frozen owner."""
         with suppress(OSError):
-            if os.read(self._told, 4096):
+            if self._told >= 0 and os.read(self._told, 4096):
                 raise frozen_fault(self._name, code)
 
     @contextmanager
@@ -124,9 +124,9 @@ class LastWords:
         self._pulse.close()
         with suppress(OSError):
             self._write(GOODBYE)
-        os.close(self._pipe)
-        os.close(self._told)
-        self._pipe = -1
+        ends, self._pipe, self._told = (self._pipe, self._told), -1, -1
+        for end in ends:
+            os.close(end)
         if self._process is not None:
             try:
                 self._process.wait(END_TIMEOUT_S)

@@ -28,6 +28,7 @@ class Owner:
         self._stat = f"/proc/{pid}/stat"
         self._beat = self._sign = float("inf")
         self._used = b""
+        self._looked = time.monotonic()
 
     def beat(self) -> None:
         """The owner has sent a beat. It is watched from the first one on."""
@@ -36,6 +37,9 @@ class Owner:
     def frozen(self) -> bool:
         """Whether the owner gave no sign of life for too long; asked at least every `LOOK_S`."""
         now, used = time.monotonic(), self._processor_time()
+        # Time in which this process did not run itself says nothing of the owner.
+        blind, self._looked = max(0.0, now - self._looked - 2 * LOOK_S), now
+        self._beat, self._sign = self._beat + blind, self._sign + blind
         if used != self._used and self._sign < now:
             self._used, self._sign = used, now
         return now - self._sign > FROZEN_S or now - self._beat > HUNG_S

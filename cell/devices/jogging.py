@@ -140,7 +140,7 @@ def arm_is_ready(arm: Arm) -> bool:
     try:
         state = arm.state()
     except DeviceFault as fault:
-        if fault.code != "arm.link_lost":
+        if fault.code not in ("arm.link_lost", "arm.link_closed"):
             raise
         return False
     return state.controlled and state.safety is ArmSafety.NORMAL

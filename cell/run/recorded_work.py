@@ -134,7 +134,7 @@ class RecordedWork:
         """
         control, devices = self.run.control, self.devices
         problems: list[str] = []
-        stopped = False
+        stopped = ever_stopped = False
 
         def begin(context: StepContext) -> object:
             with devices.gate.entered(context.token):
@@ -142,8 +142,8 @@ class RecordedWork:
                 return work(Hands(context.check, context.safe_point, context.progress, frames.keep))
 
         def stop(reason: str) -> None:
-            nonlocal stopped
-            stopped = True
+            nonlocal stopped, ever_stopped
+            stopped = ever_stopped = True
             problems[:] = ["the safe stop did not end"]
             problems[:] = devices.stop()
 
@@ -172,7 +172,10 @@ class RecordedWork:
             attempts = Attempts(sequence.steps, {self.kind: begin}, watchman)
             sequence.fire(Trigger.START)
             try:
-                end = performed(step, attempts, recover, sequence, watchman) or watchman.asked()
+                end = performed(step, attempts, recover, sequence, watchman)
+                stops = devices.gate.stops
+                # A stop that a person asks for from here on is not cleared.
+                end = end or watchman.asked()
             # Its end cannot be recorded; what it ended with counts.
             except JournalError as failure:
                 log.warning("the %s could not be recorded: %s", self.kind, failure)
@@ -180,9 +183,9 @@ class RecordedWork:
                     watchman.error = watchman.error or failure
                     end = Failure(Outcome.FAULTED, str(watchman.error))
             if end is None:
-                if open_before:
+                if open_before and ever_stopped:
                     # The stops of attempts that were recovered from keep nobody from going on.
-                    devices.gate.clear(devices.gate.stops)
+                    devices.gate.clear(stops)
                 made: Made = attempts.results[self.kind]  # type: ignore[assignment]
                 return made
             if not stopped or self.kind in attempts.results:
@@ -211,7 +214,7 @@ class RecordedWork:
     def _classify(self, error: BaseException) -> Failure:
         """As `classify`. Only what a person confirms is cleared, and a lost link to the arm where nothing is jogged."""
         failure = classify(error, self.devices.following)
-        lost = failure.code == "arm.link_lost" and self.kind != "jog"
+        lost = failure.code in ("arm.link_lost", "arm.link_closed") and self.kind != "jog"
         return replace(failure, recoverable=failure.recoverable and (failure.needs_person or lost))
 
     def _heard(self, event: Event) -> None:

@@ -82,7 +82,10 @@ def fault(device: str, code: str, text: str = "") -> DeviceFault:
     """The `DeviceFault` for a code of the child process, with its text added."""
     what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
     if _BUSY in text:
-        hint = hint.replace("Look for what it ran into and clear the way", "End what else computes here, see the arm")
+        hint = hint.replace(
+            "Look for what it ran into and clear the way",
+            "End what else computes here, and see that the arm touches nothing",
+        )
     return DeviceFault(device, code, f"{what}: {text}" if text else what, recoverable=recoverable, hint=hint)
 
 

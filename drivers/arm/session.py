@@ -97,7 +97,10 @@ class ArmSession:
     def require_remote(self) -> None:
         """Raise the `DeviceFault` of an arm in local control; one whose dashboard is silent is left to its link."""
         with suppress(DeadlineError, NotConnectedError):
-            require_remote(self._name, self.dashboard)
+            try:
+                require_remote(self._name, self.dashboard)
+            except NotConnectedError:  # The server may have closed the connection meanwhile.
+                require_remote(self._name, self.dashboard)
 
     def require_ready(self) -> None:
         """Raise the `DeviceFault` that keeps the arm from moving, if any."""

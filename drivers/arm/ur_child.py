@@ -53,7 +53,7 @@ class Child:
         self._setup = setup
         self._safe_off = setup.safe_off
         self._parent = os.getppid()
-        self._owner = Owner(self._parent)
+        self._owner, self._ending = Owner(self._parent), False
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
             self._packets = Packets(setup.address)
@@ -149,6 +149,7 @@ class Child:
     def shut_down(self, closing: int = 0) -> None:
         """Outputs off, motion stopped, then the end; bounded in time whatever the arm does."""
         signal.setitimer(signal.ITIMER_REAL, _SHUT_DOWN_S)
+        self._ending = True
         if self._setup.control:
             self._leave_safe()
         if closing:
@@ -181,7 +182,7 @@ class Child:
             before = self._snapshot
             if time.monotonic() > look:
                 look = time.monotonic() + LOOK_S
-                if self._owner.frozen():
+                if self._owner.frozen() and not self._ending:
                     self._stand_in()
             # Read once: the owner may say that nothing is attended any more meanwhile.
             silence = self._silence

@@ -68,15 +68,15 @@ class ControlThread:
         """Queue a request. A stop drops what waits and ends what runs."""
         if request.name in ("stop", "close"):
             self._program.to_stop.set()
-            stops: list[Request] = []
+            kept: list[Request] = []
             with suppress(queue.Empty):
                 while True:
                     dropped = self._requests.get_nowait()
-                    if dropped.name == "stop":
-                        stops.append(dropped)
+                    if dropped.name in ("stop", "close"):
+                        kept.append(dropped)
                     else:
                         self._send(Reply(dropped.number, ("arm.stopped", "")))
-            for stop in stops:
+            for stop in kept:
                 self._requests.put(stop)
         self._requests.put(request)
 

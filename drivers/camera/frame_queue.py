@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 from drivers.camera.stamps import Stamps
 from drivers.clock import Clock
@@ -55,18 +56,25 @@ class FrameQueue:
         self._news = threading.Condition()
         self._closed = False
         self._aborted = False
-        self._stamps = Stamps(name, clock, exposure)
+        self._fresh = partial(Stamps, name, clock, exposure)
+        self._stamps = self._fresh()
         self._untrue: DeviceFault | None = None
+        self._untrue_id = 0
 
     def expect(self, frame_id: int | None) -> None:
         """Tell the id of the first frame, so that the loss of the very first is known; None if unknown."""
-        self._expected = frame_id
+        with self._news:
+            self._expected = frame_id
+            if frame_id is not None and self._untrue_id < frame_id:
+                # It was of an acquisition before this one.
+                self._untrue, self._stamps = None, self._fresh()
 
     def put(self, frame: Frame) -> None:
         """Add a frame; called by the receiving thread, never blocks."""
         with self._news:
-            if self._expected is None or frame.frame_id >= self._expected:
-                self._untrue = self._untrue or self._stamps.fault(frame)
+            ours = self._expected is None or frame.frame_id >= self._expected
+            if ours and self._untrue is None:
+                self._untrue, self._untrue_id = self._stamps.fault(frame), frame.frame_id
             if self._untrue is not None:
                 self._news.notify_all()
                 return
