@@ -146,12 +146,13 @@ def read_json(path: Path) -> Stored:
     """Read a file of `write_json`. Raises `OSError`, and `ValueError` for what is no JSON object, or has NaN in it."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
+        intact = isinstance(data, dict) and is_intact(data)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(data, dict):
         raise ValueError(f"it holds no table, but {str(data)[:40]}")
     parts, has_digest, content = data.get(PARTS), DIGEST in data, unsealed(data)
-    if is_intact(data):
+    if intact:
         return Stored(content, has_digest, ())
     before, now = parts if isinstance(parts, dict) else {}, _parts(content)
     changed = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))

@@ -65,7 +65,7 @@ def _keep_standard_files() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
             closed.append(name)
     sys.stdout = sys.stdout or Path(os.devnull).open("w")  # noqa: SIM115
     if "standard output" in closed:

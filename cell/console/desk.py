@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from cell.calibration.verify.verdict import Verification
@@ -175,13 +176,25 @@ class Desk:
 
         return self._soon(client, f"job {job}", begin)
 
+    def _require_nothing_starting(self) -> None:
+        """Take `_beginning`, or raise `InterlockError` while something else has it."""
+        if not self._beginning.acquire(blocking=False):
+            busy = f"is starting {self.starting}" if self.starting else "is being asked something else"
+            raise InterlockError("cell", f"{busy}; wait a moment, then look before you press again")
+
+    @contextmanager
+    def _nothing_starting(self) -> Iterator[None]:
+        self._require_nothing_starting()
+        try:
+            yield
+        finally:
+            self._beginning.release()
+
     def _soon(self, client: str, what: str, begin: Callable[[], None]) -> str:
         """Begin beside this command, which answers at once; a refusal that comes later is told to the page."""
         if (going := self.cell.current) is not None:
             raise InterlockError("cell", f"a {going.kind} is going on; wait for its end or abort it, then begin again")
-        if not self._beginning.acquire(blocking=False):
-            busy = f"is starting {self.starting}" if self.starting else "is being asked something else"
-            raise InterlockError("cell", f"{busy}; wait a moment, then look before you press again")
+        self._require_nothing_starting()
         self.starting = what
         stops, refused = self.cell.stops, list[Exception]()
         ended, answered = threading.Event(), threading.Event()
@@ -280,7 +293,7 @@ class Desk:
 
     def _manual(self, client: str, words: Words) -> str:
         if words["on"]:
-            with self._beginning:
+            with self._nothing_starting():
                 return self.manual.begin(self.holders.name(client))
         return self.manual.end()
 
@@ -300,7 +313,7 @@ class Desk:
         if self.cell.current is not None:
             raise InterlockError("cell", "is at work, and its devices are asked only while it rests; wait for the end")
         served = () if self.cell.simulated is None else self.cell.simulated.simulated
-        with self._beginning:
+        with self._nothing_starting():
             rows = []
             for device in self.cell.devices:
                 bare: Any = device.bare if isinstance(device, Gated) else device

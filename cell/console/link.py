@@ -16,14 +16,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from cell.console.messages import CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
+from cell.console.messages import MOST_STOPS, CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
 from drivers.errors import CellError
 
 START_S = 30.0
 END_S = 3.0
 MOST_EVENTS, MOST_CLOUDS, MOST_SAID = 200, 64, 200
-MOST_STOPS = 64
-"""That one stop answers."""
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +108,8 @@ class ServerProcess:
         self._pipe, self._stops = (Connection(pair[0].detach()) for pair in pairs)
         self._pipe.send(setup(fds[0]))
         bound.close()
-        for work in (self._hear, self._carry_out_stops, self._tell, self._wait_for_end):
+        self._receiving, self._answering = threading.Lock(), threading.Lock()
+        for work in (self._hear, *MOST_STOPS * [self._carry_out_stops], self._tell, self._wait_for_end):
             threading.Thread(target=work, name=f"console {work.__name__.strip('_')}", daemon=True).start()
         if not self._ready.wait(START_S):
             self.close()
@@ -163,12 +162,11 @@ class ServerProcess:
             self._gone()
 
     def _carry_out_stops(self) -> None:
-        """One after the other: those that come while one is carried out have the next one in common."""
+        """One of `MOST_STOPS` threads: a stop that a device does not confirm holds up no other one."""
         with suppress(EOFError, OSError):
             while True:
-                asked: list[Stop] = [self._stops.recv()]
-                while len(asked) < MOST_STOPS and self._stops.poll():
-                    asked.append(self._stops.recv())
+                with self._receiving:
+                    message: Stop = self._stops.recv()
                 trouble = self._stop()
-                for message in asked:
+                with self._answering:
                     self._stops.send(Stopped(message.number, trouble))

@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_STOPS = 2
+"""So many are carried out at a time: one that lasts, and one more."""
+
 
 @dataclass(frozen=True)
 class Setup:

@@ -69,7 +69,7 @@ class Rehearsals:
         about = {"state": "done", "job": job, "seed": seed, "run": None}
         try:
             self.present = {**about, **self._computed(job, seed)}
-        except CellError as error:
+        except Exception as error:  # Whatever it is: else it would count as running for good.
             outcome = "cancelled" if self._cancelled else "failed"
             log.warning("dry run of %s: %s: %s", job, outcome, error)
             self.present = {**about, "outcome": outcome, "reason": "" if self._cancelled else str(error)}
@@ -87,7 +87,7 @@ class Rehearsals:
                     # Gives way: the cell beside it may be moving. It ends when its input does, with this program.
                     process = self._process = subprocess.Popen(
                         ["nice", "-n", "10", *command],
-                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, text=True,
+                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, text=True, errors="replace",
                         env=dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path)),
                     )  # fmt: skip
             except OSError as error:
@@ -113,7 +113,7 @@ class Rehearsals:
     def _heard(self, process: subprocess.Popen[str]) -> dict[str, Any] | None:
         """Show its progress until its last word, which is given; None when it ends without one."""
         for line in process.stdout or ():
-            with suppress(ValueError):
+            with suppress(ValueError, TypeError):
                 told: dict[str, Any] = json.loads(line)
                 if "fraction" not in told:
                     return told

@@ -32,6 +32,7 @@ from cell.console.access import Access
 from cell.console.application import Application
 from cell.console.archive import Archive
 from cell.console.messages import (
+    MOST_STOPS,
     Answer,
     AskCell,
     CloudPart,
@@ -50,6 +51,8 @@ from cell.console.pages import MOST_BYTES, Pages
 
 JPEG = (cv2.IMWRITE_JPEG_QUALITY, 75)
 ANSWER_S, STOP_S = 60.0, 15.0
+LASTS_S = 0.1
+"""After this a stop that is not confirmed yet holds up the next one no longer."""
 IDLE_S = 4.0
 """Wall seconds in which a connection has to say what it wants."""
 PING_S = 2.0
@@ -95,7 +98,7 @@ class Server:
             setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting
         )  # fmt: skip
         self.pages = Pages(self._tell, self._begin_stop)
-        self._under_way: asyncio.Future[str | None] | None = None
+        self._stopping: dict[int, tuple[float, asyncio.Future[str | None]]] = {}
         self._next: asyncio.Future[str | None] | None = None
 
     async def run(self) -> None:
@@ -174,27 +177,35 @@ class Server:
             return f"the stop was not confirmed within {STOP_S:.0f} s: use the emergency stop"
 
     def _begin_stop(self) -> asyncio.Future[str | None]:
-        """The stop that answers one who asks now. All who ask while one is under way have the next one in common."""
-        if self._next is not None:
-            return self._next
-        asked: asyncio.Future[str | None] = self._loop.create_future()
-        if self._under_way is None:
-            self._send_stop(asked)
-        else:
-            self._next = asked
-        return asked
+        """The stop that answers one who asks now. All who ask while one has just begun have the next one in common.
 
-    def _send_stop(self, asked: asyncio.Future[str | None]) -> None:
-        self._under_way = asked
-        self._stops.send(Stop(next(self._numbers)))
+        One that lasts, because a device does not confirm it, holds up no other: two are under way at most.
+        """
+        if self._next is None:
+            self._next = self._loop.create_future()
+            asked = self._next
+            self._send_next()
+            return asked
+        return self._next
+
+    def _send_next(self) -> None:
+        """Send the stop that is asked for, once the one before it is done or lasts."""
+        if self._next is None:
+            return
+        ages = [self._loop.time() - begun for begun, _ in self._stopping.values()]
+        if not ages or (len(ages) < MOST_STOPS and min(ages) >= LASTS_S):
+            number = next(self._numbers)
+            self._stopping[number] = self._loop.time(), self._next
+            self._next = None
+            self._stops.send(Stop(number))
+        elif len(ages) < MOST_STOPS:
+            self._loop.call_later(max(0.01, LASTS_S - min(ages)), self._send_next)
 
     def _stopped(self, message: Stopped) -> None:
-        done, following = self._under_way, self._next
-        self._under_way = self._next = None
-        if done is not None:
-            done.set_result(message.trouble)
-        if following is not None:
-            self._send_stop(following)
+        _, asked = self._stopping.pop(message.number)
+        if not asked.done():
+            asked.set_result(message.trouble)
+        self._send_next()
 
     # --- from the cell ---
 

@@ -115,3 +115,18 @@ def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
                 page.send('{"type": "stop"}')
             assert server.do(do="stop").status == 200
             assert before < server.stops <= before + 4
+
+
+def test_a_stop_that_a_device_does_not_confirm_holds_up_no_other(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        server.stop_s = 3.0
+        _ = server.cookie
+        presses = [threading.Thread(target=lambda: server.do(do="stop")) for _ in range(2)]
+        presses[0].start()
+        time.sleep(0.5)
+        pressed = time.monotonic()
+        presses[1].start()
+        time.sleep(WITHIN_S)
+        assert any(begun >= pressed for begun in server.begun)
+        for press in presses:
+            press.join(20)
