@@ -82,7 +82,7 @@ def test_another_master_maps_pdos_and_takes_the_drives_through_their_states(benc
     # 100 rpm of the motors, a gear of 20 and wheels of 0.1 m.
     speed = 100 / 60 / 20 * 2 * math.pi * 0.1
     made.until(lambda: made.speed() == pytest.approx(speed, rel=1e-3))
-    assert [node.sdo["velocity"].raw for node in nodes] == [1000, -1000]
+    made.until(lambda: [node.sdo["velocity"].raw for node in nodes] == [1000, -1000])
     for node in nodes:
         node.state = "QUICK STOP ACTIVE"
     made.until(lambda: made.speed() == 0.0)
