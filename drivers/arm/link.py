@@ -136,7 +136,7 @@ class ArmLink:
         if up:
             self._transmit(Request(number, "close"))
             pending.done.wait(deadline)
-        self._fail("it was closed", "arm.link_closed")
+        self._fail("it was closed")
         self._end()
 
     # --- inside ---
@@ -208,13 +208,14 @@ class ArmLink:
             return "its process closed the pipe"
         return f"its process was ended by {signal.Signals(-code).name}" if code < 0 else f"its process ended ({code})"
 
-    def _fail(self, reason: str, code: str = "arm.link_lost") -> None:
+    def _fail(self, reason: str) -> None:
         with self._lock:
             if self.lost is not None:
                 return
             self.lost = DeviceFault(
                 self._name,
-                code,
+                # Also where the child's end is seen before `close` goes on.
+                "arm.link_closed" if self._closing else "arm.link_lost",
                 f"the link to the arm at {self._address} was lost: {reason}",
                 recoverable=True,
                 hint="See that the arm is on and connected, then recover() or connect again.",
