@@ -165,7 +165,7 @@ class Console:
         if self._cell.simulated is not None:
             seed = self._cell.simulated.facts["seed"]
         about = {"job": job, "seed": seed, "run": None}
-        rehearsals.present = {"state": "running", "text": "computing", **about}
+        rehearsals.present = {"state": "running", "text": "computing", "by_command": True, **about}
 
         def done(outcome: RunOutcome) -> None:
             told = {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}

@@ -55,6 +55,8 @@ class Rehearsals:
         with self._lock:
             if self.present is None or self.present["state"] != "running" or self._cancelled:
                 raise InterlockError("cell", "no dry run is being computed; there is nothing to cancel")
+            if self.present.get("by_command"):
+                raise InterlockError("cell", "a command computes this dry run; end it there, with Ctrl+C")
         self.close()
         return "the dry run is cancelled"
 

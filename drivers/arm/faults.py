@@ -55,6 +55,9 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "this program gave no sign of life, so the process beside it stopped the arm", True,
         "The program was suspended, or this computer is too busy or swaps. End other programs, then go on.",
     ),
+    "arm.link_lost": (
+        "the link to the arm was lost", True, "See that the arm is on and connected, then recover() or connect again.",
+    ),
     "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
 }  # fmt: skip
 

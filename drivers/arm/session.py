@@ -206,19 +206,24 @@ class ArmSession:
         return not running and at_once and all(runtime <= PLAYING for runtime in seen)
 
     def _reconnect(self, stops: int) -> None:
-        self._require_no_stop_since(stops)
         try:
-            link = self._connect(lambda: self._stops == stops)
-        except Aborted:
-            # Its script may have been on the way already.
-            self.dashboard.ask("stop")
+            self._require_no_stop_since(stops)
+            try:
+                link = self._connect(lambda: self._stops == stops)
+            except Aborted:
+                # Its script may have been on the way already.
+                self.dashboard.ask("stop")
+                raise
+            with self._counting:
+                if self._stops == stops:
+                    self.link = link
+                    return
+            link.close(_CLOSE_S)
+            self._require_no_stop_since(stops)
+        except BaseException as error:
+            # No longer one that is closed to be opened again, which others wait for.
+            self.link.lost = fault(self._name, "arm.link_lost", f"not connected again: {error}")
             raise
-        with self._counting:
-            if self._stops == stops:
-                self.link = link
-                return
-        link.close(_CLOSE_S)
-        self._require_no_stop_since(stops)
 
     def _require_no_stop_since(self, stops: int) -> None:
         if self._stops != stops:

@@ -424,6 +424,8 @@ def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_p
         recovery.join(5.0)
         if failures:
             assert [type(failure) for failure in failures] == [Aborted]
+            with pytest.raises(DeviceFault, match=r"not connected again.*arm\.link_lost"):
+                arm.state()
             assert soon(lambda: children() <= before)
             assert stands_still(bench)
             assert dashboard(bench, "running") == "Program running: false"
