@@ -12,7 +12,7 @@ from tests.browser.screen import Console, Screen
 from tests.browser.watcher import Watcher
 from tests.wire.cells import ask, served, started
 
-pytestmark = [pytest.mark.wire, pytest.mark.flaky(reruns=2, reruns_delay=10)]
+pytestmark = pytest.mark.wire
 
 
 def test_a_person_unlocks_an_idle_arm_and_answers_for_a_homing(browser: Any, tmp_path: Path) -> None:

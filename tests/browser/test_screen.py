@@ -12,7 +12,7 @@ from tests.browser.screen import LOCAL, Console, Screen
 from tests.browser.watcher import Watcher
 
 # As in tests/wire: devices keep deadlines on the wall, which a busy machine cannot always.
-pytestmark = [pytest.mark.wire, pytest.mark.flaky(reruns=3, reruns_delay=10)]
+pytestmark = pytest.mark.wire
 
 
 def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -> None:

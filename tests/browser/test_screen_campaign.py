@@ -15,7 +15,7 @@ from tests.browser.screen import LOCAL, PHONE, Console, Screen, console_of, open
 from tests.browser.watcher import Watcher
 from tests.wire.cells import started
 
-pytestmark = [pytest.mark.wire, pytest.mark.campaign, pytest.mark.flaky(reruns=3, reruns_delay=10)]
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 FAULT = "arm.protective_stop@laser_sweep:40%"
 

@@ -86,7 +86,6 @@ def flooded(folder: Path, seconds: float) -> None:
     assert after["VmRSS"][0] - before["VmRSS"][0] < 20_000
 
 
-@pytest.mark.flaky(reruns=2, reruns_delay=5)
 def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path) -> None:
     flooded(tmp_path, 4.0)
 

@@ -94,7 +94,6 @@ def going(tmp_path: Path) -> Iterator[Going]:
 
 
 @pytest.mark.wire
-@pytest.mark.flaky(reruns=2, reruns_delay=10)
 def test_a_console_whose_server_is_killed_stops_and_ends(going: Going) -> None:
     browser = Browser(going.link())
     assert browser.token not in " ".join(below(going.process.pid).values())
@@ -108,7 +107,6 @@ def test_a_console_whose_server_is_killed_stops_and_ends(going: Going) -> None:
 
 
 @pytest.mark.wire
-@pytest.mark.flaky(reruns=2, reruns_delay=10)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["interrupted", "killed"])
 def test_a_console_that_ends_takes_its_dry_run_along(going: Going, number: signal.Signals) -> None:
     browser = Browser(going.link())

@@ -1,4 +1,4 @@
-"""What several of the wire tests start from, and what becomes of a failure on a busy machine."""
+"""What several of the wire tests start from."""
 
 from __future__ import annotations
 
@@ -15,14 +15,6 @@ from cell.run.folder import list_runs
 from cell.run.reading import read_report
 from tests.test_readme import block
 from tests.wire.cells import Supervised
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Devices keep deadlines on the wall, which three workers on two cores cannot always: a failure is looked at again
-    a little later, and listed. What is wrong fails each time."""
-    for item in items:
-        if item.get_closest_marker("wire") is not None and item.get_closest_marker("flaky") is None:
-            item.add_marker(pytest.mark.flaky(reruns=3, reruns_delay=10))
 
 
 @pytest.fixture(scope="session")

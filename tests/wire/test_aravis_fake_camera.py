@@ -14,7 +14,7 @@ from drivers.interfaces import Camera
 from tests.wire.aravis_fake import fake_camera, opened
 
 # This camera sends a picture in one burst and sends nothing again: what the receiver is too late for is lost.
-pytestmark = [pytest.mark.wire, pytest.mark.flaky(reruns=3, only_rerun="packets_lost")]
+pytestmark = pytest.mark.wire
 
 
 class TestContract(CameraContract):

@@ -13,7 +13,7 @@ from sim_backends.world.world import World
 from tests.wire.aravis_fake import fake_camera, opened
 
 # Aravis' camera sends a picture in one burst and sends nothing again: what the receiver is too late for is lost.
-pytestmark = [pytest.mark.wire, pytest.mark.flaky(reruns=3, only_rerun="packets_lost")]
+pytestmark = pytest.mark.wire
 
 
 def test_a_rendered_scene_comes_unchanged_and_a_trigger_tells_the_time() -> None:
