@@ -96,7 +96,7 @@ VIRTUAL_JOB = 3
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
 SCREENS = (HERE / "browser", HERE / "console")
-ON_THE_WALL = (HERE / "wire", *SCREENS, HERE / "test_canopen_vehicle.py", HERE / "test_vehicle_bus.py")
+ON_THE_WALL = frozenset((HERE / "wire", *SCREENS, HERE / "test_canopen_vehicle.py", HERE / "test_vehicle_bus.py"))
 WHOLE_CELL, COMPUTES = 5, 19
 """How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
 deadlines of seconds on the wall, and what only computes gets what the others leave."""
@@ -112,15 +112,16 @@ def place(file: Path) -> tuple[int, int]:
     return (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with what lasts longest.
 
     Devices keep deadlines on the wall, which more workers than cores cannot always: a failure there is looked at again
     a little later, and listed. What is wrong fails each time.
     """
     items.sort(key=lambda item: place(item.path))
+    again = config.pluginmanager.hasplugin("rerunfailures")
     for item in items:
-        if item.path in ON_THE_WALL or item.path.parent in ON_THE_WALL:
+        if again and ON_THE_WALL.intersection((item.path, item.path.parent)):
             item.add_marker(pytest.mark.flaky(reruns=3, reruns_delay=5))
 
 

@@ -14,7 +14,7 @@ from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockErr
 from drivers.vehicle.cia402.last_words import last_words
 from sim_backends.models.wheel_drive import State
 from sim_backends.peers.canopen_node import WRONG_VALUE, Abort
-from tests.canopen_bench import SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
+from tests.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 
 RAMP_WALL_S = 0.3
 """From 0.3 m/s to standstill, and the time to notice, on the wall at three times its pace."""
@@ -151,6 +151,27 @@ def test_a_second_master_is_noticed_and_the_vehicle_stands(bench: Bench) -> None
             with pytest.raises(InterlockError):
                 bench.vehicle.drive(0.1, 0.0)
             assert bench.vehicle.state().interruptions == interrupted + 1
+
+
+def test_the_drives_of_a_second_vehicle_under_the_same_numbers_are_named_and_no_stop_is_believed(apart: Bench) -> None:
+    """Their counts are 12,000 apart, and they say that they stand."""
+    vehicle = apart.connect()
+    vehicle.enable()
+    apart.drive_until_fast()
+    with apart.other() as other:
+        senders = [
+            other.send_periodic(frame(0x180 + node, struct.pack("<Hib", 0x0237, 12_000, 3)), 0.02 / RATE)
+            for node in (1, 2)
+        ]
+        with pytest.raises(DeviceFault, match="two vehicles report under the same identifiers") as met:
+            apart.drive_on(0.5 / RATE + 0.2)
+        assert (met.value.code, met.value.recoverable) == ("vehicle.two_vehicles", False)
+        with pytest.raises(DeviceFault):
+            vehicle.enable()
+        for sender in senders:
+            sender.stop()
+    apart.until(lambda: apart.speed() == 0.0)
+    vehicle.close()
 
 
 def test_drives_that_another_master_commands_are_left_alone(apart: Bench) -> None:

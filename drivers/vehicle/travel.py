@@ -71,7 +71,7 @@ class Travel:
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what others did before."""
         self.disturbance, self._rest = "", None
-        if not self._swings_now():
+        if not self.swings():
             self.two_vehicles = ""
 
     def interrupt(self, why: str) -> None:
@@ -93,7 +93,7 @@ class Travel:
         )
         if any(swings):
             self._swings.append(now)
-            if self._swings_now() and not self.two_vehicles:
+            if self.swings() and not self.two_vehicles:
                 first, second = (
                     [f"{1e3 * self._unit * count:.0f}" for count in counts] for counts in (last, self._counts)
                 )
@@ -106,7 +106,8 @@ class Travel:
         if any(ways):
             self._ways = ways
 
-    def _swings_now(self) -> bool:
+    def swings(self) -> bool:
+        """Whether the counts of two vehicles come at present."""
         recent = self._clock.now() - _SWINGS_S * max(1.0, self._clock.rate)
         return len(self._swings) == SWINGS and self._swings[0] > recent
 

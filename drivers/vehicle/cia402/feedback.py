@@ -146,6 +146,12 @@ class Feedback:
                 drive.waited = 0
                 units.forget()
 
+    def require_one(self) -> None:
+        """Raise the `DeviceFault` of two vehicles that report under the same identifiers."""
+        with self._news:
+            if what := self._travel.two_vehicles:
+                raise two_vehicles(self._name, what)
+
     def interrupt(self, why: str) -> None:
         """From now on odometry does not tell where the vehicle is relative to where it was before."""
         with self._news:
@@ -215,7 +221,7 @@ class Feedback:
 
     def stands(self, since: float) -> bool:
         """True when both drives have reported standstill after host time `since`."""
-        if self._travel.two_vehicles:
+        if self._travel.swings():
             return False
         step = 1.5 * self._wheels.velocity_step
         slow = max(STILL, step)

@@ -110,6 +110,7 @@ class Master:
         self.set_up()
         self.bus.say_in_the_end(last_words(self._wheels))
         self.require_feedback()
+        self._feedback.require_one()
         self._feedback.require_released()
 
     def set_up(self) -> None:
