@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sqlite3
 import threading
 import tomllib
 from collections.abc import Iterator
@@ -30,6 +29,7 @@ from drivers.errors import Aborted, ConfigError, InterlockError
 from statemachine.journal import request
 from statemachine.script import Script
 from statemachine.step import Event
+from tests.golden.golden import plain_journal, plain_report
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -67,25 +67,6 @@ def require_safe(report: dict[str, Any]) -> None:
     assert not end["arm"]["moving"]
     assert end["vehicle"]["braked"] and end["vehicle"]["stopped"]
     assert end["collisions"] == []
-
-
-def plain_report(folder: Path) -> str:
-    """The bytes of the report without the run's name and its dates."""
-    text = (folder / "report.json").read_text(encoding="utf-8")
-    return re.sub(r'"(run|started|ended|at|calibration_date)": "[^"]*"', r'"\1": ""', text)
-
-
-def plain_journal(folder: Path) -> list[Any]:
-    """All rows of the journal without the run's id, its process and all times."""
-    base = sqlite3.connect(folder / "journal.sqlite")
-    try:
-        runs = base.execute("SELECT info, outcome, reason FROM runs").fetchall()
-        steps = base.execute("SELECT id, name, attempt, state, duration_s, result, error FROM steps").fetchall()
-        events = base.execute("SELECT id, kind, step, data FROM events").fetchall()
-        asked = base.execute("SELECT id, kind, reason FROM requests").fetchall()
-    finally:
-        base.close()
-    return [runs, steps, events, asked]
 
 
 def plain_record(folder: Path) -> list[Any]:

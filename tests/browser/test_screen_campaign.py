@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright
 
+from cell.lab.bench.soak import counted
 from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, kill, press
 from tests.browser.screen import LOCAL, PHONE, Console, Screen, console_of, opened_browser
 from tests.browser.watcher import Watcher
@@ -133,3 +136,41 @@ def test_stop_is_in_sight_and_nothing_is_cut_off(
     assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
     page.screenshot(path=tmp_path / f"{size[0]}.png")
     browser.close()
+
+
+SOAKED_S, MOST_MB_A_HOUR, A_PAGE_OF_MEMORY_MB = 300.0, 1.0, 0.3
+BUSY = "while True: pass"
+
+
+def test_a_console_that_goes_on_does_not_grow(browsers: Playwright, tmp_path: Path) -> None:
+    """Idle, with a page that homes the rail, and while its readings come late: the second half of each phase counts."""
+    with console_of(tmp_path, "--speed", "0.3") as console:
+        link, browser = console.link(), opened_browser(browsers)
+
+        def grown(phase: str) -> None:
+            memory = []
+            for _ in range(2):
+                browser.contexts[0].pages[0].wait_for_timeout(500 * SOAKED_S)
+                memory.append({name: row["memory_mb"] for name, row in counted(console.process.pid).items()})
+            for name, after in memory[1].items():
+                most = MOST_MB_A_HOUR * SOAKED_S / 7200 + A_PAGE_OF_MEMORY_MB
+                print(f"{phase}: {name}: {after:.1f} MB, {after - memory[0][name]:+.2f} (allowed {most:.2f})")
+                assert after - memory[0][name] <= most, (phase, name)
+
+        browser.new_page()
+        grown("idle")
+        screen = Screen.of(browser, link)
+        screen.hold()
+        for _ in range(3):
+            screen.page.click("[data-do=home]")
+            screen.page.wait_for_timeout(40_000)
+        grown("a page")
+        busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(8)]
+        try:
+            grown("late readings")
+        finally:
+            for one in busy:
+                one.kill()
+                one.wait()
+        screen.close()
+        browser.close()

@@ -1,0 +1,84 @@
+"""Hashes of what jobs on the virtual clock leave behind: code that is only moved or renamed must not change them.
+
+`python -m tests.golden.golden write` makes `hashes.json` beside this file, `compare` tells what differs from it.
+A hash is that of a report and a journal without the run's name, dates and process, and without the checkout's folder.
+Another kind of processor or another release of a numerical library may round differently: write on the machine on
+which you compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import sqlite3
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import chdir, closing
+from pathlib import Path
+from typing import Any
+
+from cell import Cell
+
+HASHES = Path(__file__).with_name("hashes.json")
+CHECKOUT = f"{Path(__file__).parents[2]}/"
+JOBS, LEVELS, SEEDS = ("pot", "seat", "panel"), ("nominal", "workshop"), range(1, 7)
+_DATED = re.compile(r'"(run|started|ended|at|calibration_date)": "[^"]*"')
+_TABLES = (
+    "SELECT info, outcome, reason FROM runs",
+    "SELECT id, name, attempt, state, duration_s, result, error FROM steps",
+    "SELECT id, kind, step, data FROM events",
+    "SELECT id, kind, reason FROM requests",
+)
+
+
+def plain_report(folder: Path) -> str:
+    """The text of the report without the run's name and its dates."""
+    return _DATED.sub(r'"\1": ""', (folder / "report.json").read_text(encoding="utf-8"))
+
+
+def plain_journal(folder: Path) -> list[Any]:
+    """All rows of the journal without the run's id, its process and all times."""
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as base:
+        return [base.execute(table).fetchall() for table in _TABLES]
+
+
+def hashes(seeds: list[int]) -> Iterator[tuple[str, str]]:
+    """Name and hash of each job of these seeds; each cell is calibrated once for all its jobs."""
+    for seed in seeds:
+        for level in LEVELS:
+            with tempfile.TemporaryDirectory() as folder, chdir(folder):
+                for job in JOBS:
+                    with Cell.open(
+                        sim="all", seed=seed, level=level, clock="virtual", job=job, confirm="simulated"
+                    ) as cell:
+                        outcome = cell.run(job)
+                    told = plain_report(outcome.folder) + json.dumps(plain_journal(outcome.folder))
+                    told = told.replace(CHECKOUT, "")
+                    yield f"{job} {level} {seed}", hashlib.sha256(told.encode()).hexdigest()
+
+
+def main() -> int:
+    """0 when nothing differs; progress goes to the standard error."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("write", "compare"))
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="how many, from 1 (default: %(default)s)")
+    asked = parser.parse_args()
+    kept = {} if asked.what == "write" else json.loads(HASHES.read_text(encoding="utf-8"))
+    found: dict[str, str] = {}
+    for name, value in hashes(list(SEEDS)[: asked.seeds]):
+        found[name] = value
+        same = "written" if asked.what == "write" else "same" if kept.get(name) == value else "DIFFERS"
+        print(f"{name:20} {same}", file=sys.stderr, flush=True)
+    if asked.what == "write":
+        HASHES.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        return 0
+    differing = sorted(name for name, value in found.items() if kept.get(name) != value)
+    print(f"{len(found) - len(differing)} of {len(found)} are the same" + "".join(f"\n{name}" for name in differing))
+    return 1 if differing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
