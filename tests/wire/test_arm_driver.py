@@ -545,11 +545,11 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
 
         def promptly():
             # A busy machine answers late now and then.
-            return min((arm.latch_clock() for _ in range(4)), key=lambda latch: latch.bound)
+            latches = (arm.latch_clock() for _ in range(40))
+            return next(latch for latch in latches if latch.bound < 0.0015 * rate)
 
         try:
             prompt = promptly()
-            assert prompt.bound < 0.0015 * rate
             bench.ask("late_states")
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
             late = arm.latch_clock()
@@ -559,7 +559,7 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             assert 0.04 * rate < error < late.bound + prompt.bound + 0.004 * rate
             bench.ask("clear")
             assert soon(lambda: lateness(arm, prompt) < 0.03 * rate)
-            assert promptly().bound < 0.0015 * rate
+            promptly()
         finally:
             arm.close()
 
