@@ -40,7 +40,8 @@ def classify(error: BaseException, following: Following | None = None) -> Failur
         failure = replace(failure, reason="; ".join([failure.reason, *notes]))
     unheard = isinstance(error, DeadlineError | NotConnectedError) or failure.code in UNHEARD
     if unheard and (late := LATENESS.worst) > MOST_S and BUSY not in failure.reason:
-        failure = replace(failure, reason=f"{failure.reason} {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late.")
+        said = failure.reason.rstrip(".")
+        failure = replace(failure, reason=f"{said}. {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late.")
     if not failure.needs_person or following is None:
         return failure
     names = ", ".join(following.simulated)
