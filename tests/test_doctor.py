@@ -15,7 +15,7 @@ from cell.cli.app import app
 from cell.config import DEVICES, default_toml, load_config
 from cell.doctor import computer
 from cell.doctor.links import can_check, link_checks
-from cell.doctor.packages import package_checks
+from cell.doctor.packages import OWN, package_checks, shadow_check
 from drivers.vehicle.can_interface import CanInterface
 
 
@@ -32,6 +32,15 @@ def test_packages_are_held_against_the_pins() -> None:
     assert (rows[1].state, rows[1].found) == ("wrong", "canopen is not installed")
     # What this cell does without is told, and is not wrong.
     assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'pye57>=0.4.13'")
+
+
+def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:
+    ours = {name: ["assembly-cell", "assembly-cell"] for name in OWN}
+    assert shadow_check(lambda: ours).state == "ok"
+    row = shadow_check(lambda: {**ours, "statemachine": ["assembly-cell", "python-statemachine"]})
+    assert (row.state, row.mend) == ("wrong", "pip uninstall python-statemachine; pip install -e .")
+    assert row.found.startswith("python-statemachine installs a package statemachine as well")
+    assert shadow_check(lambda: ours, tmp_path).found.startswith("cell is imported from ")
 
 
 def test_a_port_and_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

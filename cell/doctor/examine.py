@@ -17,7 +17,7 @@ from cell.doctor.computer import (
     scheduling_check,
 )
 from cell.doctor.links import link_checks
-from cell.doctor.packages import package_checks
+from cell.doctor.packages import package_checks, shadow_check
 from drivers.errors import ConfigError
 
 EXTRA_OF_DRIVER = {"canopen": "canopen"}
@@ -41,6 +41,7 @@ def examine_computer(path: Path | None, root: Path = ROOT) -> list[Check]:
     real = [name for name in DEVICES if name not in simulated]
     needed = set() if config is None else {EXTRA_OF_DRIVER.get(config.device(name).driver, "") for name in real} - {""}
     rows += [python_check(), *package_checks(sorted(needed), [name for name in OTHER_EXTRAS if name not in needed])]
+    rows.append(shadow_check())
     rows.append(disk_check(runs_folder(source) if source is not None else beside(source) / "runs"))
     rows += [
         date_check(clock_synchronised(), bool(real)),

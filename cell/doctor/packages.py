@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable
-from importlib.metadata import PackageNotFoundError, requires, version
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.util import find_spec
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -14,6 +15,30 @@ from cell.version import DISTRIBUTION
 
 ALWAYS = ""
 """The name of what is asked for without an extra."""
+
+OWN = ("cell", "drivers", "statemachine", "sim_backends")
+"""The top-level packages of this program. Python knows one package by a name, whoever installed it."""
+
+
+def shadow_check(
+    installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[2]
+) -> Check:
+    """Whether another distribution or another folder has a package of the same name as one of ours.
+
+    `installed` gives the distributions by package; `root` is the folder that holds our packages.
+    """
+    by_name = installed()
+    others = {name: sorted(set(by_name.get(name, ())) - {DISTRIBUTION}) for name in OWN}
+    for name, distributions in others.items():
+        if distributions:
+            problem = f"{' and '.join(distributions)} installs a package {name} as well, and one hides the other"
+            return judged("package names", problem, "", f"pip uninstall {' '.join(distributions)}; pip install -e .")
+    for name in OWN:
+        spec = find_spec(name)
+        if spec is not None and spec.origin and Path(spec.origin).parents[1] != root:
+            problem = f"{name} is imported from {spec.origin}, not from {root}"
+            return judged("package names", problem, "", "start Python in another folder, or unset PYTHONPATH")
+    return Check("package names", "ok", f"{', '.join(OWN)} are this program's")
 
 
 def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
