@@ -9,7 +9,8 @@ from pathlib import Path
 
 from drivers.errors import ConfigError
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+from cell.calibration.recorded.texts import PICTURES
+
 TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz", ".pos")
 OTHERS = {
     (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz"): "an archive: unpack it",

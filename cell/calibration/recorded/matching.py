@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.calibration.recorded.listing import PICTURES, TEXTS
+from cell.calibration.recorded.listing import TEXTS
+from cell.calibration.recorded.texts import PICTURES
 
 # Words that say what is in a file and not which frame it is of.
 ROLES = (
