@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.frames import RecordedFrame
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
 from cell.vision.stripe.extract import StripeProfile

@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.command import calibrate_folder
 from cell.calibration.recorded.conventions import TRIED, check_reading
-from cell.calibration.recorded.folder import RecordedFrame, read_frames
-from cell.calibration.recorded.listing import list_folder
-from cell.calibration.recorded.series import in_order_of_views, match_series, read_series
+from cell.calibration.recorded.frames import RecordedFrame, read_frames
+from cell.calibration.recorded.series import in_order_of_views, list_folder, match_series, read_series
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
