@@ -105,12 +105,16 @@ def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
 
 
 def read_frames(
-    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (), laser: Laser | None = Laser.AUTO
+    listing: Listing,
+    spec: BoardSpec,
+    links: Sequence[dict[str, str]] = (),
+    laser: Laser | None = Laser.AUTO,
+    quick: bool = False,
 ) -> tuple[list[RecordedFrame], Channel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError where there
-    are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe; a `quick` search for boards is
+    for a plan. Raises ConfigError where there are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
@@ -122,7 +126,7 @@ def read_frames(
         try:
             image = read_picture(frame.path)
             small[-1] = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-            frame.view = find_board(image, spec)
+            frame.view = find_board(image, spec, quick=quick)
         except PictureRefused as refused:
             frame.refuse(refused.reason, str(refused))
         except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
