@@ -16,20 +16,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.calibration.observations import ScanObservation
+from cell.calibration.recorded import result as form
 from cell.calibration.recorded.frames import RecordedFrame
-from cell.calibration.recorded.result import (
-    all_finite,
-    camera_dict,
-    closed_form_dict,
-    finite,
-    flatness_dict,
-    hand_eye_dict,
-    intrinsics_dict,
-    normal_dict,
-    plane_dict,
-    seen_depths,
-    setup_note,
-)
 from cell.calibration.solve.adjustment import Adjustment
 from cell.calibration.solve.blocks import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
 from cell.calibration.solve.board_shape import moved_by_bend
@@ -256,23 +244,23 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
     apart = [b.translation - state.base_from_board.translation for b in boards]
     turns = [pin.log3(b.rotation @ state.base_from_board.rotation.T) for b in boards]
     scatter = [float(np.sqrt(np.mean(np.sum(np.square(off), axis=1)))) for off in (apart, turns)]
-    result["intrinsics"] = intrinsics_dict(chain.pictures)
+    result["intrinsics"] = form.intrinsics_dict(chain.pictures)
     if best.camera_free:
         result["intrinsics"] = {
-            **camera_dict(state.camera, sigma[CAMERA]),
+            **form.camera_dict(state.camera, sigma[CAMERA]),
             "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
             "held_out_rms_px": math.sqrt(2) * best.left.figures["dots_px"],
             "lens": pictures.model.name,
             "method": best.name,
         }
     result["hand_eye"] = {
-        **hand_eye_dict(chain.setup, best.name, state.flange_from_camera, (scatter[0], scatter[1]), sigma[HAND]),
+        **form.hand_eye_dict(chain.setup, best.name, state.flange_from_camera, (scatter[0], scatter[1]), sigma[HAND]),
         "formal_sigma_mm": (1e3 * best.formal[HAND][:3]).tolist() if best.joint else None,
-        "left_out": all_finite(best.left.figures),
+        "left_out": form.all_finite(best.left.figures),
         "frames": len(chain.observations),
         "closed_form": {
-            **closed_form_dict(chain.setup, staged.hand_eye),
-            "left_out": all_finite(choice.closed.left.figures),
+            **form.closed_form_dict(chain.setup, staged.hand_eye),
+            "left_out": form.all_finite(choice.closed.left.figures),
         },
     }
     result["noise"] = {
@@ -282,24 +270,24 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         "arm_weight_mm": 1e3 * adjusted.priors.arm_translation if best.joint else None,
         "tried": [
             {"solution": s.name, "arm_weight_mm": 1e3 * s.adjusted.priors.arm_translation if s.joint else None}
-            | {"left_out_mm": finite(s.figure()), **all_finite(s.left.figures)}
+            | {"left_out_mm": form.finite(s.figure()), **form.all_finite(s.left.figures)}
             for s in choice.tried
         ],
-        "chi2_per_dof": finite(adjusted.chi2_per_dof),
+        "chi2_per_dof": form.finite(adjusted.chi2_per_dof),
     }
-    result["notes"] += setup_note(chain.setup, state.flange_from_camera)
+    result["notes"] += form.setup_note(chain.setup, state.flange_from_camera)
     result["notes"] += [f"{names[k]}: {text} Its stripe is not used." for k, text in chain.stripes.items()]
     if state.plane is None or staged.plane is None:
         result["notes"].append(f"no light plane: {chain.no_plane}")
         return
-    depths = seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
-    checked = None if staged.paper is None else finite(1e3 * staged.paper.cross_ratio_m)
+    depths = form.seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
+    checked = None if staged.paper is None else form.finite(1e3 * staged.paper.cross_ratio_m)
     result["light_plane"] = {
-        **plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths),
+        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
-        "staged": {**normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
+        "staged": {**form.normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
     }
     result["stripe_points"] = {n: len(r) for n, r in zip(names, staged.plane.rows, strict=True)}
-    if (whole := flatness_dict(flat, names)) is not None:
-        more = {"leave_one_out": flatness_dict(left_out, names), "staged": flatness_dict(flat_staged, names)}
+    if (whole := form.flatness_dict(flat, names)) is not None:
+        more = {"leave_one_out": form.flatness_dict(left_out, names), "staged": form.flatness_dict(flat_staged, names)}
         result["flatness"] = {**whole, "frame": "base" if chain.setup == "eye_in_hand" else "flange", **more}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,7 @@ MATRICES = ("camera_matrix", "K", "mtx", "intrinsic_matrix")
 LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion")
 NEXT = "calibrate the camera with OpenCV's plain model (plumb_bob), or leave --camera out: the pictures then tell it"
 MODELS = ("distortion_model", "camera_model", "model")
-BROWN = ("plumb_bob", "radtan", "brown", "brown_conrady", "opencv", "pinhole", "none", "perspective")
-BROWN += ("rational_polynomial",)
+BROWN = re.compile("plumb_bob|radtan|brown(_conrady)?|opencv|pinhole|none|perspective|rational_polynomial")
 """Names of the lens model with k1, k2, p1, p2 and k3; the rational one is that while its further terms are 0."""
 FURTHER_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 LEAST_TERMS = 4
@@ -75,8 +75,8 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
     """The camera of a map. Raises ConfigError for another lens, whose numbers would be read as Brown's."""
     width, height = (int(data[_key(data, names)]) for names in (("width", "image_width"), ("height", "image_height")))
     for name in MODELS:
-        if name in data and str(data[name]).lower().replace("-", "_") not in BROWN:
-            raise ConfigError(f"{name} is {data[name]}, read can be {' and '.join(BROWN[:2])}; {NEXT}")
+        if name in data and not BROWN.fullmatch(str(data[name]).lower().replace("-", "_")):
+            raise ConfigError(f"{name} is {data[name]}, read can be plumb_bob and radtan; {NEXT}")
     if "fx" in data:
         values = [float(data.get(name, 0.0)) if name[0] in "kp" else float(data[name]) for name in PARAMETER_NAMES]
         further = {name: float(data[name]) for name in FURTHER_TERMS if name in data}

@@ -114,8 +114,9 @@ def grow(
         if not ways:
             continue
         reach = TOLERANCE * min(math.hypot(*own[0]), math.hypot(*own[1]))
-        distances, blobs = tree.query([(x + sign * own[axis][0], y + sign * own[axis][1]) for axis, sign in ways])
-        for (axis, sign), distance, blob in zip(ways, distances.tolist(), blobs.tolist(), strict=True):
+        guesses = np.array([(x + sign * own[axis][0], y + sign * own[axis][1]) for axis, sign in ways])
+        near = [np.asarray(part).tolist() for part in tree.query(guesses)]
+        for (axis, sign), distance, blob in zip(ways, *near, strict=True):
             if distance > reach or blob in steps or not alike(here, blob):
                 continue
             there = points[blob]
