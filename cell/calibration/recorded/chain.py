@@ -149,9 +149,8 @@ def _placed(
     """Camera on the flange or before it, whichever leaves the board scattered less, without the stripe."""
     best: tuple[str, list[ScanObservation], Staged] | None = None
     for setup in ("eye_in_hand", "eye_to_hand") if known is None else (known,):
-        poses = [f.base_from_flange for f in frames]
-        if setup == "eye_to_hand":
-            poses = [pose.inverse() for pose in poses]
+        told = [f.base_from_flange for f in frames if f.base_from_flange is not None]
+        poses = told if setup == "eye_in_hand" else [pose.inverse() for pose in told]
         seen = [ScanObservation(f.view, f.profile, p, 0.0, f.name) for f, p in zip(frames, poses, strict=True)]
         staged = solve_staged(seen, stripe=False, camera=pictures.camera)
         if best is None or staged.hand_eye.scatter_m < 0.5 * best[2].hand_eye.scatter_m:
@@ -160,7 +159,8 @@ def _placed(
     return best
 
 
-Profiles, Rows = Sequence[StripeProfile | None], Sequence[NDArray[np.intp]]
+Profiles = Sequence[StripeProfile | None]
+Rows = Sequence[NDArray[np.intp]]
 
 
 def of_one_plane(
