@@ -559,6 +559,16 @@ def test_pictures_that_a_program_drew_into_are_set_aside_by_their_pixels(tmp_pat
     }
 
 
+def test_pictures_without_colour_are_not_compared_in_full(tmp_path, pictures, monkeypatch):
+    """Dark ones look alike when small; to compare each two of them took most of a plan's time."""
+    image = cv2.imread(str(pictures / "frame04.png"), cv2.IMREAD_GRAYSCALE)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.roll(image // 2, 3 * k, axis=1))
+    monkeypatch.setattr(recorded_frames, "_drawn_into", lambda *_: pytest.fail("compared in full"))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
+    assert [f.reason for f in frames] == [None] * 3
+
+
 def test_poses_that_name_no_picture_belong_to_those_that_are_left(tmp_path, pictures):
     """Cropped copies lie beside the pictures: they take no pose."""
     (tmp_path / "poses.txt").write_text("\n".join(row([*p[:3, 3], *quaternion(p)]) for p in POSES[:5]))

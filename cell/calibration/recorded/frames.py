@@ -163,6 +163,7 @@ def _set_copies_aside(frames: Sequence[RecordedFrame], small: Sequence[Small | N
     Corners, axes and markers are found by their pixels. What a straightened copy shows differs everywhere a little:
     there its name has to say it, too.
     """
+    coloured: dict[str, bool] = {}
     for frame, mine in zip(frames, small, strict=True):
         for other, its in zip(frames, small, strict=True):
             if other is frame or mine is None or its is None or frame.reason is Reason.DUPLICATE or other.shows:
@@ -171,12 +172,30 @@ def _set_copies_aside(frames: Sequence[RecordedFrame], small: Sequence[Small | N
                 continue
             if STRAIGHTENED.search(frame.name) and not STRAIGHTENED.search(other.name):
                 text = f"by its name it is {other.name}, straightened"
-            elif not frame.lit and _drawn_into(frame, other):
+            elif not frame.lit and _has_colour(frame, coloured) and _drawn_into(frame, other):
                 text = f"it is {other.name} with lines drawn into it"
             else:
                 continue
             frame.shows = other
             frame.refuse(Reason.DUPLICATE, text)
+
+
+def _has_colour(frame: RecordedFrame, known: dict[str, bool]) -> bool:
+    """True where lines in pure colours may be in the picture; each is read once."""
+    if frame.name not in known:
+        try:
+            image = read_colours(frame.path)
+            known[frame.name] = image.ndim == 3 and bool((_spread(_coloured(image)) > COLOURED_DN).any())
+        except PictureRefused:
+            known[frame.name] = False
+    return known[frame.name]
+
+
+def _spread(image: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """How far the colours (h, w, 3) of a pixel are apart, in DN."""
+    red, green, blue = cv2.split(image)
+    wide = cv2.subtract(cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue))
+    return np.asarray(wide, dtype=np.int16)
 
 
 def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
@@ -187,12 +206,12 @@ def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
         return False
     if drawn.shape != plain.shape:
         return False
-    apart = cv2.absdiff(drawn, plain).max(axis=2)
+    off = cv2.split(cv2.absdiff(drawn, plain))
+    apart = np.asarray(cv2.max(cv2.max(off[0], off[1]), off[2]), dtype=np.uint8)
     changed = apart > CHANGED_DN
     if not 0 < changed.mean() < LARGEST_SHARE or np.median(apart) > SAME_DN:
         return False
-    more = np.ptp(drawn.astype(np.int16), axis=2) - np.ptp(plain.astype(np.int16), axis=2)
-    lines = changed & (more > COLOURED_DN)
+    lines = changed & (_spread(drawn) - _spread(plain) > COLOURED_DN)
     thick = cv2.erode(changed.astype(np.uint8), np.ones((max(5, drawn.shape[1] // THICK),) * 2, np.uint8))
     if lines.sum() < COLOURED_SHARE * changed.sum() or thick.sum() > 0.1 * changed.sum():
         return False
