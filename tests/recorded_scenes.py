@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pinocchio as pin
+import pytest
 
-from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.frames import RecordedFrame
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
 from cell.vision.stripe.extract import StripeProfile
@@ -22,6 +24,15 @@ SECOND_NORMAL, SECOND_FURTHER = cv2.Rodrigues(np.array([0.0, 0.15, 0.0]))[0] @ N
 BOARD = parse_board("chessboard:7x6:18mm")
 EDGE = 5
 DOTS_PX, STRIPE_PX = 0.08, 0.15
+RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def recording(name: str) -> Path:
+    """A folder of the recorded data; the test is skipped without them."""
+    folder = RECORDED / name
+    if not folder.is_dir():
+        pytest.skip(f"recorded data are missing: {folder} (set CELL_RECORDED_DATA)")
+    return folder
 
 
 def pose(turn: tuple[float, float, float], place: tuple[float, float, float]) -> pin.SE3:

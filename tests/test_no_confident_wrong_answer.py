@@ -14,7 +14,7 @@ import pinocchio as pin
 import pytest
 
 from cell.calibration.observations import ScanObservation
-from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.frames import RecordedFrame
 from cell.calibration.recorded.result import empty_result
 from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
 from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask

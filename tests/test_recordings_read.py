@@ -6,6 +6,7 @@ The pictures are warped by OpenCV, the poses written by numpy and scipy: neither
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,15 +15,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cell.calibration.recorded import frames as recorded_frames
 from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.command import calibrate_folder
 from cell.calibration.recorded.conventions import TRIED, check_reading
-from cell.calibration.recorded.folder import RecordedFrame, read_frames
-from cell.calibration.recorded.listing import list_folder
-from cell.calibration.recorded.series import in_order_of_views, match_series, read_series
+from cell.calibration.recorded.frames import RecordedFrame, read_frames
+from cell.calibration.recorded.series import in_order_of_views, list_folder, match_series, read_series
 from cell.calibration.recorded.solution import agreeing
 from cell.geometry.camera import CameraModel
 from cell.vision import Laser, parse_board, read_colours
+from cell.vision.board.board import find_board
 from cell.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
@@ -102,13 +104,19 @@ def recording(tmp_path, pictures) -> Path:
     return tmp_path
 
 
-def understand(folder: Path, seen: dict[str, RecordedFrame], **said: str):
-    """Frames with their poses as the product understands them, what it says about them, and what it did not read."""
+def matched(folder: Path):
+    """The listing, the series of its pictures, and the links and what was not read of a folder."""
     listing = list_folder(folder)
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
+    return listing, belonging, links, [*listing.unread, *unread, *strange]
+
+
+def understand(folder: Path, seen: dict[str, RecordedFrame], **said: str):
+    """Frames with their poses as the product understands them, what it says about them, and what it did not read."""
+    listing, belonging, _, unread = matched(folder)
     frames = [RecordedFrame(p, listing.name(p), seen[p.name].view) for p in listing.pictures]
-    return frames, attach_poses(frames, belonging, CAMERA, Options(**said)), [*listing.unread, *unread, *strange]
+    return frames, attach_poses(frames, belonging, CAMERA, Options(**said)), unread
 
 
 def quaternion(pose: np.ndarray, order: str = "xyzw") -> list[float]:
@@ -124,31 +132,21 @@ def one_file_each(folder: Path, text: Callable[[np.ndarray], str], name: str = "
 
 
 def row(values, separator: str = " ") -> str:
-    return separator.join(f"{v:.9f}" for v in values)
+    return separator.join(f"{v:.9f}" for v in np.ravel(values))
 
 
-def angles(pose: np.ndarray, kind: str, degrees: bool = True) -> np.ndarray:
+def angles(pose: np.ndarray, kind: str = "rotvec", degrees: bool = False) -> np.ndarray:
     rotation = Rotation.from_matrix(pose[:3, :3])
-    return np.degrees(rotation.as_rotvec()) if kind == "rotvec" else rotation.as_euler(kind, degrees=degrees)
+    return rotation.as_rotvec() if kind == "rotvec" else rotation.as_euler(kind, degrees=degrees)
 
 
 def tuples(folder: Path) -> None:
     one_file_each(folder, lambda p: str((tuple(p[:3, 3]), tuple(quaternion(p)))))
 
 
-def wxyz_in_mm_with_names(folder: Path) -> None:
-    rows = [f"frame{k + 3:02d}.png,{row([*1e3 * p[:3, 3], *quaternion(p, 'wxyz')], ',')}" for k, p in enumerate(POSES)]
-    (folder / "robot.csv").write_text("image,a1,a2,a3,a4,a5,a6,a7\n" + "\n".join(rows))
-
-
-def named_columns_in_another_order(folder: Path) -> None:
-    rows = [row([k + 3, *quaternion(p, "wxyz"), *p[:3, 3]], ";") for k, p in enumerate(POSES)]
-    (folder / "robot.csv").write_text("frame;qw;qx;qy;qz;x;y;z\n" + "\n".join(reversed(rows)))
-
-
-def decimal_commas_with_bom_and_crlf(folder: Path) -> None:
-    rows = [row([*1e3 * p[:3, 3], *angles(p, "ZYX")], ";").replace(".", ",") for p in POSES]
-    (folder / "Stützpunkte.csv").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
+def of_each(text: Callable[[int, np.ndarray], str], between: str = "\n") -> str:
+    """The text of each pose with the number of its picture."""
+    return between.join(text(k + 3, p) for k, p in enumerate(POSES))
 
 
 def yaml_in_a_sub_folder(folder: Path) -> None:
@@ -160,132 +158,123 @@ def yaml_in_a_sub_folder(folder: Path) -> None:
     one_file_each(folder, text, "poses/{:d}.yaml")
 
 
-def json_list(folder: Path) -> None:
-    entries = [
-        {"image": f"frame{k + 3:02d}.png", "robot": p.tolist(), "joints": [0.1] * 6} for k, p in enumerate(POSES)
-    ]
-    (folder / "data.json").write_text(json.dumps(entries[::-1]))
-
-
-def opencv_yaml(folder: Path) -> None:
-    parts = [
-        f"pose{k + 3}: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [ {row(p[:3].ravel(), ', ')} ]"
-        for k, p in enumerate(POSES)
-    ]
-    (folder / "robot.yml").write_text("%YAML:1.0\n---\n" + "\n".join(parts) + "\n")
-
-
 def numpy_stack_by_columns(folder: Path) -> None:
     np.save(folder / "poses.npy", np.array([p.T for p in POSES]))
 
 
-def times_before_rotation_vectors(folder: Path) -> None:
-    rows = [
-        row([1.7e9 + 3.7 * k, *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()]) for k, p in enumerate(POSES)
-    ]
-    (folder / "poses.txt").write_text("\n".join(rows))
-
-
-def titles_above_rotation_and_position(folder: Path) -> None:
-    turns = [Rotation.from_matrix(p[:3, :3]).as_rotvec().tolist() for p in POSES]
-    blocks = [
-        f"{k + 3}:\nRotation:\n{turn}\nTranslation:\n{p[:3, 3].tolist()}\n"
-        for k, (p, turn) in enumerate(zip(POSES, turns, strict=True))
-    ]
-    (folder / "info.txt").write_text("\n".join(blocks))
-
-
-def program_of_the_arm(folder: Path) -> None:
-    turns = [Rotation.from_matrix(p[:3, :3]).as_rotvec() for p in POSES]
-    moves = [
-        f"  movel(p[{row(np.r_[p[:3, 3], turn], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)"
-        for p, turn in zip(POSES, turns, strict=True)
-    ]
-    start = "def photographs():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movej([0.1, -1.5, 1.5, -1.5, -1.5, 0])\n"
-    (folder / "photographs.script").write_text(start + "\n".join(moves) + "\nend\n")
-
-
 def halves_in_one_file(folder: Path) -> None:
     """As OpenCV's hand-eye solvers take them, with what they are to give beside."""
-    np.savez(
-        folder / "calib.npz",
-        R_gripper2base=np.array([p[:3, :3] for p in POSES]),
-        t_gripper2base=np.array([p[:3, 3:] for p in POSES]),
-        camera_matrix=CAMERA.matrix,
-    )
+    turns, places = np.array([p[:3, :3] for p in POSES]), np.array([p[:3, 3:] for p in POSES])
+    np.savez(folder / "calib.npz", R_gripper2base=turns, t_gripper2base=places, camera_matrix=CAMERA.matrix)
 
 
-def opencv_xml(folder: Path) -> None:
-    parts = [
-        f'<pose_{k + 3} type_id="opencv-matrix"><rows>4</rows><cols>4</cols><dt>d</dt><data>\n{row(p.ravel())}</data>'
-        f"</pose_{k + 3}>"
-        for k, p in enumerate(POSES)
-    ]
-    text = '<?xml version="1.0"?>\n<opencv_storage>' + "\n".join(parts) + "</opencv_storage>"
-    (folder / "robot.xml").write_text(text)
+def joints_and_pose(k: int, p: np.ndarray) -> str:
+    joints = "".join(f"<joint{j}>{10 * j + k}.5</joint{j}>" for j in range(1, 7))
+    values = [*1e3 * p[:3, 3], *angles(p, "xyz")]
+    pose = "".join(f"<pose{j + 1}>{v:.9f}</pose{j + 1}>" for j, v in enumerate(values))
+    return f'<stop name="{11 - k}"><picture>./images/frame{k:02d}.png</picture>{joints}{pose}</stop>'
 
 
-def xml_with_joints_beside(folder: Path) -> None:
-    parts = []
-    for k, p in reversed(list(enumerate(POSES))):
-        joints = "".join(f"<joint{j}>{10 * j + k}.5</joint{j}>" for j in range(1, 7))
-        values = [*1e3 * p[:3, 3], *angles(p, "xyz", degrees=False)]
-        pose = "".join(f"<pose{j + 1}>{v:.9f}</pose{j + 1}>" for j, v in enumerate(values))
-        parts.append(f'<stop name="{k}"><picture>./images/frame{k + 3:02d}.png</picture>{joints}{pose}</stop>')
-    (folder / "robot.xml").write_text(f"<stops>{''.join(parts)}</stops>")
-
-
-JOINTS = np.random.default_rng(0).normal(0, 1.5, (len(POSES), 6))
-
-
-def as_the_arms_client_records_them(folder: Path) -> None:
-    names = [*(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(6))]
-    lines = [
-        row([100.0 + k, *JOINTS[k], *p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()])
-        for k, p in enumerate(POSES)
-    ]
-    (folder / "robot_data.csv").write_text("\n".join([" ".join(["timestamp", *names]), *lines]))
-
-
-def links_of_which_one_is_the_flange(folder: Path) -> None:
-    still = POSES[0]
-    frames = [
-        {
-            "image": f"frame{k + 3:02d}.png",
-            "tf": {f"link{j}": (p if j == 6 else still).tolist() for j in range(1, 7)},
-        }
-        for k, p in enumerate(POSES)
-    ]
-    (folder / "poses.json").write_text(json.dumps(frames))
-
-
+JOINTS = np.random.default_rng(0).normal(0, 1.5, (len(POSES) + 3, 6))
+NAMES = " ".join([*(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(6))])
+PROGRAM = "def photographs():\n  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  movej([0.1, -1.5, 1.5, -1.5, -1.5, 0])\n"
+LINKS = [
+    {"image": f"frame{k + 3:02d}.png", "tf": {f"link{j}": (p if j == 6 else POSES[0]).tolist() for j in range(1, 7)}}
+    for k, p in enumerate(POSES)
+]
+LIST = [{"image": f"frame{k + 3:02d}.png", "robot": p.tolist(), "joints": [0.1] * 6} for k, p in enumerate(POSES)]
+TEXTS = {
+    "wxyz in mm with names": (
+        "robot.csv",
+        "image,a1,a2,a3,a4,a5,a6,a7\n"
+        + of_each(lambda k, p: f"frame{k:02d}.png,{row([*1e3 * p[:3, 3], *quaternion(p, 'wxyz')], ',')}"),
+    ),
+    "named columns in another order": (
+        "robot.csv",
+        "frame;qw;qx;qy;qz;x;y;z\n"
+        + "\n".join(of_each(lambda k, p: row([k, *quaternion(p, "wxyz"), *p[:3, 3]], ";")).split("\n")[::-1]),
+    ),
+    "decimal commas with bom and crlf": (
+        "Stützpunkte.csv",
+        "\ufeff" + of_each(lambda k, p: row([*1e3 * p[:3, 3], *angles(p, "ZYX", True)], ";").replace(".", ","), "\r\n"),
+    ),
+    "json list": ("data.json", json.dumps(LIST[::-1])),
+    "links of which one is the flange": ("poses.json", json.dumps(LINKS)),
+    "opencv yaml": (
+        "robot.yml",
+        "%YAML:1.0\n---\n"
+        + of_each(
+            lambda k, p: (
+                f"pose{k}: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [ {row(p[:3], ', ')} ]\n"
+            )
+        ),
+    ),
+    "opencv xml": (
+        "robot.xml",
+        '<?xml version="1.0"?>\n<opencv_storage>'
+        + of_each(
+            lambda k, p: (
+                f'<pose_{k} type_id="opencv-matrix"><rows>4</rows><cols>4</cols><dt>d</dt><data>\n{row(p)}</data>'
+                f"</pose_{k}>"
+            )
+        )
+        + "</opencv_storage>",
+    ),
+    "xml with joints beside": ("robot.xml", f"<stops>{of_each(joints_and_pose)}</stops>"),
+    "times before rotation vectors": (
+        "poses.txt",
+        of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)])),
+    ),
+    "titles above rotation and position": (
+        "info.txt",
+        of_each(lambda k, p: f"{k}:\nRotation:\n{angles(p).tolist()}\nTranslation:\n{p[:3, 3].tolist()}\n"),
+    ),
+    "program of the arm": (
+        "photographs.script",
+        PROGRAM
+        + of_each(lambda k, p: f"  movel(p[{row([*p[:3, 3], *angles(p)], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)")
+        + "\nend\n",
+    ),
+    "as the arm's client records them": (
+        "robot_data.csv",
+        f"timestamp {NAMES}\n" + of_each(lambda k, p: row([100.0 + k, *JOINTS[k], *p[:3, 3], *angles(p)])),
+    ),
+}
 SPELLINGS = {
     halves_in_one_file: ("matrix-4x4", "m", "order"),
-    opencv_xml: ("matrix-4x4", "m", "name"),
-    xml_with_joints_beside: ("xyz+rpy-rad", "mm", "name"),
     tuples: ("xyz+quaternion-xyzw", "m", "name"),
-    wxyz_in_mm_with_names: ("xyz+quaternion-wxyz", "mm", "name"),
-    named_columns_in_another_order: ("xyz+quaternion-xyzw", "m", "number"),
-    decimal_commas_with_bom_and_crlf: ("xyz+abc-deg", "mm", "order"),
     yaml_in_a_sub_folder: ("xyz+quaternion-xyzw", "m", "name"),
-    json_list: ("matrix-4x4", "m", "name"),
-    opencv_yaml: ("matrix-4x4", "m", "name"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
-    program_of_the_arm: ("xyz+rotvec-rad", "m", "order"),
-    times_before_rotation_vectors: ("xyz+rotvec-rad", "m", "order"),
-    titles_above_rotation_and_position: ("xyz+rotvec-rad", "m", "name"),
-    as_the_arms_client_records_them: ("xyz+rotvec-rad", "m", "order"),
-    links_of_which_one_is_the_flange: ("matrix-4x4", "m", "name"),
+    "opencv xml": ("matrix-4x4", "m", "name"),
+    "xml with joints beside": ("xyz+rpy-rad", "mm", "name"),
+    "wxyz in mm with names": ("xyz+quaternion-wxyz", "mm", "name"),
+    "named columns in another order": ("xyz+quaternion-xyzw", "m", "number"),
+    "decimal commas with bom and crlf": ("xyz+abc-deg", "mm", "order"),
+    "json list": ("matrix-4x4", "m", "name"),
+    "opencv yaml": ("matrix-4x4", "m", "name"),
+    "program of the arm": ("xyz+rotvec-rad", "m", "order"),
+    "times before rotation vectors": ("xyz+rotvec-rad", "m", "order"),
+    "titles above rotation and position": ("xyz+rotvec-rad", "m", "name"),
+    "as the arm's client records them": ("xyz+rotvec-rad", "m", "order"),
+    "links of which one is the flange": ("matrix-4x4", "m", "name"),
 }
 
 
-@pytest.mark.parametrize("write", SPELLINGS, ids=lambda w: w.__name__)
-def test_poses_are_read_as_they_were_meant(recording, seen, write):
-    write(recording)
+def write(folder: Path, spelling: str | Callable[[Path], None]) -> None:
+    if isinstance(spelling, str):
+        name, text = TEXTS[spelling]
+        (folder / name).write_bytes(text.encode())
+    else:
+        spelling(folder)
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS, ids=lambda w: w if isinstance(w, str) else w.__name__)
+def test_poses_are_read_as_they_were_meant(recording, seen, spelling):
+    write(recording, spelling)
     frames, understood, unread = understand(recording, seen)
     assert understood.notes == [], unread
     about = understood.about
-    assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[write]
+    assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[spelling]
     assert about["setup"] == "eye_in_hand"
     assert about["turn_deg"] < 0.1
     assert about["shift_mm"] < 0.5
@@ -331,9 +320,7 @@ def test_a_folder_for_each_pose_is_read(tmp_path, pictures, seen):
         folder.mkdir()
         (folder / "image.png").symlink_to(path)
         (folder / "data.json").write_text(json.dumps({"stamp": k, "robot": [*pose[:3, 3], *quaternion(pose)]}))
-    listing = list_folder(tmp_path)
-    series, links, _ = read_series(listing)
-    belonging, _ = match_series(series, listing, links)
+    listing, belonging, _, _ = matched(tmp_path)
     views = [seen[path.name].view for path in sorted(pictures.iterdir())]
     frames = [RecordedFrame(p, listing.name(p), v) for p, v in zip(listing.pictures, views, strict=True)]
     assert attach_poses(frames, belonging, CAMERA, Options()).about["matched_by"] == "folder"
@@ -426,6 +413,33 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
 
 
+def test_a_plan_searches_quickly_for_the_same_boards(pictures, seen):
+    listing, took, found = list_folder(pictures), [], []
+    for quick in (False, True):
+        begun = time.process_time()
+        found.append(read_frames(listing, BOARD, laser=None, quick=quick)[0])
+        took.append(time.process_time() - begun)
+    for fine, rough in zip(*found, strict=True):
+        assert np.array_equal(fine.view.ids, rough.view.ids)
+        assert 0 < np.abs(fine.view.pixels - rough.view.pixels).max() < 0.5
+    assert took[1] < 0.9 * took[0]
+
+
+def test_a_plan_is_made_by_the_quick_search(recording, monkeypatch):
+    tuples(recording)
+    asked: list[bool] = []
+
+    def find(image, spec, quick):
+        asked.append(quick)
+        return find_board(image, spec, quick=quick)
+
+    monkeypatch.setattr(recorded_frames, "find_board", find)
+    plan = calibrate_folder(recording, BOARD, Options(plan=True))
+    assert asked == [True] * len(POSES)
+    assert (plan["poses"]["reading"], plan["intrinsics"]) == ("xyz+quaternion-xyzw", None)
+    assert plan["poses"]["turn_deg"] < 0.2
+
+
 def test_without_a_board_the_folders_with_pictures_are_named(tmp_path, pictures):
     (tmp_path / "left").symlink_to(pictures)
     with pytest.raises(ConfigError, match=r"8 pictures with --board.*pictures are in left \(8\)"):
@@ -490,15 +504,11 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
         for path in pictures.iterdir():
             (tmp_path / session / path.name).symlink_to(path)
         tuples(tmp_path / session)
-    listing = list_folder(tmp_path)
-    series, links, _ = read_series(listing)
     with pytest.raises(ConfigError, match="monday, tuesday"):
-        match_series(series, listing, links)
+        matched(tmp_path)
     for path in (tmp_path / "monday").iterdir():
         path.rename(tmp_path / path.name)
-    listing = list_folder(tmp_path)
-    series, links, _ = read_series(listing)
-    (own,), _ = match_series(series, listing, links)
+    listing, (own,), _, _ = matched(tmp_path)
     assert len(own.of) == len(listing.pictures) == len(POSES)
     assert ("tuesday/", "a recording of its own: name it with --from") in listing.unread
 
@@ -506,8 +516,8 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
 @pytest.mark.parametrize("seed", range(4))
 def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
     rng = np.random.default_rng(seed)
-    for write in SPELLINGS:
-        write(recording)
+    for spelling in SPELLINGS:
+        write(recording, spelling)
     for path in [p for p in recording.rglob("*") if p.suffix in (".txt", ".csv", ".yaml", ".yml", ".json")]:
         data = bytearray(path.read_bytes())
         for at in rng.integers(0, len(data), 3):
@@ -549,6 +559,16 @@ def test_pictures_that_a_program_drew_into_are_set_aside_by_their_pixels(tmp_pat
     }
 
 
+def test_pictures_without_colour_are_not_compared_in_full(tmp_path, pictures, monkeypatch):
+    """Dark ones look alike when small; to compare each two of them took most of a plan's time."""
+    image = cv2.imread(str(pictures / "frame04.png"), cv2.IMREAD_GRAYSCALE)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.roll(image // 2, 3 * k, axis=1))
+    monkeypatch.setattr(recorded_frames, "_drawn_into", lambda *_: pytest.fail("compared in full"))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
+    assert [f.reason for f in frames] == [None] * 3
+
+
 def test_poses_that_name_no_picture_belong_to_those_that_are_left(tmp_path, pictures):
     """Cropped copies lie beside the pictures: they take no pose."""
     (tmp_path / "poses.txt").write_text("\n".join(row([*p[:3, 3], *quaternion(p)]) for p in POSES[:5]))
@@ -557,7 +577,7 @@ def test_poses_that_name_no_picture_belong_to_those_that_are_left(tmp_path, pict
         cv2.imwrite(str(tmp_path / f"Calibrated{k}.png"), cv2.imread(str(path), 0)[6:-6, 8:-8])
     listing = list_folder(tmp_path)
     (poses,), _, _ = read_series(listing)
-    assert match_series([poses], listing, [])[0] == []
+    assert matched(tmp_path)[1] == []
     frames, _ = read_frames(listing, BOARD, laser=None)
     assert in_order_of_views(poses, frames)
     assert attach_poses(frames, [poses], CAMERA, Options()).about["turn_deg"] < 0.1
@@ -578,10 +598,9 @@ def test_a_copy_under_another_number_counts_once_and_with_another_pose_it_is_ref
     (recording / "frame13.png").symlink_to(recording / "frame05.png")
     rows = [row(p.ravel()) for p in [*POSES, POSES[0], POSES[1], POSES[7]]]
     (recording / "poses.txt").write_text("\n".join(rows))
-    listing = list_folder(recording)
-    series, links, _ = read_series(listing)
+    listing, belonging, links, _ = matched(recording)
     frames, _ = read_frames(listing, BOARD, links)
-    attach_poses(frames, match_series(series, listing, links)[0], CAMERA, Options())
+    attach_poses(frames, belonging, CAMERA, Options())
     assert [f.reason for f in frames[: len(POSES)]] == [None] * len(POSES)
     same, again, other = frames[len(POSES) :]
     assert (same.reason.value, same.text) == ("duplicate", "the same file as frame03.png")

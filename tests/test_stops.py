@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.recorded.decide import decide
-from cell.calibration.recorded.folder import RecordedFrame, read_pose_pairs
-from cell.calibration.recorded.pairs import calibrate_pairs
+from cell.calibration.recorded.agreement import decide
+from cell.calibration.recorded.frames import RecordedFrame
+from cell.calibration.recorded.pairs import calibrate_pairs, read_pose_pairs
 from cell.calibration.recorded.series import Series
 from cell.calibration.recorded.texts import Record
 from cell.calibration.solve.consistency import odd_turns

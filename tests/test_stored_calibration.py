@@ -241,6 +241,17 @@ def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path: Path) -> 
     assert found(tmp_path).identities == DEVICES
 
 
+def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
+    own = made()
+    save_calibration(own, tmp_path / "own.json")
+    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
+    edited(tmp_path / "copy.json", "scan", "flange_from_camera", 0, 3, value=0.001)
+    assert found(tmp_path).hash() == own.hash()
+    (note,) = found(tmp_path).scan.unread
+    assert "copy.json was changed after it was written: scan.flange_from_camera" in note
+    assert note in found(tmp_path).summary()["notes"]
+
+
 def test_one_without_its_digest_is_edited_and_one_from_before_is_read_with_a_note(tmp_path: Path) -> None:
     path, own = tmp_path / "own.json", made()
     path.write_text(json.dumps(own.as_dict()), encoding="utf-8")
@@ -248,6 +259,10 @@ def test_one_without_its_digest_is_edited_and_one_from_before_is_read_with_a_not
         found(tmp_path)
     path.write_text(json.dumps({**own.as_dict(), "format": 1}), encoding="utf-8")
     assert found(tmp_path).hash() == own.hash()
+    assert "before its file had a digest" in found(tmp_path).scan.unread[0]
+    # Stored again, by a verification for one, it is no better known than before.
+    save_calibration(replace(found(tmp_path), kinematics=""), path)
+    assert "sha256" not in json.loads(path.read_text())
     assert "before its file had a digest" in found(tmp_path).scan.unread[0]
     accept_calibration(path, "ann", "the one of last week")
     assert found(tmp_path).scan.unread == ()

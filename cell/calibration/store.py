@@ -50,6 +50,7 @@ class CellCalibration:
     `made` is in seconds since the epoch; `identities` are serial numbers by device name. `kinematics` names the arm's
     table with which the flange's poses were reckoned, as of `kinematics_name`; "" in files that do not say so.
     `edits` tell of each edit of its file that a person has accepted: `who`, `when`, `why` and `changed` (the parts).
+    One that is not `sealed` was read from a file without a digest: it is stored again without one.
     """
 
     scan: ScanCalibration
@@ -59,6 +60,7 @@ class CellCalibration:
     made: float
     kinematics: str = ""
     edits: tuple[dict[str, Any], ...] = ()
+    sealed: bool = True
 
     @classmethod
     def solve(
@@ -99,7 +101,7 @@ class CellCalibration:
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
         return {
-            "format": FORMAT,
+            "format": FORMAT if self.sealed else UNSEALED,
             "made": self.made,
             "date": self.date,
             "identities": self.identities,
@@ -221,9 +223,13 @@ def nominal_camera(config: CameraConfig) -> CameraModel:
 
 
 def save_calibration(calibration: CellCalibration, path: Path) -> None:
-    """Write it; a reader finds the old file or the new one, never half of one."""
+    """Write it; a reader finds the old file or the new one, never half of one.
+
+    A fresh digest would vouch for what nobody could check: one that was read without a digest gets none.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, sealed(calibration.as_dict(), parts=True))
+    content = calibration.as_dict()
+    write_json(path, sealed(content, parts=True) if calibration.sealed else content)
 
 
 def archive_of(folder: Path, calibration: CellCalibration) -> Path:
@@ -264,7 +270,7 @@ def accept_calibration(path: Path, who: str, why: str) -> CellCalibration:
         "why": why,
         "changed": list(changed) or ["it had no digest"],
     }
-    accepted = replace(made, edits=(*made.edits, edit))
+    accepted = replace(made, edits=(*made.edits, edit), sealed=True)
     save_calibration(accepted, path)
     return accepted
 
@@ -300,6 +306,7 @@ def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...], bool]:
                 }
                 for edit in data.get("edits", ())
             ),
+            stored.sealed,
         )
         require_valid(made)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:

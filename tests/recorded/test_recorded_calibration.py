@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,19 +12,12 @@ import pytest
 from cell.calibration.recorded.command import calibrate_folder
 from cell.vision import parse_board
 from drivers.errors import ConfigError
+from tests.recorded_scenes import recording
 
-RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 CHESS = parse_board("chessboard:7x6:10mm")
 RECORDED_FRAMES = range(2, 9)
 
 pytestmark = pytest.mark.recorded
-
-
-def recording(name: str) -> Path:
-    folder = RECORDED / name
-    if not folder.is_dir():
-        pytest.skip(f"recorded data are missing: {folder} (set CELL_RECORDED_DATA)")
-    return folder
 
 
 @pytest.fixture(scope="module")

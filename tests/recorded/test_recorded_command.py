@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-import os
 import re
 import shutil
 from pathlib import Path
@@ -18,17 +17,9 @@ from cell.cli.app import app
 from cell.cli.recorded_tables import verdicts
 from cell.vision import parse_board
 from drivers.errors import ConfigError
-
-RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from tests.recorded_scenes import recording
 
 pytestmark = pytest.mark.recorded
-
-
-def recording(name: str) -> Path:
-    folder = RECORDED / name
-    if not folder.is_dir():
-        pytest.skip(f"recorded data are missing: {folder} (set CELL_RECORDED_DATA)")
-    return folder
 
 
 def calibrate(folder: Path, *options: str):

@@ -1,4 +1,8 @@
-"""How well a reading of the poses agrees with the pictures: a closed-form hand-eye, and how the board scatters then."""
+"""Which reading of the recorded poses agrees with the pictures: conventions are tested, not assumed.
+
+Each reading gives flange poses; with the board as the camera sees it they give a closed-form hand-eye, and how far the
+board then scatters in the base tells how well they agree. A reading is taken when no other comes near it.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.conventions import Reading
+from cell.calibration.recorded.conventions import FORM, TRIED, Reading, readings_of, why_not
 from cell.calibration.recorded.series import Series
 from cell.calibration.solve.consistency import odd_turns, orders, turn_votes, weighted_median
 from cell.calibration.solve.hand_eye import park_martin
 from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
+from drivers.errors import RefusedError
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
-SETUPS = ("eye_in_hand", "eye_to_hand")
 # So many frames tell the readings apart; more cost time.
 MOST_FRAMES = 24
 REWEIGHTINGS = 25
@@ -27,6 +31,17 @@ SCALE_SIGMAS, SCALE_WRONG = 4.0, 0.4
 FAR_RATIO, FAR_SHARE = 10.0, 0.1
 # A camera so near to the base's origin, as a share of the board's distance, and so much along its axes is the base.
 OWN_SHARE, OWN_TURN = 0.05, 0.1
+# The next best reading must leave so many times as much, and the best no more than this (rad, and share of distance).
+CLEAR, AGREES = 2.5, 0.06
+# … or leave as much turn and so many times the shift, of at least this share of the distance: an inverse turns alike.
+AS_MUCH, CLEAR_SHIFT, LEAST_SHIFT = 0.95, 5.0, 0.002
+# The flange's way and the board's size may disagree by this share before it is said, and before it is refused …
+SCALE_NOTE, SCALE_REFUSED = 0.015, 0.05
+# … and where that other size leaves no more than this share of the scatter.
+SCALE_BETTER, SCALE_CLEARLY = 0.7, 0.35
+# Poses that were written with few digits, or in two files, are the same to this.
+SAME_RAD, SAME_M = 1e-3, 2e-4
+NAME_IT = f"another convention is named with --poses, as {FORM}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +80,11 @@ class Fit:
         return _axes(self.stands.rotation) and float(np.linalg.norm(self.stands.translation)) < self.reach / 2
 
     @property
+    def score_scaled(self) -> float:
+        """The score with lengths of any size."""
+        return self.turn + self.shift_scaled / self.reach
+
+    @property
     def text(self) -> str:
         """The reading in words."""
         return f"{self.reading.text} ({self.reading.name}), lengths in {self.unit}, {self.setup.replace('_', ' ')}"
@@ -75,50 +95,155 @@ class Fit:
         return f"{math.degrees(self.turn):.2f}° and {1e3 * self.shift:.1f} mm"
 
 
-def fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The reading taken, the next best that means something else, and series that hold the board's own poses."""
+
+    best: Fit
+    rival: Fit | None
+    boards_own: Sequence[str] = ()
+
+    @property
+    def evidence(self) -> str:
+        """Why this reading."""
+        said = f"leaves {self.best.left} of scatter (medians)"
+        if self.rival is None:
+            return f"{said}; no other reading of the numbers is possible"
+        return f"{said}; the next best, {self.rival.text}, leaves {self.rival.left}"
+
+
+def decide(
+    series: Sequence[Series],
+    boards: dict[int, list[pin.SE3]],
+    pitch: float,
+    wanted: str | None = None,
+    setup: str | None = None,
+) -> Decision:
+    """The reading of the series that agrees with the boards that frames (by index) saw, in each order they allow.
+
+    `pitch` of the board in m, as it was named. Raises RefusedError when none does, or when two do that mean different
+    things; its text names the option to give.
+    """
+    fits: list[Fit] = []
+    problems: list[str] = []
+    for one in series:
+        first = one.records[0]
+        for reading in readings_of(len(first.numbers), first.named, wanted):
+            try:
+                fits += _fits_of(one, reading, boards, setup)
+            except RefusedError as error:
+                problems.append(str(error))
+    fits.sort(key=lambda f: f.score)
+    own = {f.series.name: f for f in fits if f.boards_own and f.score_scaled < AGREES}
+    fits = [f for f in fits if f.series.name not in own]
+    if own and all(one.name in own for one in series):
+        fit = next(iter(own.values()))
+        turned = "" if fit.setup == "eye_to_hand" else ", or of the camera as the board sees it"
+        raise RefusedError(
+            f"the poses of {fit.series.name} are those of the board as the camera sees it{turned}, not of the flange: "
+            f"read as {fit.text} they put the camera {1e3 * float(np.linalg.norm(fit.hand.translation)):.1f} mm from "
+            "the origin and along its axes; give the poses that the arm's controller told"
+        )
+    if not fits:
+        first = series[0].records[0]
+        reason = (problems or [why_not(first.numbers, first.named, wanted)])[0]
+        raise RefusedError(f"the poses of {series[0].name} cannot be read: {reason}; {NAME_IT}")
+    best = fits[0]
+    if not best.score < AGREES:
+        sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
+        other = min(sized or fits, key=lambda f: f.score_scaled)
+        if sized and other.score_scaled < 0.5 * AGREES:
+            raise RefusedError(f"read as {other.text}, {scale_problem(other, pitch)[0]}")
+        raise RefusedError(
+            f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
+            "scatter; are they the poses of these pictures in this order, of the flange (and not joint angles), and is "
+            f"the board's pitch right? Tried were {', '.join(TRIED)}; {NAME_IT}"
+        )
+    rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
+    if rival is not None:
+        # The same poses in another file are no other meaning.
+        rival = next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
+        # A rival leaves clearly more in all, or turns alike and leaves more in where it puts the board.
+        shift = CLEAR_SHIFT * max(best.shift, LEAST_SHIFT * best.reach)
+        worse = rival.score >= CLEAR * best.score or (rival.turn >= AS_MUCH * best.turn and rival.shift >= shift)
+        if not worse:
+            raise RefusedError(_question(best, rival))
+    return Decision(best, rival, sorted(own))
+
+
+def _question(best: Fit, rival: Fit) -> str:
+    option = "--setup eye-in-hand or --setup eye-to-hand"
+    if best.series is not rival.series:
+        option = f"--pose-field {best.series.name} or --pose-field {rival.series.name}"
+    elif best.reading != rival.reading:
+        option = f"--poses {best.reading.name} or --poses {rival.reading.name}"
+    return (
+        f"the poses can be read in two ways that agree with the pictures about equally: {best.text} leaves "
+        f"{best.left}, {rival.text} leaves {rival.left}; say which with {option}, or add frames with larger turns"
+    )
+
+
+def scale_problem(fit: Fit, pitch: float) -> tuple[str, bool]:
+    """What to say where the flange's way and the board's size disagree, and whether it refuses the hand-eye."""
+    off = abs(fit.scale - 1)
+    if off < max(SCALE_NOTE, SCALE_SIGMAS * fit.scale_sigma) or fit.shift_scaled > SCALE_BETTER * fit.shift:
+        return "", False
+    text = (
+        f"the flange's way fits the pictures only when it is {fit.scale:.3f} ± {fit.scale_sigma:.3f} times as long as "
+        f"its poses say ({1e3 * fit.shift_scaled:.1f} mm of scatter instead of {1e3 * fit.shift:.1f} mm): is the "
+        f"board's pitch {1e3 * pitch / fit.scale:.2f} mm and not {1e3 * pitch:.2f} mm, or are the positions in a unit "
+        "other than m, cm and mm?"
+    )
+    return text, off > SCALE_REFUSED and fit.shift_scaled < SCALE_CLEARLY * fit.shift
+
+
+def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
+    """True where both readings give the same poses, from another file in another unit maybe."""
+    first, second = a.series.poses(a.reading), b.series.poses(b.reading)
+    both = [k for k in first if k in second and k in boards]
+    return a.setup == b.setup and len(both) >= 3 and all(
+        _angle(first[k].rotation, second[k].rotation) < SAME_RAD
+        and np.linalg.norm(UNITS[a.unit] * first[k].translation - UNITS[b.unit] * second[k].translation) < SAME_M
+        for k in both
+    )  # fmt: skip
+
+
+def _fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
     """The fits of a reading, one for each set-up; none where too few frames have a pose in it.
 
     Raises RefusedError where the turns tell nothing.
     """
     poses = {k: p for k, p in one.poses(reading).items() if k in boards}
-    if len(poses) < 3 or len(poses) < 0.5 * len([k for k in one.of if k in boards]):
+    if len(poses) < 3 or len(poses) < 0.5 * sum(k in boards for k in one.of):
         return []
     keys = sorted(poses)
     if len(keys) > MOST_FRAMES:
         keys = [keys[k] for k in np.linspace(0, len(keys) - 1, MOST_FRAMES).round().astype(int)]
     found = []
-    for side in SETUPS if setup is None else (setup,):
+    for side in ("eye_in_hand", "eye_to_hand") if setup is None else (setup,):
         flanges = [poses[k] if side == "eye_in_hand" else poses[k].inverse() for k in keys]
         options = [boards[k] for k in keys]
-        seen = [poses[turn] for poses, turn in zip(options, orders(flanges, options), strict=True)]
+        seen = [views[turn] for views, turn in zip(options, orders(flanges, options), strict=True)]
         rotation, turn, kept = _rotation(flanges, seen)
         reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))
         flanges, seen = [flanges[k] for k in kept], [seen[k] for k in kept]
-        tried = []
-        for unit, size in UNITS.items():
-            off = _shifts(flanges, seen, rotation, size)[0]
-            tried.append((float(np.median(off)), unit, size, off))
+        offs = {unit: _shifts(flanges, seen, rotation, size)[0] for unit, size in UNITS.items()}
+        unit = min(offs, key=lambda u: float(np.median(offs[u])))
         # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
-        off = min(tried, key=lambda t: t[0])[3]
+        off = offs[unit]
         near = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
-        off, scale, sigma, hand = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
+        off, scale, sigma, place = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
         # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
-        shift, unit, size, _ = min(tried, key=lambda t: t[0])
         if scale > 4 * sigma > 0:
-            shift, unit, size, _ = min(tried, key=lambda t: abs(math.log(scale / t[2])))
-        score, best = turn + shift / reach, float(np.median(off))
-        if abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma:
-            # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
-            score += 1.0
-        flange_from_camera = from_parts(hand, rotation)
-        stands = from_parts(scale * flanges[near[0]].translation, flanges[near[0]].rotation)
-        stands = stands * flange_from_camera * seen[near[0]]
-        found.append(
-            Fit(
-                one, reading, side, unit, turn, shift, score, scale / size, sigma / size, best, reach,
-                flange_from_camera, stands,
-            )
-        )  # fmt: skip
+            unit = min(offs, key=lambda u: abs(math.log(scale / UNITS[u])))
+        shift, size = float(np.median(offs[unit])), UNITS[unit]
+        # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
+        small = abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma
+        score = turn + shift / reach + (1.0 if small else 0.0)
+        hand = from_parts(place, rotation)
+        stands = from_parts(scale * flanges[near[0]].translation, flanges[near[0]].rotation) * hand * seen[near[0]]
+        scaled = scale / size, sigma / size, float(np.median(off))
+        found.append(Fit(one, reading, side, unit, turn, shift, score, *scaled, reach, hand, stands))
     return found
 
 
@@ -133,7 +258,7 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     for _ in range(3):
         rotation = park_martin([flanges[k] for k in kept], [boards[k] for k in kept])
         there = [f.rotation @ rotation @ b.rotation for f, b in zip(flanges, boards, strict=True)]
-        apart = np.array([[angle(a, b) for b in there] for a in there])
+        apart = np.array([[_angle(a, b) for b in there] for a in there])
         typical = weighted_median(apart, votes)
         middle = int(np.argmin(typical))
         turn = float(typical[middle])
@@ -149,7 +274,7 @@ def _axes(rotation: Array) -> bool:
     return bool(np.all((np.abs(rotation) < OWN_TURN) | (np.abs(rotation) > 1 - OWN_TURN)))
 
 
-def angle(a: Array, b: Array) -> float:
+def _angle(a: Array, b: Array) -> float:
     """Angle in rad between two rotations (3, 3)."""
     return math.acos(max(-1.0, min(1.0, 0.5 * (float(np.sum(a * b)) - 1))))
 
@@ -159,18 +284,16 @@ def _shifts(
 ) -> tuple[Array, float, float, Array]:
     """Distances (n,) in m of the boards' origins from one place, the size of the poses' unit in m with its σ, …
 
-    … and the camera's place (3,) in m in the flange.
-
-    By least sum of distances; `size` None lets the unit's size be found with the rest.
+    … and the camera's place (3,) in m in the flange. By least sum of distances; `size` None lets the unit's size be
+    found with the rest.
     """
-    design, known = [], []
-    for f, b in zip(flanges, boards, strict=True):
-        seen = f.rotation @ rotation @ b.translation
-        way = f.translation[:, None]
-        design.append(np.hstack([f.rotation, -np.eye(3), way] if size is None else [f.rotation, -np.eye(3)]))
-        known.append(seen if size is None else seen + size * f.translation)
+    turns, ways = np.array([f.rotation for f in flanges]), np.array([f.translation for f in flanges])
+    right = turns @ rotation @ np.array([b.translation for b in boards])[:, :, None]
+    whole = np.concatenate([turns, np.broadcast_to(-np.eye(3), turns.shape), ways[:, :, None]], axis=2)
+    right = right[:, :, 0]
+    if size is not None:
+        whole, right = whole[:, :, :6], right + size * ways
     # An arm's base may be metres away and its unit mm: columns of one size keep the system well conditioned.
-    whole, right = np.array(design), np.array(known)
     norms = np.linalg.norm(whole.reshape(-1, whole.shape[2]), axis=0) + 1e-12
     off = np.ones(len(whole))
     for _ in range(REWEIGHTINGS):
@@ -178,13 +301,9 @@ def _shifts(
         a = (whole / norms * root[:, :, None]).reshape(-1, len(norms))
         solution = np.linalg.lstsq(a, -(right * root).ravel(), rcond=None)[0]
         off = np.linalg.norm(whole / norms @ solution + right, axis=1)
+    place = solution[:3] / norms[:3]
     if size is not None:
-        return off, size, 0.0, solution[:3] / norms[:3]
+        return off, size, 0.0, place
     left = float(np.sum((a @ solution + (right * root).ravel()) ** 2)) / max(1, a.shape[0] - a.shape[1])
     sigma = math.sqrt(left * float(np.linalg.pinv(a.T @ a)[-1, -1]))
-    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1]), solution[:3] / norms[:3]
-
-
-def scaled(pose: pin.SE3, unit: str) -> pin.SE3:
-    """The pose with its lengths in m."""
-    return from_parts(UNITS[unit] * pose.translation, pose.rotation)
+    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1]), place

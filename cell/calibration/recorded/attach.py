@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.agreement import scaled
+from cell.calibration.recorded.agreement import UNITS, Decision, decide, scale_problem
 from cell.calibration.recorded.conventions import why_not
-from cell.calibration.recorded.decide import Decision, decide, scale_problem
-from cell.calibration.recorded.folder import RecordedFrame
+from cell.calibration.recorded.frames import RecordedFrame
 from cell.calibration.recorded.series import Series
 from cell.geometry.camera import CameraModel
+from cell.geometry.poses import from_parts
 from cell.vision.board.board import board_pose
 from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe.planes import Laser
 from drivers.errors import ConfigError, RefusedError
 
-LEAST_POSES = 3
-FARTHEST_M = 20.0
+LEAST_POSES, FARTHEST_M = 3, 20.0
 # Poses of an arm that stands still, read twice, are no further apart.
 SAME_M, SAME_RAD = 0.5e-3, 2e-3
 
@@ -30,7 +29,7 @@ SAME_M, SAME_RAD = 0.5e-3, 2e-3
 class Options:
     """What a person said instead of leaving it to the data; None where nothing was said.
 
-    `poses` is a reading's name (`conventions.READINGS`), `pose_field` a series of poses, `setup` eye_in_hand or
+    `poses` is a reading's name (`conventions.TRIED`), `pose_field` a series of poses, `setup` eye_in_hand or
     eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
     `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read, None for none.
     """
@@ -46,13 +45,12 @@ class Options:
 
 @dataclass
 class Understood:
-    """How the poses of a folder were read: for the table that comes before the result."""
+    """How the poses of a folder were read; `refused`: why there are poses, and none can be used."""
 
     setup: str | None = None
     about: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     refused: str = ""
-    """Why there are poses, and none can be used; empty when they can, or there are none."""
 
 
 def attach_poses(
@@ -63,14 +61,18 @@ def attach_poses(
     Without a camera, or with fewer than three frames, nothing is decided and no frame gets a pose.
     """
     if options.pose_field is not None:
-        series = [s for s in series if s.name == options.pose_field] or _no_such_field(series, options.pose_field)
+        names = ", ".join(s.name for s in series)
+        series = [s for s in series if s.name == options.pose_field]
+        if not series:
+            text = f"--pose-field {options.pose_field}: no such poses belong to the pictures; there are {names}"
+            raise ConfigError(text)
     if not series:
         return Understood(about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
     for one in series:
-        _tell_apart(one, frames, len(series) == 1)
-        _lend(one, frames)
+        _settle(one, frames, len(series) == 1)
+    understood = Understood(about={"source": [s.name for s in series]})
     if camera is None:
-        return Understood(about={"source": [s.name for s in series]}, notes=[])
+        return understood
     boards = {}
     for k, frame in enumerate(frames):
         if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
@@ -80,83 +82,72 @@ def attach_poses(
         except PictureRefused as refused:
             frame.refuse(refused.reason, str(refused))
     if len(boards) < LEAST_POSES:
-        return Understood(
-            about={"source": [s.name for s in series]},
-            notes=[
-                f"{len(boards)} used frames have a flange pose, at least {LEAST_POSES} are needed: no hand-eye, no "
-                "flatness"
-            ],
-        )
+        few = f"{len(boards)} used frames have a flange pose, at least {LEAST_POSES} are needed"
+        understood.notes.append(f"{few}: no hand-eye, no flatness")
+        return understood
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
         decision = decide(series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
-        return Understood(about={"source": [s.name for s in series]}, refused=f"no hand-eye: {error}")
+        understood.refused = f"no hand-eye: {error}"
+        return understood
     return _apply(decision, frames, pitch, options)
+
+
+def _settle(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:
+    """Refuse frames that have two poses, and give one without a pose that of another picture of its place."""
+    for k, records in one.doubled.items():
+        if only and frames[k].reason is None:
+            names = ", ".join(dict.fromkeys(f"{r.path.name} {r.label or ''}".strip() for r in records))
+            frames[k].refuse(Reason.NO_POSE, f"{len(records)} poses are named like it: {names}; which one is it?")
+    index = {id(frame): k for k, frame in enumerate(frames)}
+    for k, frame in enumerate(frames):
+        if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
+            one.of.setdefault(index[id(frame.shows)], one.of[k])
 
 
 def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, options: Options) -> Understood:
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
-    understood = Understood(best.setup, about_poses(decision, options))
-    understood.notes += [
-        f"{name} not used: its poses are those of the board as the camera sees it, not of the flange"
-        for name in decision.boards_own
-    ]
-    problem, refused = scale_problem(best, pitch)
-    if problem and refused:
-        understood.refused = f"no hand-eye: {problem}"
-    elif problem:
-        understood.notes.append(f"doubt: {problem}")
-    for k, record in one.of.items():
-        frame = frames[k]
-        several = sum(r.path == record.path for r in one.records) > 1
-        frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
-        pose = poses.get(k)
-        if pose is None:
-            if frame.reason in (None, Reason.DUPLICATE):
-                why = why_not(record.numbers, record.named, best.reading.name)
-                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
-            continue
-        metres = scaled(pose, best.unit)
-        if np.linalg.norm(metres.translation) > FARTHEST_M:
-            if frame.reason is None:
-                far = float(np.linalg.norm(metres.translation))
-                frame.refuse(
-                    Reason.NO_POSE,
-                    f"{frame.pose_from}: the flange is {far:.0f} m from the base, read in {best.unit} like the others "
-                    f"(allowed {FARTHEST_M:.0f} m): is its position in another unit? Correct it",
-                )
-            continue
-        if not refused:
-            frame.base_from_flange = metres
-    _compare_copies(frames)
-    return understood
-
-
-def about_poses(decision: Decision, options: Options) -> dict[str, Any]:
-    """How the poses were read, for the JSON."""
-    best = decision.best
-    return {
-        "source": [best.series.name],
+    about = {
+        "source": [one.name],
         "reading": best.reading.name,
         "text": best.reading.text,
         "unit": best.unit,
         "setup": best.setup,
-        "matched_by": best.series.by,
+        "matched_by": one.by,
         "given": [n for n in ("poses", "pose_field", "setup") if getattr(options, n)],
         "evidence": decision.evidence,
         "turn_deg": float(np.degrees(best.turn)),
         "shift_mm": 1e3 * best.shift,
     }
-
-
-def _lend(one: Series, frames: Sequence[RecordedFrame]) -> None:
-    """Give a frame without a pose that of another picture of its place."""
-    index = {id(frame): k for k, frame in enumerate(frames)}
-    for k, frame in enumerate(frames):
-        if frame.shows is not None and k in one.of and index[id(frame.shows)] not in one.doubled:
-            one.of.setdefault(index[id(frame.shows)], one.of[k])
+    own = "not used: its poses are those of the board as the camera sees it, not of the flange"
+    understood = Understood(best.setup, about, [f"{name} {own}" for name in decision.boards_own])
+    problem, refused = scale_problem(best, pitch)
+    if refused:
+        understood.refused = f"no hand-eye: {problem}"
+    elif problem:
+        understood.notes.append(f"doubt: {problem}")
+    for k, record in one.of.items():
+        frame, pose = frames[k], poses.get(k)
+        several = sum(r.path == record.path for r in one.records) > 1
+        frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
+        if pose is None:
+            if frame.reason in (None, Reason.DUPLICATE):
+                why = why_not(record.numbers, record.named, best.reading.name)
+                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
+            continue
+        place = UNITS[best.unit] * pose.translation
+        far = float(np.linalg.norm(place))
+        if far > FARTHEST_M:
+            if frame.reason is None:
+                text = f"the flange is {far:.0f} m from the base, read in {best.unit} like the others (allowed"
+                text += f" {FARTHEST_M:.0f} m): is its position in another unit? Correct it"
+                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {text}")
+        elif not refused:
+            frame.base_from_flange = from_parts(place, pose.rotation)
+    _compare_copies(frames)
+    return understood
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:
@@ -169,24 +160,9 @@ def _compare_copies(frames: Sequence[RecordedFrame]) -> None:
         way, turn = float(np.linalg.norm(apart.translation)), float(np.linalg.norm(pin.log3(apart.rotation)))
         if way < SAME_M and turn < SAME_RAD:
             continue
-        text = (
-            f"its pose ({frame.pose_from}) is {1e3 * way:.1f} mm and {np.degrees(turn):.2f}° from that of {first.name}"
-        )
+        off = f"{1e3 * way:.1f} mm and {np.degrees(turn):.2f}°"
+        text = f"its pose ({frame.pose_from}) is {off} from that of {first.name}"
         if first.stripe_from == frame.name:
             first.profile, first.stripe_from, first.stripe_off = None, "", ""
             first.stripe_text = f"{frame.name} was not taken at the same place: {text}"
         frame.refuse(Reason.NO_POSE, f"{frame.text}, but {text} ({first.pose_from}): which one is right?")
-
-
-def _tell_apart(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:
-    """Refuse frames that have two poses."""
-    for k, records in one.doubled.items():
-        if only and frames[k].reason is None:
-            names = ", ".join(dict.fromkeys(f"{r.path.name} {r.label or ''}".strip() for r in records))
-            frames[k].refuse(Reason.NO_POSE, f"{len(records)} poses are named like it: {names}; which one is it?")
-
-
-def _no_such_field(series: Sequence[Series], wanted: str) -> list[Series]:
-    raise ConfigError(
-        f"--pose-field {wanted}: no such poses belong to the pictures; there are {', '.join(s.name for s in series)}"
-    )

@@ -7,47 +7,40 @@ that were left out best, and it is checked against figures that do not come from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.calibration.observations import ScanObservation
-from cell.calibration.recorded.folder import RecordedFrame
-from cell.calibration.recorded.result import (
-    camera_dict,
-    closed_form_dict,
-    finite_mm,
-    flatness_dict,
-    hand_eye_dict,
-    intrinsics_dict,
-    plane_dict,
-    seen_depths,
-    setup_note,
-)
+from cell.calibration.recorded import result as form
+from cell.calibration.recorded.frames import RecordedFrame
 from cell.calibration.solve.adjustment import Adjustment
 from cell.calibration.solve.blocks import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
 from cell.calibration.solve.board_shape import moved_by_bend
 from cell.calibration.solve.checks import Check
 from cell.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
 from cell.calibration.solve.closed_form import points_on_boards
-from cell.calibration.solve.flatness import Flatness, flatness, leave_one_out
+from cell.calibration.solve.flatness import flatness, leave_one_out
 from cell.calibration.solve.hand_eye_checks import hand_eye_checks
 from cell.calibration.solve.intrinsics import Intrinsics
 from cell.calibration.solve.joint import Staged, solve_staged, start_state
 from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_of_cameras
 from cell.calibration.solve.scale import Scale, metric_scale
 from cell.calibration.solve.starts import stripe_means
-from cell.geometry.camera import PARAMETER_NAMES, Array
+from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
+from cell.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
-Setup = str
 STRANGE_SHARE, STRANGE_TURN = 0.15, math.radians(10.0)
 LEAST_FRAMES = 4
 """Of stops, not of pictures. With three poses everything fits: there is no fourth to disagree."""
+STRIPE_MEANS = 120
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +59,19 @@ class Chain:
     no_plane: str
     plane_known: PlaneKnown | None
     scale: Scale | None
-    flat_staged: Flatness | None
-    flat: Flatness | None
-    left_out: Flatness | None
+
+    @property
+    def noise(self) -> float:
+        """What the stripe's own stated σ makes in m on the board, RMS."""
+        best = self.choice.best
+        flanges = best.adjusted.state.flanges or [v.base_from_flange for v in best.views]
+        both = [both for both in zip(best.views, flanges, strict=True) if len(both[0].stripe)]
+        parts = [stripe_block(best.adjusted.state, view, flange, 0.0)[2] for view, flange in both]
+        return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def solve_chain(
-    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: Setup | None = None, hold_camera: bool = False
+    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: str | None = None, hold_camera: bool = False
 ) -> Chain:
     """Closed form and joint solution with the camera on the flange, or before it, whichever fits; `known` says which.
 
@@ -84,40 +83,32 @@ def solve_chain(
             "(further pictures of one stop do not count)"
         )
     setup, observations, staged = _placed(frames, pictures, known)
+    reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
     scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)
     if scale is not None:
         scale = scale.with_focal(float(pictures.sigma[0]) / pictures.camera.fx)
-    _refuse_strangers(staged, scale)
+    _refuse_strangers(staged, scale, reach)
     staged, stripes, no_plane = _with_plane(observations, staged, pictures)
     choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
     choice, pictures = with_doubt_of_camera(choice, pictures)
-    unsure = _unsure(choice, pictures, scale)
-    known_plane = _plane_known(choice, staged, observations, pictures, unsure)
+    # What the shared parameters (27,) would move with a bent board or the arm's scale, where these are believed.
+    unsure, best = np.zeros(SHARED), choice.best
+    if pictures.bend is not None and pictures.bend.believed:
+        unsure = moved_by_bend(Adjustment(best.views, best.free, best.adjusted.priors), best.adjusted.state)
+    if scale is not None and scale.believed:
+        place = slice(HAND.start, HAND.start + 3)
+        unsure[place] = np.hypot(unsure[place], scale.shift)
+    plane = _plane_known(choice, staged, observations, pictures, unsure)
+    if scale is not None and scale.believed and plane is not None:
+        plane = replace(plane, place=math.hypot(plane.place, (scale.value - 1) * reach))
     best, closed = (replace(s, unsure=np.abs(unsure)) for s in (choice.best, choice.closed))
     choice = replace(choice, best=best, closed=closed)
-    if scale is not None and scale.believed and known_plane is not None:
-        reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
-        known_plane = replace(known_plane, place=math.hypot(known_plane.place, (scale.value - 1) * reach))
-    return Chain(
-        setup,
-        observations,
-        staged,
-        pictures,
-        choice,
-        stripes,
-        no_plane,
-        known_plane,
-        scale,
-        flatness(start_state(staged), observations, staged),
-        flatness(choice.best.adjusted.state, observations, staged),
-        leave_one_out(observations, staged, choice.best),
-    )
+    return Chain(setup, observations, staged, pictures, choice, stripes, no_plane, plane, scale)
 
 
-def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
+def _refuse_strangers(staged: Staged, scale: Scale | None, reach: float) -> None:
     """Refuse poses that have nothing to do with the pictures: no adjustment could make sense of them."""
     found = staged.hand_eye
-    reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
     if found.scatter_m < STRANGE_SHARE * reach and found.scatter_rad < STRANGE_TURN:
         return
     text = (
@@ -133,25 +124,8 @@ def _refuse_strangers(staged: Staged, scale: Scale | None) -> None:
     )
 
 
-def _unsure(choice: Choice, pictures: Intrinsics, scale: Scale | None) -> Array:
-    """What the shared parameters (27,) would move with a bent board or the arm's scale, where these are believed."""
-    unsure = np.zeros(SHARED)
-    best = choice.best
-    if pictures.bend is not None and pictures.bend.believed:
-        adjustment = Adjustment(best.views, best.free, best.adjusted.priors)
-        unsure = moved_by_bend(adjustment, best.adjusted.state)
-    if scale is not None and scale.believed:
-        place = slice(HAND.start, HAND.start + 3)
-        unsure[place] = np.hypot(unsure[place], scale.shift)
-    return unsure
-
-
 def _plane_known(
-    choice: Choice,
-    staged: Staged,
-    observations: Sequence[ScanObservation],
-    pictures: Intrinsics,
-    unsure: Array,
+    choice: Choice, staged: Staged, observations: Sequence[ScanObservation], pictures: Intrinsics, unsure: Array
 ) -> PlaneKnown | None:
     """How well the light plane is known, None without one."""
     plane = choice.best.adjusted.state.plane
@@ -170,48 +144,69 @@ def _plane_known(
 
 
 def _placed(
-    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: Setup | None
+    frames: Sequence[RecordedFrame], pictures: Intrinsics, known: str | None
 ) -> tuple[str, list[ScanObservation], Staged]:
     """Camera on the flange or before it, whichever leaves the board scattered less, without the stripe."""
-    best: tuple[float, str, list[ScanObservation], Staged] | None = None
+    best: tuple[str, list[ScanObservation], Staged] | None = None
     for setup in ("eye_in_hand", "eye_to_hand") if known is None else (known,):
-        observations = [_observation(f, invert=setup == "eye_to_hand") for f in frames]
-        staged = solve_staged(observations, stripe=False, camera=pictures.camera)
-        if best is None or staged.hand_eye.scatter_m < 0.5 * best[0]:
-            best = staged.hand_eye.scatter_m, setup, observations, staged
+        told = [f.base_from_flange for f in frames if f.base_from_flange is not None]
+        poses = told if setup == "eye_in_hand" else [pose.inverse() for pose in told]
+        seen = [ScanObservation(f.view, f.profile, p, 0.0, f.name) for f, p in zip(frames, poses, strict=True)]
+        staged = solve_staged(seen, stripe=False, camera=pictures.camera)
+        if best is None or staged.hand_eye.scatter_m < 0.5 * best[2].hand_eye.scatter_m:
+            best = setup, seen, staged
     assert best is not None
-    return best[1:]
+    return best
+
+
+Profiles = Sequence[StripeProfile | None]
+Rows = Sequence[NDArray[np.intp]]
+
+
+def of_one_plane(
+    profiles: Profiles,
+    camera: CameraModel,
+    fit: Callable[[Profiles], tuple[Found, Rows, Sequence[Array]]],
+    wrong: dict[int, str],
+) -> tuple[Found, Sequence[Array]]:
+    """What `fit` finds of the stripes without those of another line, and its points on the boards.
+
+    `fit` gives its result, the rows of each stripe that it used, and these points (n, 3) of each. `wrong` takes up why
+    stripes are left out, by their place, also where it raises RefusedError.
+    """
+    while True:
+        lit = [None if k in wrong else profile for k, profile in enumerate(profiles)]
+        found, rows, clouds = fit(lit)
+        more = odd_stripes(clouds)
+        for k, (profile, some) in enumerate(zip(lit, rows, strict=True)):
+            if profile is not None and len(some):
+                text = crooked(camera, *stripe_means(profile, some, STRIPE_MEANS))
+                if text is not None:
+                    more[k] = text
+        if not more:
+            return found, clouds
+        wrong |= more
 
 
 def _with_plane(
     observations: list[ScanObservation], staged: Staged, pictures: Intrinsics
 ) -> tuple[Staged, dict[int, str], str]:
     """The closed form with its light plane, without stripes that are of another line; why, and why there is none."""
+    profiles = [o.profile for o in observations]
     wrong: dict[int, str] = {}
-    if sum(o.profile is not None for o in observations) < 2:
+    if sum(p is not None for p in profiles) < 2:
         return staged, wrong, "fewer than two frames show a laser stripe"
-    while True:
-        lit = [replace(o, profile=None) if k in wrong else o for k, o in enumerate(observations)]
-        try:
-            found = solve_staged(lit, camera=pictures.camera)
-        except RefusedError as error:
-            return staged, wrong, str(error)
+
+    def fit(lit: Profiles) -> tuple[Staged, Rows, Sequence[Array]]:
+        seen = [replace(o, profile=p) for o, p in zip(observations, lit, strict=True)]
+        found = solve_staged(seen, camera=pictures.camera)
         assert found.plane is not None
-        more = odd_stripes(points_on_boards(found, lit))
-        for k, (o, rows) in enumerate(zip(lit, found.plane.rows, strict=True)):
-            if o.profile is not None and len(rows):
-                text = crooked(pictures.camera, *stripe_means(o.profile, rows, 120))
-                if text is not None:
-                    more[k] = text
-        if not more:
-            return found, wrong, ""
-        wrong |= more
+        return found, found.plane.rows, points_on_boards(found, seen)
 
-
-def _observation(frame: RecordedFrame, invert: bool) -> ScanObservation:
-    assert frame.base_from_flange is not None
-    pose = frame.base_from_flange.inverse() if invert else frame.base_from_flange
-    return ScanObservation(frame.view, frame.profile, pose, 0.0, frame.name)
+    try:
+        return of_one_plane(profiles, pictures.camera, fit, wrong)[0], wrong, ""
+    except RefusedError as error:
+        return staged, wrong, str(error)
 
 
 def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
@@ -219,42 +214,27 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     made = hand_eye_checks(chain.choice, chain.staged.camera_from_board, pictures)
     if chain.scale is not None:
         made.append(chain.scale.check(made))
-    best, staged = chain.choice.best, chain.staged
-    state = best.adjusted.state
-    known = chain.plane_known
-    if state.plane is None or staged.plane is None or known is None:
+    adjusted, staged, known = chain.choice.best.adjusted, chain.staged, chain.plane_known
+    plane = adjusted.state.plane
+    if plane is None or staged.plane is None or known is None:
         return made
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
-    lit = [k for k, rows in enumerate(staged.plane.rows) if len(rows)]
-    rms = max(staged.plane.rms, best.adjusted.stripe_rms_m)
-    made += plane_checks(rms, _own_noise(chain), cloud, len(lit), known, len(chain.stripes))
-    apart = math.degrees(math.acos(min(1.0, abs(float(state.plane.n @ staged.plane.plane.n)))))
-    tilt = math.degrees(known.tilt)
-    made.append(
-        Check(
-            "light_plane", "plane with the arm against plane of the pictures", apart, max(1.0, 4 * tilt),
-            max(4.0, 8 * tilt), "deg", "the arm's poses and the board's in the pictures do not agree about it",
-        )
-    )  # fmt: skip
+    lit = sum(len(rows) > 0 for rows in staged.plane.rows)
+    rms = max(staged.plane.rms, adjusted.stripe_rms_m)
+    made += plane_checks(rms, chain.noise, cloud, lit, known, len(chain.stripes))
+    apart = math.degrees(math.acos(min(1.0, abs(float(plane.n @ staged.plane.plane.n)))))
+    name, tilt = "plane with the arm against plane of the pictures", math.degrees(known.tilt)
+    text = "the arm's poses and the board's in the pictures do not agree about it"
+    made.append(Check("light_plane", name, apart, max(1.0, 4 * tilt), max(4.0, 8 * tilt), "deg", text))
     return made
-
-
-def _own_noise(chain: Chain) -> float:
-    """What the stripe's own stated σ makes in m on the board, RMS."""
-    state = chain.choice.best.adjusted.state
-    flanges = state.flanges or [v.base_from_flange for v in chain.choice.best.views]
-    parts = [
-        stripe_block(state, view, flange, 0.0)[2]
-        for view, flange in zip(chain.choice.best.views, flanges, strict=True)
-        if len(view.stripe)
-    ]
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> None:
     """Put camera, hand-eye, light plane, noise and flatness into the result, lengths in mm."""
-    best, choice = chain.choice.best, chain.choice
+    best, choice, staged, names = chain.choice.best, chain.choice, chain.staged, [o.name for o in chain.observations]
     adjusted, state, sigma = best.adjusted, best.adjusted.state, best.sigma
+    flat, flat_staged = (flatness(s, chain.observations, staged) for s in (state, start_state(staged)))
+    left_out = leave_one_out(chain.observations, staged, best)
     # Board and hand-eye belong to one camera: that which is reported.
     boards = [
         o.base_from_flange * state.flange_from_camera * board_pose(o.view, state.camera).camera_from_board
@@ -262,32 +242,25 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         if o.view is not None
     ]
     apart = [b.translation - state.base_from_board.translation for b in boards]
-    turns = [float(np.linalg.norm(pin.log3(b.rotation @ state.base_from_board.rotation.T))) for b in boards]
+    turns = [pin.log3(b.rotation @ state.base_from_board.rotation.T) for b in boards]
+    scatter = [float(np.sqrt(np.mean(np.sum(np.square(off), axis=1)))) for off in (apart, turns)]
+    result["intrinsics"] = form.intrinsics_dict(chain.pictures)
     if best.camera_free:
         result["intrinsics"] = {
-            **camera_dict(state.camera),
+            **form.camera_dict(state.camera, sigma[CAMERA]),
             "rms_px": math.sqrt(2) * adjusted.dots_rms_px,
             "held_out_rms_px": math.sqrt(2) * best.left.figures["dots_px"],
-            "sigma_px": dict(zip(PARAMETER_NAMES[:4], sigma[CAMERA][:4].tolist(), strict=True)),
             "lens": pictures.model.name,
             "method": best.name,
         }
-    else:
-        result["intrinsics"] = intrinsics_dict(chain.pictures)
-    figures = {key: finite(value) for key, value in best.left.figures.items()}
     result["hand_eye"] = {
-        "method": best.name,
-        **hand_eye_dict(chain.setup, state.flange_from_camera),
-        "scatter_mm": 1e3 * float(np.sqrt(np.mean(np.sum(np.square(apart), axis=1)))),
-        "scatter_deg": math.degrees(float(np.sqrt(np.mean(np.square(turns))))),
-        "sigma_mm": (1e3 * sigma[HAND][:3]).tolist(),
-        "sigma_deg": np.degrees(sigma[HAND][3:]).tolist(),
+        **form.hand_eye_dict(chain.setup, best.name, state.flange_from_camera, (scatter[0], scatter[1]), sigma[HAND]),
         "formal_sigma_mm": (1e3 * best.formal[HAND][:3]).tolist() if best.joint else None,
-        "left_out": figures,
+        "left_out": form.all_finite(best.left.figures),
         "frames": len(chain.observations),
         "closed_form": {
-            **closed_form_dict(chain.setup, chain.staged.hand_eye),
-            "left_out": {key: finite(value) for key, value in choice.closed.left.figures.items()},
+            **form.closed_form_dict(chain.setup, staged.hand_eye),
+            "left_out": form.all_finite(choice.closed.left.figures),
         },
     }
     result["noise"] = {
@@ -297,48 +270,24 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
         "arm_weight_mm": 1e3 * adjusted.priors.arm_translation if best.joint else None,
         "tried": [
             {"solution": s.name, "arm_weight_mm": 1e3 * s.adjusted.priors.arm_translation if s.joint else None}
-            | {"left_out_mm": finite(s.figure()), **{k: finite(v) for k, v in s.left.figures.items()}}
+            | {"left_out_mm": form.finite(s.figure()), **form.all_finite(s.left.figures)}
             for s in choice.tried
         ],
-        "chi2_per_dof": finite(adjusted.chi2_per_dof),
+        "chi2_per_dof": form.finite(adjusted.chi2_per_dof),
     }
-    result["notes"] += setup_note(chain.setup, state.flange_from_camera)
-    _report_plane(chain, result)
-
-
-def _report_plane(chain: Chain, result: dict[str, Any]) -> None:
-    best, staged = chain.choice.best, chain.staged
-    state, names = best.adjusted.state, [o.name for o in chain.observations]
+    result["notes"] += form.setup_note(chain.setup, state.flange_from_camera)
     result["notes"] += [f"{names[k]}: {text} Its stripe is not used." for k, text in chain.stripes.items()]
     if state.plane is None or staged.plane is None:
         result["notes"].append(f"no light plane: {chain.no_plane}")
         return
-    known = chain.plane_known
+    depths = form.seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
+    checked = None if staged.paper is None else form.finite(1e3 * staged.paper.cross_ratio_m)
     result["light_plane"] = {
-        **plane_dict(state.plane),
-        "rms_mm": 1e3 * best.adjusted.stripe_rms_m,
-        "depth_range_mm": seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)]),
-        "sigma_distance_mm": 1e3 * float(best.sigma[PLANE][2]),
-        "sigma_place_mm": None if known is None else 1e3 * known.place,
-        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
-        "stripe_noise_mm": 1e3 * _own_noise(chain),
-        "method": best.name,
-        "staged": {
-            **plane_dict(staged.plane.plane),
-            "rms_mm": 1e3 * staged.plane.rms,
-            "cross_ratio_check_mm": None if staged.paper is None else finite_mm(staged.paper.cross_ratio_m),
-        },
+        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths),
+        "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
+        "staged": {**form.normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
     }
     result["stripe_points"] = {n: len(r) for n, r in zip(names, staged.plane.rows, strict=True)}
-    if chain.flat is not None:
-        result["flatness"] = {
-            **flatness_dict(chain.flat, names),
-            "frame": "base" if chain.setup == "eye_in_hand" else "flange",
-            "leave_one_out": None if chain.left_out is None else flatness_dict(chain.left_out, names),
-            "staged": None if chain.flat_staged is None else flatness_dict(chain.flat_staged, names),
-        }
-
-
-def finite(value: float) -> float | None:
-    """None for what is not known."""
-    return value if math.isfinite(value) else None
+    if (whole := form.flatness_dict(flat, names)) is not None:
+        more = {"leave_one_out": form.flatness_dict(left_out, names), "staged": form.flatness_dict(flat_staged, names)}
+        result["flatness"] = {**whole, "frame": "base" if chain.setup == "eye_in_hand" else "flange", **more}

@@ -11,15 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pinocchio as pin
-
 from cell.calibration.recorded.attach import Options, attach_poses
 from cell.calibration.recorded.conventions import check_reading
-from cell.calibration.recorded.folder import RecordedFrame, read_frames, read_pose_pairs
-from cell.calibration.recorded.listing import Listing, list_folder
-from cell.calibration.recorded.pairs import calibrate_pairs
-from cell.calibration.recorded.result import channel_dict, empty_result, frame_dict
-from cell.calibration.recorded.series import Series, in_order_of_views, match_series, read_series
+from cell.calibration.recorded.frames import RecordedFrame, read_frames
+from cell.calibration.recorded.pairs import calibrate_pairs, read_pose_pairs
+from cell.calibration.recorded.result import empty_result, frame_dict
+from cell.calibration.recorded.series import Series, in_order_of_views, list_folder, match_series, read_series
 from cell.calibration.recorded.solution import (
     CameraChanged,
     agreeing,
@@ -28,7 +25,6 @@ from cell.calibration.recorded.solution import (
     rough_camera,
     solve_frames,
 )
-from cell.calibration.solve.intrinsics import Intrinsics
 from cell.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
 
@@ -62,73 +58,57 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     options = options or Options()
     check_reading(options.poses)
     pairs = read_pose_pairs(folder) if folder.is_dir() else []
-    if spec is None and pairs:
-        return _of_pairs(pairs, options)
     listing = list_folder(folder)
+    if pairs and (spec is None or (listing.texts and not listing.pictures)):
+        result = calibrate_pairs(pairs)
+        return (
+            result | {"hand_eye": None, "checks": [], "refused": {}, "refused_values": {}} if options.plan else result
+        )
     if not listing.pictures and listing.texts:
-        if pairs:
-            return _of_pairs(pairs, options)
         raise ConfigError(
             f"{folder} holds no pictures, and no JSON file with pairs of poses: for a hand-eye without pictures give "
             "a list of [base_from_flange, camera_from_board], each a 4×4 matrix in m"
         )
     if spec is None:
+        count = Counter(path.parent for path in listing.pictures)
+        held = ", ".join(f"{listing.name(f)} ({n})" for f, n in count.items() if f != folder)
         raise ConfigError(
             f"{folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
-            f"chessboard:7x6:10mm{_folders(listing)}"
+            "chessboard:7x6:10mm" + (f"; pictures are in {held}: --from can name one of these, too" if held else "")
         )
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     # A plan tells of boards and poses; to read stripes takes seconds for each picture.
-    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser)
+    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser, options.plan)
     late = [one for one in series if not one.of and in_order_of_views(one, frames)]
-    belonging += late
     strange = [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
     result = empty_result(spec)
-    result["laser"] = channel_dict(channel)
-    result["notes"] += _doubtful_lines(frames)
+    asked, chosen = (str(one or "none") for one in (channel.asked, channel.chosen))
+    result["laser"] = {"asked": asked, "channel": chosen, "looked": channel.looked, "votes": channel.votes}
+    # Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all.
+    doubtful = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
+    if len(doubtful) > 1 and not any(f.profile is not None for f in frames):
+        perhaps = f"no picture shows a stripe for certain, {len(doubtful)} show a line that may be one"
+        doubtful = [f"{perhaps}; {doubtful[0]}"]
+    result["notes"] += doubtful
     result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
-    _from_frames(frames, belonging, options, result)
-    result["frames"] = [frame_dict(frame, result["frames_rms"]) for frame in frames]
-    del result["frames_rms"]
+    _from_frames(frames, belonging + late, options, result)
+    rms = result.pop("frames_rms")
+    result["frames"] = [frame_dict(frame, rms) for frame in frames]
     return result
-
-
-def _folders(listing: Listing) -> str:
-    """The sub-folders that hold pictures, each with how many."""
-    count = Counter(path.parent for path in listing.pictures)
-    if set(count) <= {listing.folder}:
-        return ""
-    held = ", ".join(f"{listing.name(f)} ({n})" for f, n in count.items() if f != listing.folder)
-    return f"; pictures are in {held}: --from can name one of these, too"
-
-
-def _of_pairs(pairs: Sequence[tuple[pin.SE3, pin.SE3]], options: Options) -> dict[str, Any]:
-    result = calibrate_pairs(pairs)
-    if options.plan:
-        result |= {"hand_eye": None, "checks": [], "refused": {}, "refused_values": {}}
-    return result
-
-
-def _doubtful_lines(frames: list[RecordedFrame]) -> list[str]:
-    """Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all."""
-    texts = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
-    if len(texts) < 2 or any(f.profile is not None for f in frames):
-        return texts
-    return [f"no picture shows a stripe for certain, {len(texts)} show a line that may be one; {texts[0]}"]
 
 
 def _from_frames(
     frames: list[RecordedFrame], series: Sequence[Series], options: Options, result: dict[str, Any]
 ) -> None:
     notes: list[str] = result["notes"]
-    found: tuple[Intrinsics, Intrinsics] | None = None
+    found = None
     try:
-        found = rough_camera(frames, options.camera) if options.plan else camera_of(frames, options.camera)
+        found = (rough_camera if options.plan else camera_of)(frames, options.camera)
+    except CameraChanged as error:
+        result["refused"]["intrinsics"] = f"no intrinsics: {error}"
     except RefusedError as error:
         notes.append(f"no intrinsics: {error}")
-        if isinstance(error, CameraChanged):
-            result["refused"]["intrinsics"] = notes.pop()
     understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
     result["poses"] = understood.about
     notes += understood.notes
@@ -136,15 +116,11 @@ def _from_frames(
         result["refused"]["hand_eye"] = understood.refused
     for one in series:
         if one.alone and one.name in (understood.about["source"] or []):
-            names = [
-                r.path.name if sum(r.path == o.path for o in one.records) == 1 else f"{r.path.name} {r.label}"
-                for r in one.alone
-            ]
+            several = Counter(r.path for r in one.records)
+            names = [r.path.name + (f" {r.label}" if several[r.path] > 1 else "") for r in one.alone]
             notes.append(f"{', '.join(names)} not used: no picture belongs to it")
-    if found is None:
-        return
-    if options.plan:
+    if found is not None and options.plan:
         agreeing(frames, found[0].camera)
-        return
-    solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)
-    note_perhaps_no_laser(frames, result)
+    elif found is not None:
+        solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)
+        note_perhaps_no_laser(frames, result)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,25 +11,16 @@ from typing import Any
 import numpy as np
 
 from cell.calibration.recorded.texts import decoded, stored_matrix, structured
-from cell.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
 from cell.storage import EditedError, is_intact
 from drivers.errors import ConfigError
 
 FORM = "it needs width, height, fx, fy, cx, cy and k1 … k3, or camera_matrix and distortion coefficients"
 MATRICES = ("camera_matrix", "K", "mtx", "intrinsic_matrix")
+LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion")
 NEXT = "calibrate the camera with OpenCV's plain model (plumb_bob), or leave --camera out: the pictures then tell it"
 MODELS = ("distortion_model", "camera_model", "model")
-BROWN = (
-    "plumb_bob",
-    "radtan",
-    "brown",
-    "brown_conrady",
-    "opencv",
-    "pinhole",
-    "none",
-    "perspective",
-    "rational_polynomial",
-)
+BROWN = re.compile("plumb_bob|radtan|brown(_conrady)?|opencv|pinhole|none|perspective|rational_polynomial")
 """Names of the lens model with k1, k2, p1, p2 and k3; the rational one is that while its further terms are 0."""
 FURTHER_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 LEAST_TERMS = 4
@@ -35,7 +28,6 @@ FOCAL_RANGE = (0.1, 100.0)
 """Focal lengths over the picture's longer side: from a fisheye's to a long telephoto's."""
 OUTSIDE = 0.5
 """How far outside the picture, in its width or height, the principal point may lie."""
-LENSES = ("distortion_coefficients", "dist_coeffs", "D", "dist", "distortion")
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -47,9 +39,9 @@ def read_camera(path: Path) -> CameraModel:
             raise EditedError("it was changed after `cell calibrate --from` wrote it; use the result as it was")
     except (OSError, ValueError) as error:
         raise ConfigError(f"--camera {path}: it cannot be read: {error}") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"--camera {path}: {FORM}")
     try:
+        if not isinstance(data, dict):
+            raise ConfigError(FORM)
         return _camera(_inner(data))
     except ConfigError as error:
         raise ConfigError(f"--camera {path}: {error}") from error
@@ -61,91 +53,67 @@ def _inner(data: Mapping[str, Any]) -> Mapping[str, Any]:
     """The map that holds the camera: below `intrinsics`, OpenCV's storage, or ViSP's last model with its size."""
     if any(name in data for name in (*MATRICES, "fx")):
         return data
-    if "model" in data and {"image_width", "image_height"} <= set(data):
-        models = data["model"] if isinstance(data["model"], list) else [data["model"]]
-        return {**_of_visp(models[-1]), "width": data["image_width"], "height": data["image_height"]}
+    if {"model", "image_width", "image_height"} <= set(data):
+        model = data["model"][-1] if isinstance(data["model"], list) else data["model"]
+        if "Kannala" in str(model.get("type")):
+            kind = f"the model's type is {model['type']}"
+            raise ConfigError(f"{kind}, read can be perspectiveProjWithDistortion; {NEXT}")
+        # ViSP's kud is k1, its kdu an inverse that is not needed.
+        names = {"fx": "px", "fy": "py", "cx": "u0", "cy": "v0"}
+        found = {name: model[its] for name, its in names.items()} | {"k1": model.get("kud", 0.0)}
+        return found | {"width": data["image_width"], "height": data["image_height"]}
     for value in data.values():
-        several = value if isinstance(value, list) else [value]
-        if several and isinstance(several[-1], dict) and "data" not in several[-1]:
-            found = _inner(several[-1])
-            if any(name in found for name in (*MATRICES, "fx")):
-                return {**data, **found}
+        last = value[-1] if isinstance(value, list) and value else value
+        if isinstance(last, dict) and "data" not in last:
+            inner = _inner(last)
+            if any(name in inner for name in (*MATRICES, "fx")):
+                return {**data, **inner}
     return data
 
 
-def _of_visp(model: Mapping[str, Any]) -> dict[str, Any]:
-    """ViSP's names as those used here: its kud is k1, its kdu an inverse that is not needed."""
-    if "Kannala" in str(model.get("type")):
-        raise ConfigError(f"the model's type is {model['type']}, read can be perspectiveProjWithDistortion; {NEXT}")
-    lens = {"k1": model.get("kud", 0.0)}
-    return {"fx": model["px"], "fy": model["py"], "cx": model["u0"], "cy": model["v0"], **lens}
-
-
 def _camera(data: Mapping[str, Any]) -> CameraModel:
-    width, height = (int(_first(data, names)) for names in (("width", "image_width"), ("height", "image_height")))
-    camera = CameraModel(width, height, 1.0, 1.0, 0.0, 0.0)
-    _check_model(data)
+    """The camera of a map. Raises ConfigError for another lens, whose numbers would be read as Brown's."""
+    width, height = (int(data[_key(data, names)]) for names in (("width", "image_width"), ("height", "image_height")))
+    for name in MODELS:
+        if name in data and not BROWN.fullmatch(str(data[name]).lower().replace("-", "_")):
+            raise ConfigError(f"{name} is {data[name]}, read can be plumb_bob and radtan; {NEXT}")
     if "fx" in data:
         values = [float(data.get(name, 0.0)) if name[0] in "kp" else float(data[name]) for name in PARAMETER_NAMES]
         further = {name: float(data[name]) for name in FURTHER_TERMS if name in data}
     else:
-        matrix = _numbers(_first(data, MATRICES)).reshape(3, 3)
+        of, lenses = _key(data, MATRICES), _key(data, LENSES)
+        matrix, lens = _numbers(data[of]).reshape(3, 3), _numbers(data[lenses])
         if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], (0, 0, 1)):
-            raise ConfigError(
-                f"{_key(data, MATRICES)} is {matrix.tolist()}, it must be fx 0 cx, 0 fy cy, 0 0 1; {NEXT}"
-            )
-        lens = _numbers(_first(data, LENSES))
+            raise ConfigError(f"{of} is {matrix.tolist()}, it must be fx 0 cx, 0 fy cy, 0 0 1; {NEXT}")
         if len(lens) < LEAST_TERMS and lens.any():
-            raise ConfigError(
-                f"{_key(data, LENSES)} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}"
-            )
+            raise ConfigError(f"{lenses} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}")
         values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens[:5], *np.zeros(max(0, 5 - len(lens)))]
-        further = {f"{_key(data, LENSES)}[{k + 5}]": float(value) for k, value in enumerate(lens[5:])}
+        further = {f"{lenses}[{k + 5}]": float(value) for k, value in enumerate(lens[5:])}
     for name, value in further.items():
         if value != 0.0:
             raise ConfigError(f"{name} is {value:g}: the lens here has k1, k2, p1, p2 and k3 only; {NEXT}")
-    return _checked(camera.with_parameters(values))
-
-
-def _check_model(data: Mapping[str, Any]) -> None:
-    """Refuse lenses of another model, whose numbers would be read as Brown's. Raises ConfigError."""
-    for name in MODELS:
-        if name in data and str(data[name]).lower().replace("-", "_") not in BROWN:
-            raise ConfigError(f"{name} is {data[name]}, read can be {' and '.join(BROWN[:2])}; {NEXT}")
-
-
-def _checked(camera: CameraModel) -> CameraModel:
-    """The camera, when it can be one. Raises ConfigError that names the value."""
+    camera = CameraModel(width, height, 1.0, 1.0, 0.0, 0.0).with_parameters(values)
+    longer, inf = max(width, height), math.inf
+    focal = tuple(limit * longer for limit in FOCAL_RANGE)
+    allowed = {"fx": focal, "fy": focal, "cx": (-OUTSIDE * width, (1 + OUTSIDE) * width)}
+    allowed |= {"cy": (-OUTSIDE * height, (1 + OUTSIDE) * height)}
+    if width <= 0 or height <= 0:
+        raise ConfigError(f"the picture is {width}×{height} px, both must be positive; {NEXT}")
     for name, value in zip(PARAMETER_NAMES, camera.parameters, strict=True):
         if not np.isfinite(value):
             raise ConfigError(f"{name} is {value}, it must be a finite number; {NEXT}")
-    if camera.width <= 0 or camera.height <= 0:
-        raise ConfigError(f"the picture is {camera.width}×{camera.height} px, both must be positive; {NEXT}")
-    longer = max(camera.width, camera.height)
-    low, high = FOCAL_RANGE
-    for name, focal in (("fx", camera.fx), ("fy", camera.fy)):
-        if not low * longer <= focal <= high * longer:
-            raise ConfigError(f"{name} is {focal:g} px, allowed are {low * longer:g} to {high * longer:g} px; {NEXT}")
-    for name, at, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
-        if not -OUTSIDE * size <= at <= (1 + OUTSIDE) * size:
-            raise ConfigError(
-                f"{name} is {at:g} px, allowed are {-OUTSIDE * size:g} to {(1 + OUTSIDE) * size:g} px in a picture of "
-                f"{size} px; {NEXT}"
-            )
+        low, high = allowed.get(name, (-inf, inf))
+        if not low <= value <= high:
+            size = f"in a picture of {width}×{height} px"
+            raise ConfigError(f"{name} is {value:g} px, allowed are {low:g} to {high:g} px {size}; {NEXT}")
     return camera
 
 
 def _key(data: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    return next(name for name in names if name in data)
+    return next((name for name in names if name in data), names[0])
 
 
-def _first(data: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    for name in names:
-        if name in data:
-            return data[name]
-    raise KeyError(names[0])
-
-
-def _numbers(value: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _numbers(value: Any) -> Array:
     matrix = stored_matrix(value) if isinstance(value, dict) else value
-    return np.ravel(np.asarray(value["data"] if matrix is None else matrix, dtype=np.float64))
+    found: Array = np.ravel(np.asarray(value["data"] if matrix is None else matrix, dtype=np.float64))
+    return found

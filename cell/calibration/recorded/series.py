@@ -1,7 +1,13 @@
-"""Series of recorded poses: files of one kind, or the rows of one table, and the picture that each belongs to."""
+"""Series of recorded poses, and the picture of each: by a table, by name, folder, number or time, or in order.
+
+Also what lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name.
+"""
 
 from __future__ import annotations
 
+import math
+import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -12,25 +18,99 @@ import numpy as np
 import pinocchio as pin
 
 from cell.calibration.recorded.conventions import Reading
-from cell.calibration.recorded.listing import Listing
-from cell.calibration.recorded.matching import match, series_name
-from cell.calibration.recorded.texts import NEEDED, Content, Record, join_halves, read_content
+from cell.calibration.recorded.texts import NEEDED, PICTURES, Content, Record, join_halves, read_content
 from cell.vision.pictures import Reason
 from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cell.calibration.recorded.folder import RecordedFrame
+    from cell.calibration.recorded.frames import RecordedFrame
 
-LEAST = 2
+TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz", ".pos")
+OTHERS = {
+    (".zip", ".gz", ".tar", ".tgz", ".7z", ".rar", ".bz2", ".xz"): "an archive: unpack it",
+    (".bag", ".db3", ".mcap"): "a ROS bag: export its pictures and poses to files",
+    (".mp4", ".avi", ".mov", ".mkv", ".webm"): "a film: save its pictures to files",
+    (".xlsx", ".xls", ".ods"): "a spreadsheet: save it as CSV",
+    (".mat",): "a file of MATLAB: save its poses with writematrix as CSV",
+    (".pkl", ".pickle"): "a pickle, which may run code when it is read: save its arrays with numpy.savez",
+}
+LARGEST_TEXT = 50_000_000
+# Poses of a series; different rows of a table whose rows are poses.
+LEAST, LEAST_ALONE = 2, 3
 # Pictures that are no view of their own.
 ASIDE = (Reason.DUPLICATE, Reason.WRONG_SIZE, Reason.LASER_PICTURE, Reason.UNREADABLE)
-# A table whose rows are poses holds so many different rows.
-LEAST_ALONE = 3
+# Words that say what is in a file and not which frame it is of.
+ROLES = (
+    "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
+    "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
+)
+CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
+
+
+@dataclass
+class Listing:
+    """The files of a folder by kind, each in natural order; `unread`: (name, reason) of the others."""
+
+    folder: Path
+    pictures: list[Path] = field(default_factory=list)
+    texts: list[Path] = field(default_factory=list)
+    unread: list[tuple[str, str]] = field(default_factory=list)
+
+    def name(self, path: Path) -> str:
+        """A file's name below the folder."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def list_folder(folder: Path) -> Listing:
+    """All files of a folder and below. Raises ConfigError when it is no folder."""
+    if not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder; give the folder that holds the recorded frames")
+    listing = Listing(folder)
+    seen: set[str] = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        if os.path.realpath(root) in seen:
+            folders.clear()
+            continue
+        seen.add(os.path.realpath(root))
+        for name in [f for f in folders if f.startswith((".", "__MACOSX"))]:
+            folders.remove(name)
+            listing.unread.append((listing.name(Path(root, name)) + "/", "hidden, not read"))
+        for path in (Path(root, name) for name in files):
+            if reason := _why_not(path):
+                listing.unread.append((listing.name(path), reason))
+            else:
+                (listing.pictures if path.suffix.lower() in PICTURES else listing.texts).append(path)
+    for paths in (listing.pictures, listing.texts):
+        paths.sort(key=lambda p: _natural(listing.name(p)))
+    listing.unread.sort(key=lambda u: _natural(u[0]))
+    return listing
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A sort key in which frame10 follows frame9."""
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", name.lower()) if p]
+
+
+def _why_not(path: Path) -> str:
+    """Why a file is neither a picture nor a text that may be read; empty where it is."""
+    suffix = path.suffix.lower()
+    if path.name.startswith((".", "__MACOSX")):
+        return "hidden, not read"
+    if not path.is_file():
+        return "no ordinary file" if path.exists() else "a link to a file that is not there"
+    if suffix in TEXTS and path.stat().st_size > LARGEST_TEXT:
+        return f"{path.stat().st_size / 1e6:.0f} MB are too much for a table of poses"
+    if suffix in (*PICTURES, *TEXTS):
+        return ""
+    return next((r for kinds, r in OTHERS.items() if suffix in kinds), "neither a picture nor a table that is known")
 
 
 @dataclass(eq=False)
 class Series:
-    """Records of one kind, and in `of` the record of each picture by the picture's index; `by` says how they match."""
+    """Records of one kind, and in `of` the record of each picture by the picture's index; `by` says how they match.
+
+    `alone`: records of no picture. `doubled`: the records of a picture that has several.
+    """
 
     name: str
     records: list[Record]
@@ -39,26 +119,15 @@ class Series:
     alone: list[Record] = field(default_factory=list)
     doubled: dict[int, list[Record]] = field(default_factory=dict)
 
-    @property
-    def count(self) -> int:
-        """Numbers of a pose."""
-        return len(self.records[0].numbers)
-
-    @property
-    def named(self) -> str:
-        """What names beside the numbers said, see `Record`."""
-        return self.records[0].named
-
     def poses(self, reading: Reading) -> dict[int, pin.SE3]:
         """Poses by picture in the unit of the file, without those that the reading makes no pose of."""
         found = {}
         for k, record in self.of.items():
-            if not np.isfinite(record.numbers).all():
-                continue
-            try:
-                found[k] = reading.pose(record.numbers)
-            except ValueError:
-                continue
+            if np.isfinite(record.numbers).all():
+                try:
+                    found[k] = reading.pose(record.numbers)
+                except ValueError:
+                    continue
         return found
 
 
@@ -67,66 +136,63 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
     contents: dict[str, Content] = {}
     unread: list[tuple[str, str]] = []
     for path in listing.texts:
-        name = listing.name(path)
         try:
-            contents[name] = read_content(path)
+            contents[listing.name(path)] = read_content(path)
         except ValueError as error:
-            unread.append((name, str(error)))
+            unread.append((listing.name(path), str(error)))
         except Exception as error:
             # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
-            unread.append((name, f"it cannot be read ({type(error).__name__}): {error}"))
+            unread.append((listing.name(path), f"it cannot be read ({type(error).__name__}): {error}"))
     joined, paired = join_halves([half for content in contents.values() for half in content.halves])
     for name, content in contents.items():
-        if not content.records and not content.links and not any(path in paired for path, _, _ in content.halves):
-            what = (
-                "positions or rotations only: name both files alike, such as R_gripper2base.txt and t_gripper2base.txt"
-            )
-            unread.append((name, f"it holds {what}" if content.halves else f"no pose is in it ({NEEDED} numbers)"))
+        if content.halves and not content.records and not any(path in paired for path, _, _ in content.halves):
+            what = "positions or rotations only: name both files alike, such as R_gripper2base.txt and"
+            unread.append((name, f"it holds {what} t_gripper2base.txt"))
+        elif not (content.records or content.links or content.halves):
+            unread.append((name, f"no pose is in it ({NEEDED} numbers)"))
     groups: dict[tuple[str, str, int], list[Record]] = {}
     for record in joined:
         groups.setdefault((listing.name(record.path), record.field, len(record.numbers)), []).append(record)
-    alike = Counter((path.parent, series_name(path.name)) for path in listing.texts)
+    alike = Counter((path.parent, _series_name(path.name)) for path in listing.texts)
     for content in contents.values():
+        fields = Counter(record.field for record in content.records)
         for record in content.records:
-            source, place = listing.name(record.path), record.field
-            if sum(r.field == record.field for r in content.records) == 1:
+            source, place, kind = listing.name(record.path), record.field, _series_name(record.path.name)
+            if fields[place] == 1:
                 # A folder for each pose: files that are the only one of their kind in theirs are of one series.
-                own = alike[record.path.parent, series_name(record.path.name)] == 1
-                parent = listing.name(record.path.parent)
-                source = series_name(source) if own else (Path(parent) / series_name(record.path.name)).as_posix()
+                own = alike[record.path.parent, kind] == 1
+                source = _series_name(source) if own else (Path(source).parent / kind).as_posix()
                 place = "" if place == "row" else place
             groups.setdefault((source, place, len(record.numbers)), []).append(record)
     found = [
         Series(f"{source}:{place}" if place not in ("", "row") else source, records)
-        for (source, place), records in _apart(groups)
+        for (source, whole, count), some in groups.items()
+        for place, records in _kinds(whole, count, some)
     ]
+    few = [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in found]
+    unread += [said for s, said in zip(found, few, strict=True) if len(s.records) < LEAST]
     links = [link for content in contents.values() for link in content.links]
-    few = [s for s in found if len(s.records) < LEAST]
-    unread += [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in few]
     return [s for s in found if len(s.records) >= LEAST], links, unread
 
 
-def _apart(groups: dict[tuple[str, str, int], list[Record]]) -> list[tuple[tuple[str, str], list[Record]]]:
-    """Groups of records by their source and place, those that hold several kinds of poses taken apart.
+def _kinds(place: str, count: int, records: list[Record]) -> list[tuple[str, list[Record]]]:
+    """Records of one place, those that hold several kinds of poses taken apart.
 
     Of one picture there may be link1 to link8, and only one is the flange. Twelve numbers that are no matrix are two
     times six: joint angles and a pose, in either order.
     """
-    found: list[tuple[tuple[str, str], list[Record]]] = []
-    for (source, place, count), records in groups.items():
-        kinds: dict[str, list[Record]] = {}
-        if len({(r.path, r.label) for r in records}) < len(records):
-            for record in records:
-                kinds.setdefault(record.exact, []).append(record)
-        if len(kinds) > 1:
-            found += [((source, kind), some) for kind, some in kinds.items()]
-        elif count == 12:
-            for half, name in ((slice(0, 6), "numbers1-6"), (slice(6, 12), "numbers7-12")):
-                six = [replace(record, numbers=record.numbers[half]) for record in records]
-                found.append(((source, f"{place}/{name}" if place not in ("", "row") else name), six))
-        else:
-            found.append(((source, place), records))
-    return found
+    kinds: dict[str, list[Record]] = {}
+    if len({(r.path, r.label) for r in records}) < len(records):
+        for record in records:
+            kinds.setdefault(record.exact, []).append(record)
+    if len(kinds) > 1:
+        return list(kinds.items())
+    if count != 12:
+        return [(place, records)]
+    return [
+        (f"{place}/{name}".removeprefix("row/").lstrip("/"), [replace(r, numbers=r.numbers[half]) for r in records])
+        for half, name in ((slice(0, 6), "numbers1-6"), (slice(6, 12), "numbers7-12"))
+    ]
 
 
 def match_series(
@@ -137,38 +203,34 @@ def match_series(
     Raises ConfigError for a folder with several recordings in it.
     """
     names = [listing.name(p) for p in listing.pictures]
-    linked = _linked(names, links)
+    linked: dict[str, int] = {}
+    for link in links:
+        shown = [names.index(v) for v in link.values() if v in names]
+        others = [v for v in link.values() if v not in names]
+        if len(shown) == len(others) == 1:
+            linked[others[0]] = shown[0]
     for one in series:
         single = len({r.path for r in one.records}) == len(one.records)
         own = {r.path.parent for r in one.records}
-        beside = [k for k, p in enumerate(listing.pictures) if p.parent in own] if single else []
-        which = beside or list(range(len(names)))
-        labels = [listing.name(r.path) if single else r.label for r in one.records]
-        by_link = {label: k for k, label in linked.items()}
-        if single and sum(label in by_link for label in labels) >= LEAST:
-            one.by = "table"
-            one.of = {by_link[label]: r for label, r in zip(labels, one.records, strict=True) if label in by_link}
-            one.alone = [r for label, r in zip(labels, one.records, strict=True) if label not in by_link]
-            continue
-        found = match([names[k] for k in which], labels, [r.time for r in one.records])
-        one.by = found.by
-        one.of = {which[k]: one.records[i] for k, i in enumerate(found.of) if i is not None}
+        which = [k for k, p in enumerate(listing.pictures) if p.parent in own] if single else []
+        which = which or list(range(len(names)))
+        labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
+        if single and sum(label in linked for label in labels) >= LEAST:
+            which, of = list(range(len(names))), {linked[x]: k for k, x in enumerate(labels) if x in linked}
+            found = _Match("table", of, [k for k, x in enumerate(labels) if x not in linked])
+        else:
+            found = _match([names[k] for k in which], labels, [r.time for r in one.records])
+        one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
         one.alone = [one.records[i] for i in found.alone]
         one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
     belonging = [s for s in series if s.of]
-    below = _others(belonging, listing)
-    if below:
+    if below := _others(belonging, listing):
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
         listing.pictures = [p for p in listing.pictures if p.parent not in below]
         listing.unread += [(f"{listing.name(p)}/", "a recording of its own: name it with --from") for p in below]
-        kept = [s for s in series if not any(r.path.parent in below for r in s.records)]
-        return match_series(kept, listing, links)
-    strange = [
-        (s.name, f"{len(s.records)} poses for {len(names)} pictures, and none says which picture it belongs to")
-        for s in series
-        if not s.of
-    ]
-    return belonging, strange if names else []
+        return match_series([s for s in series if not any(r.path.parent in below for r in s.records)], listing, links)
+    why = f"poses for {len(names)} pictures, and none says which picture it belongs to"
+    return belonging, [(s.name, f"{len(s.records)} {why}") for s in series if not s.of and names]
 
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
@@ -183,30 +245,108 @@ def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
     return True
 
 
-def _linked(names: Sequence[str], links: Sequence[dict[str, str]]) -> dict[int, str]:
-    """Pose files that a table names beside a picture, by the picture's index."""
-    found = {}
-    for link in links:
-        pictures = [names.index(v) for v in link.values() if v in names]
-        others = [v for v in link.values() if v not in names]
-        if len(pictures) == 1 and len(others) == 1:
-            found[pictures[0]] = others[0]
-    return found
-
-
 def _others(series: Sequence[Series], listing: Listing) -> list[Path]:
     """Sub-folders that are recordings of their own, where the folder itself is one, too.
 
     Raises ConfigError where it is none: their boards and bases need not be the same.
     """
-    owners: set[Path] = set()
-    for one in series:
-        folders = {listing.pictures[k].parent for k in one.of}
-        if len(one.of) >= LEAST_ALONE and len(folders) == 1:
-            owners |= folders
+    folders = [{listing.pictures[k].parent for k in one.of} for one in series if len(one.of) >= LEAST_ALONE]
+    owners = {path for some in folders if len(some) == 1 for path in some}
     if len(owners) > 1 and listing.folder not in owners:
         raise ConfigError(
             f"{listing.folder} holds {len(owners)} recordings, each with poses of its own: "
             f"{', '.join(sorted(map(listing.name, owners)))}; give one of these folders with --from"
         )
     return sorted(owners - {listing.folder}) if len(owners) > 1 else []
+
+
+@dataclass(frozen=True)
+class _Match:
+    """Which label belongs to which picture, by their indices; labels of none, and pictures that have several."""
+
+    by: str
+    of: dict[int, int]
+    alone: list[int]
+    doubled: dict[int, list[int]] = field(default_factory=dict)
+
+
+def _match(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match:
+    """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
+    both = (list(pictures), [label.replace("\\", "/") for label in labels])
+    ways = [
+        ("name", [[of(x) for x in side] for side in both]) for of in (str, lambda x: Path(x).name, _stem, frame_key)
+    ]
+    # A folder for each pose.
+    ways.append(("folder", [[str(Path(x).parent) for x in side] for side in both]))
+    if not any(x.startswith("[") for x in labels):
+        ways.append(("number", [_numbers(side) for side in both]))
+    best = max((_equal(left, right, by) for by, (left, right) in ways), key=lambda found: len(found.of))
+    by_time = _nearest(pictures, labels, times) if len(best.of) < len(pictures) / 2 else None
+    if by_time is None and len(labels) == len(pictures) and len(best.of) < 2:
+        return _Match("order", {k: k for k in range(len(labels))}, [])
+    return by_time or best
+
+
+def _equal(left: list[str], right: list[str], by: str) -> _Match:
+    many: dict[str, list[int]] = {}
+    for k, key in enumerate(right):
+        if key:
+            many.setdefault(key, []).append(k)
+    taken = Counter(left)
+    hits = {k: many[key] for k, key in enumerate(left) if key in many}
+    of = {k: h[0] for k, h in hits.items() if len(h) == 1 and (taken[left[k]] == 1 or by != "name")}
+    doubled = {k: h for k, h in hits.items() if len(h) > 1}
+    used = {*of.values(), *(i for h in doubled.values() for i in h)}
+    return _Match(by, of, [k for k in range(len(right)) if k not in used], doubled)
+
+
+def _numbers(names: list[str]) -> list[str]:
+    """The numbers in each name that differ from name to name, as one word; empty where there is none."""
+    found = [[int(d) for d in re.findall(r"\d+", str(Path(n).with_suffix("")) if "." in n else n)] for n in names]
+    length = Counter(map(len, found)).most_common(1)[0][0] if found else 0
+    usual = [f for f in found if len(f) == length]
+    varying = [k for k in range(length) if len({f[k] for f in usual}) > 1] or list(range(length))[-1:]
+    # A folder's number that goes with the file's adds nothing.
+    if len({tuple(f[k] for k in varying[-1:]) for f in usual}) == len(usual):
+        varying = varying[-1:]
+    return ["-".join(str(f[k]) for k in varying) if len(f) == length and varying else "" for f in found]
+
+
+def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match | None:
+    """The pose of the nearest time, where names and table have times of the same clock."""
+    shown = [_clock(Path(p).name) for p in pictures]
+    told = [t if t is not None and math.isfinite(t) else _clock(x) for t, x in zip(times, labels, strict=True)]
+    timed = [k for k, t in enumerate(told) if t is not None]
+    if len(timed) < 2 or 2 * len(timed) < len(told) or None in shown:
+        return None
+    table = np.array([t for t in told if t is not None])
+    for scale in (1.0, 1e-3, 1e-6, 1e-9):
+        clock = np.array([s for s in shown if s is not None]) * scale
+        apart = np.abs(clock[:, None] - table[None, :])
+        near, reach = apart.argmin(axis=1), 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
+        good = apart.min(axis=1) <= max(reach, 1e-3)
+        if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
+            of = {k: timed[near[k]] for k in np.flatnonzero(good).tolist()}
+            return _Match("time", of, [k for k in range(len(labels)) if k not in of.values()])
+    return None
+
+
+def _clock(name: str) -> float | None:
+    found = CLOCK.search(name)
+    return None if found is None else float(found[0].replace("_", "."))
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    return path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
+
+
+def _series_name(name: str) -> str:
+    """A file's name with its numbers taken out: files of one series have the same."""
+    return re.sub(r"\d+", "N", name.lstrip("_"))
+
+
+def frame_key(name: str) -> str:
+    """What two pictures of one frame have in common: their name without folders and the words for what is in them."""
+    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
+    return "-".join(str(int(w)) if w.isdecimal() else w for w in words if w and not re.fullmatch(ROLES, w))

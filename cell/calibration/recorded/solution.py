@@ -10,25 +10,25 @@ from typing import Any
 import numpy as np
 
 from cell.calibration.collect.stripe_on_board import on_plane
-from cell.calibration.recorded.chain import check_chain, report_chain, solve_chain
-from cell.calibration.recorded.folder import RecordedFrame, used
-from cell.calibration.recorded.result import intrinsics_dict, plane_dict, seen_depths
-from cell.calibration.recorded.stops import by_stop, counted, merged
+from cell.calibration.recorded.chain import (
+    STRIPE_MEANS,
+    Profiles,
+    Rows,
+    check_chain,
+    of_one_plane,
+    report_chain,
+    solve_chain,
+)  # fmt: skip
+from cell.calibration.recorded.frames import RecordedFrame, by_stop, counted, merged, used
+from cell.calibration.recorded.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
 from cell.calibration.solve.camera_checks import camera_checks
-from cell.calibration.solve.checks import Check, Part, refused_parts
+from cell.calibration.solve.checks import Check, refused_parts
 from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.calibration.solve.foreign import FOREIGN, foreign_view, parted_at
 from cell.calibration.solve.given_camera import against_pictures
 from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
-from cell.calibration.solve.plane_checks import (
-    PlaneKnown,
-    crooked,
-    odd_stripes,
-    plane_checks,
-    planes_of_cameras,
-    planes_without_one,
-)
-from cell.calibration.solve.starts import plane_from_board, stripe_means, stripe_pixels, zhang
+from cell.calibration.solve.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
+from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels, zhang
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose
 from cell.vision.board.view import BoardView
@@ -38,17 +38,12 @@ from drivers.errors import RefusedError
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
 ODD_RATIO, ODD_PX = 3.5, 0.4
 LEAST_FRAMES = 3
-OTHER_CAMERAS = ("intrinsics_from_pictures", "intrinsics_without_distortion")
+# Two parts of the pictures are of two cameras where their focal lengths differ by more than both. A bent board and
+# views from one side move that of few pictures by up to a hundredth.
 CHANGED_SIGMAS, CHANGED_SHARE = 4.0, 0.02
-"""Two parts of the pictures are of two cameras where their focal lengths differ by more than both.
-
-A bent board and views from one side move that of few pictures by up to a hundredth.
-"""
+# … and where one camera for both leaves so many times the squares of two; with a zoom of 2 % it leaves 1.1 times. A few
+# views from one side take noise or a bend for another focal length and hardly fit better with it.
 FITS_BETTER = 1.06
-"""… and where one camera for both leaves so many times the squares of two; with a zoom of 2 % it leaves 1.1 times.
-
-A few views from one side take noise or a bend for another focal length and hardly fit better with it.
-"""
 LIKELY_LASER = 0.5
 """Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
@@ -65,22 +60,31 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
     """
     while True:
         kept = used(frames)
-        views = _views(kept)
-        stops = by_stop(kept)
+        views, stops = _views(kept), by_stop(kept)
         apart = _views([merged(s) for s in stops])
         try:
             if given is None:
-                chosen, plain = (_of_all(c, views) for c in choose_lens(apart))
+                # The camera of the stops with the residuals of each picture.
+                found, plain = choose_lens(apart)
+                chosen, plain = (
+                    replace(c, view_rms=np.array([board_pose(view, c.camera).rms_px for view in views]))
+                    for c in (found, plain)
+                )
                 _refuse_change(chosen, apart, [s[0].name for s in stops])
             else:
-                chosen, plain = (given_camera(given, views),) * 2
+                chosen = plain = given_camera(given, views)
         except PictureRefused:
             # One picture whose pose nobody can tell must not take the camera of the others.
-            if not _refuse_without_pose(kept, zhang(apart, lens=False)[0] if given is None else given):
+            rough = zhang(apart, lens=False)[0] if given is None else given
+            for frame in kept:
+                try:
+                    board_pose(_view(frame), rough)
+                except PictureRefused as refused:
+                    frame.refuse(refused.reason, str(refused))
+            if len(used(kept)) == len(kept):
                 raise
             continue
-        worst = int(np.argmax(chosen.view_rms))
-        typical = float(np.median(chosen.view_rms))
+        worst, typical = int(np.argmax(chosen.view_rms)), float(np.median(chosen.view_rms))
         if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
             kept[worst].refuse(
                 Reason.RESIDUAL,
@@ -98,16 +102,12 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
                     "or with another zoom, focus or crop?",
                 )
             continue
-        oblique = False
         for frame in kept:
-            assert frame.view is not None
-            angle = board_pose(frame.view, chosen.camera).obliquity
+            angle = board_pose(_view(frame), chosen.camera).obliquity
             if angle > OBLIQUE:
-                oblique = True
-                frame.refuse(
-                    Reason.OBLIQUE, f"the board is seen {math.degrees(angle):.0f}° from square, allowed are 75°"
-                )
-        if not oblique:
+                text = f"the board is seen {math.degrees(angle):.0f}° from square, allowed are 75°"
+                frame.refuse(Reason.OBLIQUE, text)
+        if len(used(kept)) == len(kept):
             return chosen, plain
 
 
@@ -117,28 +117,20 @@ def rough_camera(frames: Sequence[RecordedFrame], given: CameraModel | None) -> 
     return (given_camera(zhang(views, lens=False)[0] if given is None else given, views),) * 2
 
 
-def _refuse_without_pose(frames: Sequence[RecordedFrame], camera: CameraModel) -> bool:
-    """Refuse frames in which the board's pose cannot be told, by about such a camera; True where there are some."""
-    found = False
-    for frame in frames:
-        assert frame.view is not None
-        try:
-            board_pose(frame.view, camera)
-        except PictureRefused as refused:
-            frame.refuse(refused.reason, str(refused))
-            found = True
-    return found
-
-
 def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:
     """CameraChanged where the pictures from one on are of another camera than those before, by the cameras of both."""
+
+    def squares(views: Sequence[BoardView], camera: CameraModel) -> float:
+        """Sum of the squares in px² by which the views' points miss their places in a camera."""
+        return sum(2 * len(v.ids) * board_pose(v, camera).rms_px ** 2 for v in views)
+
     roomy = replace(found, model=replace(found.model, k1=True, k2=True, one_focal=False))
     for at in parted_at(roomy, views):
         before, after = choose_lens(views[:at])[0], choose_lens(views[at:])[0]
-        focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
-        apart = _squares(views[:at], before.camera) + _squares(views[at:], after.camera)
-        if _squares(views, found.camera) < FITS_BETTER * apart:
+        apart = squares(views[:at], before.camera) + squares(views[at:], after.camera)
+        if squares(views, found.camera) < FITS_BETTER * apart:
             continue
+        focal, sigma = (before.camera.fx, after.camera.fx), (before.sigma[0], after.sigma[0])
         if abs(focal[1] - focal[0]) > max(CHANGED_SIGMAS * float(np.hypot(*sigma)), CHANGED_SHARE * focal[0]):
             raise CameraChanged(
                 f"the pictures up to {names[at - 1]} give fx = {focal[0]:.0f} ± {sigma[0]:.0f} px, those from "
@@ -147,14 +139,9 @@ def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequenc
             )
 
 
-def _squares(views: Sequence[BoardView], camera: CameraModel) -> float:
-    """Sum of the squares in px² by which the views' points miss their places in a camera."""
-    return sum(len(v.ids) * board_pose(v, camera).rms_px ** 2 for v in views)
-
-
-def _of_all(found: Intrinsics, views: Sequence[BoardView]) -> Intrinsics:
-    """The camera of the stops with the residuals of each picture."""
-    return replace(found, view_rms=np.array([board_pose(view, found.camera).rms_px for view in views]))
+def _view(frame: RecordedFrame) -> BoardView:
+    assert frame.view is not None
+    return frame.view
 
 
 def _views(frames: Sequence[RecordedFrame]) -> list[BoardView]:
@@ -185,7 +172,16 @@ def solve_frames(
     notes: list[str] = result["notes"]
     told = sum(f.base_from_flange is not None for f in used(frames))
     posed = agreeing(frames, chosen.camera)
-    disagree = _disagreeing(told - len(posed), told) if posed else []
+    left_out, checks = told - len(posed), []
+    if posed and left_out:
+        # A few are slips.
+        name, text = "frames whose pose disagrees with the others", (
+            f"{left_out} of {told} are left out for it, too many for slips: was the camera's zoom, focus or mount, or "
+            "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself"
+        )  # fmt: skip
+        share = 100 * left_out / told
+        checks = [Check("hand_eye", name, share, 25.0, 40.0, "%", text)]
+        checks.append(Check("intrinsics", name, share, 25.0, math.inf, "%", text))
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = camera_of(frames, given)
@@ -197,26 +193,22 @@ def solve_frames(
     result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
     stops = [merged(stop) for stop in by_stop(rest)]
     if len(stops) < len(rest):
-        notes.append(
-            f"{counted(len(rest), len(stops))}: pictures of one stop share its error and count as one frame, their mean"
-        )
+        same = "pictures of one stop share its error and count as one frame, their mean"
+        notes.append(f"{counted(len(rest), len(stops))}: {same}")
     views = _views(stops)
-    beside: list[Check] = []
     if given is not None:
         chosen, beside = against_pictures(chosen, views)
-        plain = chosen
+        plain, checks = chosen, beside + checks
     result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
     result["intrinsics_without_distortion"] = intrinsics_dict(plain)
-    checks = beside + disagree + camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
+    checks += camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
     if posed:
         if len(rest) > len(posed):
-            notes.append(
-                f"{len(rest) - len(posed)} used frames have no flange pose: they count for the intrinsics only"
-            )
+            more = len(rest) - len(posed)
+            notes.append(f"{more} used frames have no flange pose: they count for the intrinsics only")
+        hold = hold_camera or given is not None
         try:
-            chain = solve_chain(
-                [merged(stop) for stop in by_stop(posed)], chosen, setup, hold_camera or given is not None
-            )
+            chain = solve_chain([merged(stop) for stop in by_stop(posed)], chosen, setup, hold)
             checks += check_chain(chain, chosen)
             report_chain(chain, chosen, result)
         except (RefusedError, np.linalg.LinAlgError) as error:
@@ -226,21 +218,6 @@ def solve_frames(
     if result["light_plane"] is None and result["hand_eye"] is None:
         checks += _report_plane(stops, chosen, result)
     apply_checks(checks, result)
-
-
-def _disagreeing(left_out: int, count: int) -> list[Check]:
-    """How many of the frames with a pose are left out because it disagrees with the others: a few are slips."""
-    if left_out == 0:
-        return []
-    parts: tuple[tuple[Part, float], ...] = (("hand_eye", 40.0), ("intrinsics", math.inf))
-    return [
-        Check(
-            part, "frames whose pose disagrees with the others", 100 * left_out / count, 25.0, refused, "%",
-            f"{left_out} of {count} are left out for it, too many for slips: was the camera's zoom, focus or mount, or "
-            "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself",
-        )
-        for part, refused in parts
-    ]  # fmt: skip
 
 
 def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
@@ -266,15 +243,15 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
     result["checks"] = [check.as_dict() for check in checks]
     result["notes"] += [f"doubtful: {check.text}" for check in checks if check.verdict == "doubt"]
     failed = {part: "; ".join(check.text for check in found) for part, found in refused_parts(checks).items()}
+    gone = dict(failed)
     if "intrinsics" in failed:
         for part in ("hand_eye", "light_plane"):
-            if result[part] is not None and part not in failed:
-                failed[part] = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
-        for name in OTHER_CAMERAS:
-            result["refused_values"][name] = result[name]
-            result[name] = None
-    for part, text in failed.items():
-        result["refused"][part] = text
+            if result[part] is not None:
+                rests = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
+                failed.setdefault(part, rests)
+        gone = dict.fromkeys(CAMERAS[1:], "") | failed
+    result["refused"] |= failed
+    for part in gone:
         result["refused_values"][part] = result[part]
         result[part] = None
     if "hand_eye" in failed or "light_plane" in failed:
@@ -283,54 +260,36 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
 
 def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[Check]:
     """The light plane from pictures alone, when the stripe is in them, and its checks."""
-    camera = pictures.camera
-    views = _views(frames)
+    camera, views, wrong = pictures.camera, _views(frames), dict[int, str]()
     profiles = [f.profile for f in frames]
-    left_out = 0
-    notes: list[str] = result["notes"]
     if sum(p is not None for p in profiles) < 2:
-        notes.append("no light plane: fewer than two frames show a laser stripe")
+        result["notes"].append("no light plane: fewer than two frames show a laser stripe")
         return []
     poses = [board_pose(v, camera).camera_from_board for v in views]
-    while True:
-        try:
-            plane = plane_from_board(camera, poses, views, profiles)
-        except RefusedError as error:
-            result["refused"]["light_plane"] = f"no light plane: {error}"
-            return []
-        clouds = [
+
+    def fit(lit: Profiles) -> tuple[PlaneStart, Rows, Sequence[Array]]:
+        plane = plane_from_board(camera, poses, views, lit)
+        on_boards = [
             np.zeros((0, 3)) if p is None or not len(r) else on_plane(camera, pose, stripe_pixels(p, r))
-            for p, r, pose in zip(profiles, plane.rows, poses, strict=True)
+            for p, r, pose in zip(lit, plane.rows, poses, strict=True)
         ]
-        wrong = odd_stripes(clouds)
-        noise = []
-        for k, (p, r) in enumerate(zip(profiles, plane.rows, strict=True)):
-            if p is not None and len(r):
-                means = stripe_means(p, r, 120)
-                noise.append(float(np.sqrt(np.mean(means[1] ** 2))))
-                text = crooked(camera, *means)
-                if text is not None:
-                    wrong[k] = text
-        if not wrong:
-            break
-        notes += [f"{frames[k].name}: {text} Its stripe is not used." for k, text in wrong.items()]
-        profiles = [None if k in wrong else p for k, p in enumerate(profiles)]
-        left_out += len(wrong)
-    seen = [stripe_pixels(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None]
+        return plane, plane.rows, on_boards
+
+    try:
+        plane, clouds = of_one_plane(profiles, camera, fit, wrong)
+    except RefusedError as error:
+        result["refused"]["light_plane"] = f"no light plane: {error}"
+        return []
+    finally:
+        result["notes"] += [f"{frames[k].name}: {text} Its stripe is not used." for k, text in wrong.items()]
+    profiles = [None if k in wrong else p for k, p in enumerate(profiles)]
+    both = [(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None and len(r)]
+    noise = [float(np.mean(stripe_means(p, r, STRIPE_MEANS)[1] ** 2)) for p, r in both]
     cloud: Array = np.concatenate(clouds)
-    lit = sum(len(c) > 0 for c in clouds)
-    others = planes_without_one(clouds)
     moved = planes_of_cameras(pictures, views, profiles, plane.rows)
-    known = PlaneKnown.of(plane.plane, others, cloud, moved)
-    own = float(np.sqrt(np.mean(np.square(noise)))) * float(np.median(cloud[:, 2])) / camera.fx
-    result["light_plane"] = {
-        **plane_dict(plane.plane),
-        "rms_mm": 1e3 * plane.rms,
-        "depth_range_mm": seen_depths(plane.plane, camera, seen),
-        "sigma_place_mm": None if known is None else 1e3 * known.place,
-        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
-        "stripe_noise_mm": 1e3 * own,
-        "method": "fit on the board's poses",
-    }
+    known = PlaneKnown.of(plane.plane, planes_without_one(clouds), cloud, moved)
+    own = float(np.sqrt(np.mean(noise))) * float(np.median(cloud[:, 2])) / camera.fx
+    depths = seen_depths(plane.plane, camera, [stripe_pixels(p, r) for p, r in both])
+    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths)
     result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-    return plane_checks(plane.rms, own, cloud, lit, known, left_out)
+    return plane_checks(plane.rms, own, cloud, len(both), known, len(wrong))

@@ -50,6 +50,24 @@ class Source:
     view: BoardView
     off: Path | None = None
 
+    def picture(self) -> Shot | None:
+        """The picture in colour, None where it cannot be read or has another size than the board's."""
+        try:
+            image = read_colours(self.path)
+        except PictureRefused:
+            return None
+        return image if (image.shape[1], image.shape[0]) == self.view.size else None
+
+    def sheet(self) -> NDArray[np.bool_]:
+        """Mask (h, w) of the board with what is around its points: outer squares and margin."""
+        flat = self.view.object_points[:, :2] / self.view.spec.pitch
+        homography, _ = cv2.findHomography(flat, self.view.pixels)
+        mask = np.zeros(self.view.size[::-1], np.uint8)
+        (x0, y0), (x1, y1) = flat.min(axis=0) - AROUND, flat.max(axis=0) + AROUND
+        corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], dtype=np.float64)
+        cv2.fillConvexPoly(mask, np.round(cv2.perspectiveTransform(corners, homography)[0]).astype(np.int32), 1)
+        return mask > 0
+
 
 @dataclass(frozen=True)
 class ReadStripe:
@@ -100,17 +118,15 @@ def choose_channel(sources: Sequence[Source], laser: Laser | None) -> Channel:
 
 def _may_show_line(source: Source) -> bool:
     """Whether some mix of colours has a thin line on the board that is brighter than its white: a quick look."""
-    try:
-        picture = subtracted(read_colours(source.path), None, StripeSettings())[0]
-    except PictureRefused:
+    image, sheet = source.picture(), source.sheet()
+    if image is None:
         return False
-    sheet = _sheet(source.view)
-    box = tuple(
-        slice(int(np.flatnonzero(sheet.any(axis=k)).min()), np.flatnonzero(sheet.any(axis=k)).max() + 1) for k in (1, 0)
-    )
+    picture = subtracted(image, None, StripeSettings())[0]
+    left, top, width, height = cv2.boundingRect(sheet.astype(np.uint8))
+    box = slice(top, top + height), slice(left, left + width)
     for mix in MIXES if picture.coloured else ("grey",):
         plane = picture.plane(mix)[0]
-        needed = min(LASER_OVER_WHITE * max(_white(plane, source.view), 0.0) + OVER_DN, SATURATED_DN)
+        needed = _needed(_white(plane, source.view))
         part = np.where(sheet[box], cv2.GaussianBlur(plane[box], (0, 0), 1.0), OUTSIDE_DN)
         for lines in (part, part.T):
             wide = np.pad(lines, ((0, 0), (BESIDE_PX, BESIDE_PX)), constant_values=OUTSIDE_DN)
@@ -132,14 +148,13 @@ def read_on_board(source: Source, channel: Channel) -> ReadStripe:
     """The stripe on the board of a picture, along rows or columns, whichever shows more of it."""
     if source.path in channel.reads or channel.chosen is None:
         return channel.reads.get(source.path, ReadStripe())
-    try:
-        image = read_colours(source.path)
-    except PictureRefused:
+    image, sheet, off = source.picture(), source.sheet(), None
+    if image is None:
         return ReadStripe()
-    if (image.shape[1], image.shape[0]) != source.view.size:
-        return ReadStripe()
-    sheet = _sheet(source.view)
-    off = None if source.off is None else _calming(image, source.off, sheet)
+    if source.off is not None:
+        # A picture without the laser of another exposure would not take the board away.
+        dark, left = _without(image, source.off, sheet)
+        off = dark if left < CALMER else None
     found = []
     for axis in ("rows", "columns"):
         try:
@@ -172,11 +187,10 @@ def _on_board(
         return ReadStripe(points=smooth)
     mix = _mix(profile)
     plane = picture.plane(mix)[0] if off is None else picture.plane(mix)[0] - off.plane(mix)[0]
-    levels = plane[at[lit, 1], at[lit, 0]]
-    level = float(np.median(levels))
-    white = _white(plane, view)
-    needed = min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, SATURATED_DN)
-    among = _among(view, profile.pixels()[lit])
+    levels, white = plane[at[lit, 1], at[lit, 0]], _white(plane, view)
+    level, needed = float(np.median(levels)), _needed(white)
+    hull = cv2.convexHull(view.pixels.astype(np.float32))
+    among = np.array([cv2.pointPolygonTest(hull, (float(x), float(y)), False) > 0 for x, y in profile.pixels()[lit]])
     if level > needed and among.sum() >= LEAST_SMOOTH_ROWS:
         # Edges of the squares are no brighter there than the white, whatever shines outside.
         level = min(level, float(np.percentile(levels[among], 75)))
@@ -186,16 +200,9 @@ def _on_board(
             f"board's white with {white:.0f} DN (in {mix}; needed is {needed:.0f}): it may be the board's own. {NEXT}"
         )
         return ReadStripe(None, text, points=smooth)
-    return _without_marked(profile, on_board, smooth)
-
-
-def _without_marked(profile: StripeProfile, on_board: NDArray[np.bool_], smooth: int) -> ReadStripe:
-    """The profile without points that a second line or a reflection may have moved; None where no line is left.
-
-    A mark of most points tells nothing of single ones: faint light all along a stripe is its halo, and they stay.
-    """
-    marks = profile.marks
-    second, faint = ((marks & np.uint8(mark)) > 0 for mark in (Mark.SECOND_LINE, Mark.REFLECTION))
+    # Points that a second line or a reflection may have moved do not count. A mark of most points tells nothing of
+    # single ones: faint light all along a stripe is its halo, and they stay.
+    second, faint = ((profile.marks & np.uint8(mark)) > 0 for mark in (Mark.SECOND_LINE, Mark.REFLECTION))
     rest = on_board & ~second
     if (faint & rest).sum() > MOST_MARKED * rest.sum():
         faint = np.zeros_like(faint)
@@ -218,30 +225,19 @@ def _white(plane: NDArray[np.float32], view: BoardView) -> float:
     return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
 
 
-def _among(view: BoardView, pixels: Array) -> NDArray[np.bool_]:
-    """Which of the points (n, 2) lie among the board's own points."""
-    hull = cv2.convexHull(view.pixels.astype(np.float32))
-    return np.array([cv2.pointPolygonTest(hull, (float(x), float(y)), False) > 0 for x, y in pixels], dtype=np.bool_)
+def _needed(white: float) -> float:
+    """How bright in DN a line has to be on such a board."""
+    return min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, SATURATED_DN)
 
 
 def calmest(path: Path, offs: Sequence[Path], view: BoardView) -> Path:
     """Of pictures without the laser, one or more, the one that takes most of the board away from the picture `path`."""
-    if len(offs) == 1:
+    source = Source(path, view)
+    image = source.picture() if len(offs) > 1 else None
+    if image is None:
         return offs[0]
-    try:
-        image = read_colours(path)
-    except PictureRefused:
-        return offs[0]
-    if (image.shape[1], image.shape[0]) != view.size:
-        return offs[0]
-    sheet = _sheet(view)
+    sheet = source.sheet()
     return min(offs, key=lambda off: _without(image, off, sheet)[1])
-
-
-def _calming(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> Shot | None:
-    """The picture without the laser, if it is of the same exposure: if the board vanishes when it is taken off."""
-    off, left = _without(image, path, sheet)
-    return off if left < CALMER else None
 
 
 def _without(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> tuple[Shot | None, float]:
@@ -266,14 +262,3 @@ def _straight(centres: Array, follows: NDArray[np.bool_]) -> int:
     dx, dy, x, y = cv2.fitLine(points, cv2.DIST_WELSCH, 0, 0.01, 0.01).ravel()
     near = int((np.abs((points[:, 0] - x) * dy - (points[:, 1] - y) * dx) < STRAIGHT_PX).sum())
     return near if near > LEAST_STRAIGHT * len(rows) else 0
-
-
-def _sheet(view: BoardView) -> NDArray[np.bool_]:
-    """Mask (h, w) of the board with what is around its points: outer squares and margin."""
-    flat = view.object_points[:, :2] / view.spec.pitch
-    homography, _ = cv2.findHomography(flat, view.pixels)
-    mask = np.zeros(view.size[::-1], np.uint8)
-    (x0, y0), (x1, y1) = flat.min(axis=0) - AROUND, flat.max(axis=0) + AROUND
-    corners = np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], dtype=np.float64)
-    cv2.fillConvexPoly(mask, np.round(cv2.perspectiveTransform(corners, homography)[0]).astype(np.int32), 1)
-    return mask > 0

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.folder import RecordedFrame
-from cell.calibration.recorded.stops import by_stop, merged
+from cell.calibration.recorded.frames import RecordedFrame, by_stop, merged
 from cell.calibration.solve.hand_eye import park_martin
 from cell.geometry.camera import Array, CameraModel
 from cell.vision.board.board import board_pose

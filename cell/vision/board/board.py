@@ -50,11 +50,12 @@ class BoardPose:
     obliquity: float
 
 
-def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None) -> BoardView:
+def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None, *, quick: bool = False) -> BoardView:
     """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
 
-    `size` is the expected (width, height). Raises PictureRefused with the reason: black, saturated, wrong size, no
-    board, ambiguous order, mirrored.
+    `size` is the expected (width, height). A `quick` search measures chessboard corners in small windows, several times
+    less exactly: enough to tell which board is seen, and about where. Raises PictureRefused with the reason: black,
+    saturated, wrong size, no board, ambiguous order, mirrored.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
@@ -63,7 +64,7 @@ def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = Non
         return without_outliers(_find_dots(image, spec))
     if spec.kind == "aprilgrid":
         return without_outliers(find_tags(image, spec))
-    found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec)
+    found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec, quick)
     return without_outliers(found)
 
 

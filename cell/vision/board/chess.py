@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
-from cell.vision.board.corner_fit import fit_corners
+from cell.vision.board.corner_fit import WINDOW_SHARE, fit_corners
 from cell.vision.board.corners import Corners, corner_lattices, find_corners
 from cell.vision.board.ends import check_chess_ends, grey
 from cell.vision.board.identify import Places, by_outline
@@ -24,6 +24,8 @@ LEAST_CORNERS = 6
 LEAST_SHARE = 0.5
 LEAST_SIGMA_PX = 0.0025
 LEAST_COLOURS = 0.85
+# A window of a quick search is so much of the distance to the next corner.
+QUICK_SHARE = 0.25
 # Of the places of a next row; clutter may look like a corner here and there.
 MOST_BEYOND = 0.4
 # The picture is searched at half its size first, where noise and blur are less.
@@ -33,10 +35,10 @@ STREAK_PX = 31
 STREAK_SHARE = 0.15
 
 
-def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
-    """The inner corners of a chessboard in an 8-bit image (h, w). Raises PictureRefused."""
+def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> BoardView:
+    """The inner corners of a chessboard in an 8-bit image (h, w); `quick` in small windows. Raises PictureRefused."""
     least = max(LEAST_CORNERS, int(0.3 * len(spec.lattice())))
-    lit = laser_streaks(image)
+    lit, share = laser_streaks(image), QUICK_SHARE if quick else WINDOW_SHARE
     refusals: list[PictureRefused] = []
     for scale in SCALES:
         if scale * min(image.shape) < 100:
@@ -48,7 +50,7 @@ def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
         views = []
         for index, places in corner_lattices(corners, least):
             try:
-                views.append(_view(image, lit, spec, corners, index, places))
+                views.append(_view(image, lit, spec, corners, index, places, share))
             except PictureRefused as refused:
                 refusals.append(refused)
         if views:
@@ -61,7 +63,13 @@ def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
 
 
 def _view(
-    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places
+    image: Image,
+    lit: Image,
+    spec: BoardSpec,
+    corners: Corners,
+    index: NDArray[np.intp],
+    places: Places,
+    share: float,
 ) -> BoardView:
     index, places = _extended(corners, index, places, spec.name)
     pixels = corners.places[index]
@@ -77,7 +85,7 @@ def _view(
     even = order[known].sum(axis=1) % 2 == 0
     first_is_dark = bool((dark_first == even).mean() > 0.5)
     dark = np.asarray((lattice.sum(axis=1) % 2 == 0) == first_is_dark, dtype=np.bool_)
-    measured, sigma, contrast = fit_corners(image, starts, plane.steps(flat), dark)
+    measured, sigma, contrast = fit_corners(image, starts, plane.steps(flat), dark, share)
     good = np.isfinite(sigma)
     if lit.any():
         good &= ~_near(lit, starts, 5)

@@ -5,6 +5,7 @@ What is searched is the crossing itself, so that a part of a board is enough, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -99,8 +100,10 @@ def corner_lattices(corners: Corners, least: int) -> Iterator[tuple[NDArray[np.i
     near, neighbours = tree.query(corners.places, k=min(n, 13))
     distances, who = np.asarray(near), np.asarray(neighbours)
 
+    dark: list[float] = corners.dark.tolist()
+
     def opposite(a: int, b: int) -> bool:
-        return bool(free[b]) and abs(np.sin(corners.dark[a] - corners.dark[b])) > 0.7
+        return bool(free[b]) and abs(math.sin(dark[a] - dark[b])) > 0.7
 
     tries = 0
     # Regular surroundings first: the corners whose fourth neighbour is not much farther than the first.

@@ -153,7 +153,8 @@ def check_chess_ends(image: Image, spec: BoardSpec, plane: PlaneMap) -> None:
     ):
         k = np.arange(count + 1)[:, None] - 0.5
         line = np.array(start) + k * np.array(along)
-        at = np.array([grey(smooth, plane.pixels(line + share * np.array(out))) for share in OUTWARD])
+        places = (line + OUTWARD[:, None, None] * np.array(out)).reshape(-1, 2)
+        at = grey(smooth, plane.pixels(places)).reshape(len(OUTWARD), -1)
         inner, differences = at[0], np.diff(at, axis=1)
         difference = differences[0]
         # Not a number where the line lies outside the picture: there no end is seen.

@@ -5,6 +5,7 @@ Lattice places are whole steps along two neighbour vectors of the picture; `iden
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ Places = NDArray[np.intp]
 TOLERANCE = 0.27
 SIZE_RATIO = 1.7
 SEEDS = 12
+WAYS = ((0, 1), (0, -1), (1, 1), (1, -1))
+"""Neighbours: axis and sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,28 +101,29 @@ def grow(
     `alike(a, b)` says whether b can be a neighbour of a.
     """
     found = {(0, 0): seed}
-    steps = {seed: [basis[0], basis[1]]}
-    taken = {seed}
+    points: list[tuple[float, float]] = centres.tolist()
+    steps = {seed: [(float(basis[0][0]), float(basis[0][1])), (float(basis[1][0]), float(basis[1][1]))]}
     queue = [(0, 0)]
     while queue:
         place = queue.pop(0)
         here = found[place]
-        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            there = (place[0] + sign, place[1]) if axis == 0 else (place[0], place[1] + sign)
-            if there in found:
+        (x, y), own = points[here], steps[here]
+        ways = [
+            (axis, sign) for axis, sign in WAYS if (place[0] + sign * (not axis), place[1] + sign * axis) not in found
+        ]
+        if not ways:
+            continue
+        reach = TOLERANCE * min(math.hypot(*own[0]), math.hypot(*own[1]))
+        guesses = np.array([(x + sign * own[axis][0], y + sign * own[axis][1]) for axis, sign in ways])
+        near = [np.asarray(part).tolist() for part in tree.query(guesses)]
+        for (axis, sign), distance, blob in zip(ways, *near, strict=True):
+            if distance > reach or blob in steps or not alike(here, blob):
                 continue
-            step = steps[here][axis]
-            across = steps[here][1 - axis]
-            guess = centres[here] + sign * step
-            reach = TOLERANCE * min(np.linalg.norm(step), np.linalg.norm(across))
-            distance, blob = tree.query(guess)
-            if distance > reach or int(blob) in taken or not alike(here, int(blob)):
-                continue
-            measured = sign * (centres[blob] - centres[here])
-            local = list(steps[here])
-            local[axis] = measured
-            found[there] = int(blob)
-            steps[int(blob)] = local
-            taken.add(int(blob))
-            queue.append(there)
+            there = points[blob]
+            local = list(own)
+            local[axis] = sign * (there[0] - x), sign * (there[1] - y)
+            steps[blob] = local
+            beside = (place[0] + sign * (not axis), place[1] + sign * axis)
+            found[beside] = blob
+            queue.append(beside)
     return found
