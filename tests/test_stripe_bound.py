@@ -1,4 +1,4 @@
-"""Promises of the stripe's centres beside the Cramér–Rao bound, of their stated deviations, and of both engines."""
+"""Promises of the stripe's centres beside the Cramér–Rao bound, and of their stated deviations."""
 
 from __future__ import annotations
 
@@ -40,22 +40,6 @@ def test_the_stated_deviation_is_not_too_small_under_speckle(cell):
     if cell.contrast < 0.3:
         assert row["efficiency"] > 0.85
         assert row["stated_over_true"] < 1.2
-
-
-@pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 150, 0.2), Cell(3, 600)])
-def test_both_engines_agree(cell):
-    image, _ = draw(cell, SMALL, 5)
-    compiled, plain = extract(image, engine="compiled"), extract(image, engine="numpy")
-    np.testing.assert_array_equal(compiled.valid, plain.valid)
-    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
-    assert np.nanmax(np.abs(compiled.sigma / plain.sigma - 1)) < 1e-2
-
-
-def test_both_engines_agree_with_a_dark_frame():
-    image, _ = draw(Cell(2, 100), SMALL, 6)
-    dark, _ = draw(Cell(2, 0.001), SMALL, 7)
-    compiled, plain = (extract(image, dark, engine=engine) for engine in ("compiled", "numpy"))
-    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
 
 
 def test_a_dark_frame_makes_the_deviation_larger_and_true():

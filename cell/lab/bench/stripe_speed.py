@@ -45,7 +45,6 @@ def compare(progress: Callable[[float, str], None], repeats: int = 5) -> dict[st
         ("ours, single pictures with speckle contrast 0.2", _each(extract), speckled),
         ("ours, single pictures, speckle declared absent", _each(lambda i: extract(i, settings=known)), plain),
         ("ours, single pictures, along columns", _each(lambda i: extract(i, axis="columns")), turned),
-        ("ours, numpy engine", _each(lambda i: extract(i, engine="numpy")), plain[:3]),
         ("numpy centre of gravity", _each(centre_of_gravity), plain[:8]),
         ("OpenCV separable Steger", _each(opencv_steger), plain[:3]),
         ("our Steger, with peaks and sigmas", _each(lambda i: extract(i, method=Method.STEGER)), plain[:3]),

@@ -6,12 +6,11 @@ attains the bound (docs/theory.md, section 5). What a centre means in space is t
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cell import compiled
 from cell.vision.stripe.careful import read_carefully
 from cell.vision.stripe.look import choose_mix
 from cell.vision.stripe.planes import FULL, Picture, as_picture
@@ -36,7 +35,6 @@ def extract(
     settings: StripeSettings | None = None,
     *,
     method: Method | str = Method.MAXIMUM_LIKELIHOOD,
-    engine: Literal["auto", "compiled", "numpy"] = "auto",
     like: StripeProfile | None = None,
     laser: Laser | str = Laser.AUTO,
 ) -> StripeProfile:
@@ -44,18 +42,15 @@ def extract(
 
     8 or 16 bits, 10 to 14 of them at either end; colours red first; alpha is left out. `laser` names the channel to
     read, "auto" finds that in which the laser stands out. `dark` is a frame of the same view without the laser and is
-    subtracted; its noise counts, and where it is bright it tells the surface's albedo. `engine` "numpy" does without
-    the compiler, as "auto" does where there is none. `like` is the profile of an earlier picture of the same scene,
-    whose noise, speckle and profile hold for this one as far as it has them; None: they are measured, where the
-    settings do not declare them. An ordinary grey 8-bit picture takes .5 ms; what is not ordinary is read carefully
+    subtracted; its noise counts, and where it is bright it tells the surface's albedo. `like` is the profile of an
+    earlier picture of the same scene, whose noise, speckle and profile hold for this one as far as it has them; None:
+    they are measured, where the settings do not declare them. An ordinary grey 8-bit picture takes .5 ms; what is not ordinary is read carefully
     and takes a hundred times that. Raises ValueError for an image of another type, a dark frame of another size, an
     unknown method or laser, `PictureRefused` for a picture that is blinded.
     """
     settings = settings or StripeSettings()
     method, laser = Method(method), Laser(laser)
     _check(image, dark)
-    if engine == "compiled" and not compiled.AVAILABLE:
-        raise ValueError('engine "compiled": numba is missing or switched off here; take "numpy" or "auto"')
     plain = image.ndim == 2 and image.dtype == np.uint8
     likelihood = method is Method.MAXIMUM_LIKELIHOOD
     if not plain:
@@ -63,8 +58,7 @@ def extract(
         if not picture.plain and likelihood:
             return _carefully(picture, dark, axis, settings, laser, like, None)
         image, dark = _one_plane(picture, dark, laser, settings)
-    quick = compiled.AVAILABLE and engine != "numpy"
-    profile, verdict = read_quickly(image, dark, axis, settings, method, quick, like)
+    profile, verdict = read_quickly(image, dark, axis, settings, method, like)
     if verdict is Verdict.ORDINARY or not likelihood:
         return profile
     starts = profile.centres if _trusted(profile) else None

@@ -17,7 +17,6 @@ from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe import find as find
 from cell.vision.stripe import fit as fit
 from cell.vision.stripe import search as stripe_search
-from cell.vision.stripe import without_compiler as stripe_numpy
 from cell.vision.stripe.belief import believe
 from cell.vision.stripe.methods import METHODS
 from cell.vision.stripe.noise import pixel_noise
@@ -55,7 +54,7 @@ class Verdict(Enum):
 
 
 def read_quickly(
-    image: Image, dark: Any, axis: Axis, settings: StripeSettings, method: Method, quick: bool,
+    image: Image, dark: Any, axis: Axis, settings: StripeSettings, method: Method,
     like: StripeProfile | None,
 ) -> tuple[StripeProfile, Verdict]:  # fmt: skip
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
@@ -66,8 +65,7 @@ def read_quickly(
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
-    search = (stripe_search if quick else stripe_numpy).find_lines
-    several = search(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
+    several = stripe_search.find_lines(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
@@ -77,7 +75,7 @@ def read_quickly(
     of_dark = (0.0, 0.0) if dark is None else (noise2 / frames, gain * (1 + 1 / frames))
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
-        (fit if quick else stripe_numpy).fit_lines(
+        fit.fit_lines(
             work, cut, cut_at, shade, start, widths, np.log(widths), which, settings.saturation_dn,
             (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
         )  # fmt: skip
