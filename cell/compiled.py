@@ -21,8 +21,8 @@ except Exception as error:  # A numba that does not fit the installed numpy or L
     _reason = f"{type(error).__name__}: {error}"
 if not AVAILABLE:
     warnings.warn(
-        f"numba cannot compile here ({_reason}): a picture's stripe takes seconds, calibrations and clouds are made some "
-        "hundred times slower, so that a job's steps run past their deadlines. Reinstall numba",
+        f"numba cannot compile here ({_reason}): a picture's stripe takes seconds, calibrations and clouds are made "
+        "some hundred times slower, so that a job's steps run past their deadlines. Reinstall numba",
         RuntimeWarning,
         stacklevel=2,
     )

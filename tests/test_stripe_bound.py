@@ -8,10 +8,9 @@ import pytest
 from cell.lab.bench.stripe_accuracy import measure
 from cell.lab.bench.stripe_truth import Cell, bound, draw
 from cell.vision.pictures import PictureRefused
-from cell.vision.stripe.extract import Method, StripeSettings, extract
+from cell.vision.stripe.extract import StripeSettings, extract
 from cell.vision.stripe.stream import BLOCK, StripeStream, extract_all
 
-LIKELIHOOD = (Method.MAXIMUM_LIKELIHOOD,)
 SMALL = (256, 384)
 
 
@@ -25,7 +24,7 @@ def test_the_bound_is_the_published_one(cell, published):
 
 @pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 100), Cell(3, 220), Cell(2, 100, slope=0.15)])
 def test_without_speckle_the_bound_is_attained_and_the_deviation_true(cell):
-    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    row = measure(cell)
     assert row["efficiency"] >= 0.95
     assert abs(row["bias_px"]) < 0.005
     assert row["stated_over_true"] == pytest.approx(1.0, abs=0.1)
@@ -34,7 +33,7 @@ def test_without_speckle_the_bound_is_attained_and_the_deviation_true(cell):
 
 @pytest.mark.parametrize("cell", [Cell(1.2, 100, 0.2), Cell(2, 100, 0.2), Cell(3, 60, 0.5)])
 def test_the_stated_deviation_is_not_too_small_under_speckle(cell):
-    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    row = measure(cell)
     assert row["stated_over_true"] > 0.95
     assert row["found"] > 0.98
     if cell.contrast < 0.3:
@@ -52,16 +51,6 @@ def test_a_dark_frame_makes_the_deviation_larger_and_true():
         assert np.nanmedian(profile.sigma) > 1.1 * np.nanmedian(extract(image, settings=settings).sigma)
         z.append((profile.centres - centres) / profile.sigma)
     assert np.sqrt(np.nanmean(np.square(z))) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize("method", list(Method))
-def test_every_method_finds_the_stripe_with_a_deviation(method):
-    image, centres = draw(Cell(2, 150), SMALL, 1)
-    profile = extract(image, method=method)
-    assert profile.valid.mean() > 0.99
-    error = profile.centres - centres
-    assert np.sqrt(np.nanmean(error**2)) < (0.4 if method is Method.EXTREME_VALUE else 0.12)
-    assert np.nanmin(profile.sigma) > 0
 
 
 def test_where_a_reflection_is_brighter_the_neighbours_say_which_is_the_stripe():
@@ -89,11 +78,6 @@ def test_peaks_that_jump_from_line_to_line_have_a_centre_and_a_deviation():
 def test_a_blinded_picture_is_refused():
     with pytest.raises(PictureRefused, match="saturated"):
         extract(np.full((480, 640), 255, np.uint8))
-
-
-def test_an_unknown_method_is_named():
-    with pytest.raises(ValueError, match="parabola"):
-        extract(np.zeros((64, 64), np.uint8), method="parabola")
 
 
 def test_a_stream_on_two_cores_gives_the_profiles_of_one_in_order():

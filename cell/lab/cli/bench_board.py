@@ -8,11 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cell.cli.options import JsonOption, print_json, wide_console
-
-
-def register(bench: typer.Typer) -> None:
-    """Add the command to the bench."""
-    bench.command(name="board")(board)
+from cell.lab.cli.shown import bar, counted, formed, show
 
 
 def board(
@@ -44,12 +40,9 @@ def board(
     chosen = [c for c in CONDITIONS if not condition or any(text in c.name for text in condition)]
     if not chosen:
         raise ConfigError(f"no condition is named like that; there are: {', '.join(c.name for c in CONDITIONS)}")
-    with _progress(views * len(kinds) * len(chosen)) as advance:
-        report = campaign(views, seed, kinds, chosen, advance)
-    if json:
-        print_json(report)
-    else:
-        _print(report)
+    with bar() as told:
+        report = campaign(views, seed, kinds, chosen, counted(told, views * len(kinds) * len(chosen)))
+    show(report, json, _print)
     if report["wrong"]:
         raise typer.Exit(1)
 
@@ -89,71 +82,33 @@ def _one(picture: Path, name: str, json: bool) -> None:
         )
 
 
-class _progress:
-    """A progress bar on standard error that counts views."""
-
-    def __init__(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.completed:>5.0f} of {task.total:.0f} views"),
-            BarColumn(bar_width=30),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.description}"),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task("", total=total)
-
-    def __enter__(self) -> Any:
-        self._bar.start()
-        return lambda text: self._bar.update(self._task, advance=1, description=text)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-
-COLUMNS = (
-    ("views", "views", "{:d}"),
-    ("found %", "found", "{:.1%}"),
-    ("refused %", "refused", "{:.1%}"),
-    ("wrong", "wrong", "{:d}"),
-    ("points px", "centre_rms_px", "{:.3f}"),
-    ("pose mm", "pose_mm", "{:.3f}"),
-    ("mrad", "pose_mrad", "{:.3f}"),
-    ("z", "z", "{:.2f}"),
-    ("z of the axes", "z_axes", "{}"),
-    ("in 95 %", "coverage_95", "{:.1%}"),
-    ("found ms", "found_ms", "{:.0f}"),
-    ("refused ms", "refused_ms", "{:.0f}"),
-)
-
-
-def _text(value: Any) -> Any:
-    """The smallest and the largest of a list, anything else as it is."""
-    return f"{min(value):.2f}-{max(value):.2f}" if isinstance(value, list) else value
+COLUMNS = {
+    "views": "{views:d}",
+    "found %": "{found:.1%}",
+    "refused %": "{refused:.1%}",
+    "wrong": "{wrong:d}",
+    "points px": "{centre_rms_px:.3f}",
+    "pose mm": "{pose_mm:.3f}",
+    "mrad": "{pose_mrad:.3f}",
+    "z": "{z:.2f}",
+    "z of the axes": "{least_z:.2f}-{most_z:.2f}",
+    "in 95 %": "{coverage_95:.1%}",
+    "found ms": "{found_ms:.0f}",
+    "refused ms": "{refused_ms:.0f}",
+}
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.table import Table
-
     console = wide_console()
-    lines = [(row["condition"], row["expect"], row) for row in report["rows"] if row["kind"] == "all"]
-    kinds = [(kind, "found", row) for kind, row in report["kinds"].items()]
+    lines = [row for row in report["rows"] if row["kind"] == "all"]
+    kinds = [{"condition": kind, "expect": "found", **row} for kind, row in report["kinds"].items()]
     for title, first, rows in (
         (f"all kinds of boards, {report['views_per_line']} views of each, RMS errors", "condition", lines),
         ("by kind, where the board is to be found", "kind", kinds),
     ):
-        table = Table(title=title)
-        table.add_column(first)
-        table.add_column("to be")
-        for heading, _, _ in COLUMNS:
-            table.add_column(heading, justify="right")
-        for name, expect, row in rows:
-            shown = ["" if row[key] is None else form.format(_text(row[key])) for _, key, form in COLUMNS]
-            table.add_row(name, expect, *shown)
-        console.print(table)
+        axes = [row["z_axes"] or [None] for row in rows]
+        shown = [row | {"least_z": min(z), "most_z": max(z)} for row, z in zip(rows, axes, strict=True)]
+        console.print(formed(title, {first: "{condition}", "<to be": "{expect}", **COLUMNS}, shown))
     console.print(
         "simulated pictures: 40 electrons per DN, read noise 0.4 DN. wrong: a point under another's name, or a board "
         "found that is not there."

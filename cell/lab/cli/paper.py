@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption
+from cell.lab.cli.shown import bar, show
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the pictures and the numbers as JSON; made if it is not there.")
@@ -17,11 +18,6 @@ SeedsOption = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How 
 paper = typer.Typer(
     help="The paper, reproduced: its design study, equations, tables and the systems it cites.", no_args_is_help=True
 )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the group of this file."""
-    app.add_typer(paper, name="paper")
 
 
 @paper.command()
@@ -56,12 +52,11 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
 
     With --out it also draws table1.png.
     """
-    from cell.lab.cli.paper_tables import campaign_progress, print_table1
-    from cell.lab.paper.campaign import cores
+    from cell.lab.cli.paper_tables import print_table1
     from cell.lab.paper.table1 import table1 as campaign
 
-    with campaign_progress("heads") as progress:
-        result = campaign(range(seeds), cores(), progress)
+    with bar() as told:
+        result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
     _show(result, json, out, "table1", print_table1)
     if out is not None:
         from cell.lab.paper.comparison_pictures import draw_table1
@@ -75,12 +70,11 @@ def systems(seeds: SeedsOption = 5, json: JsonOption = False, out: OutOption = N
 
     With --out it also draws systems.png.
     """
-    from cell.lab.cli.paper_tables import campaign_progress, print_systems
-    from cell.lab.paper.campaign import cores
+    from cell.lab.cli.paper_tables import print_systems
     from cell.lab.paper.systems import systems as campaign
 
-    with campaign_progress("heads") as progress:
-        result = campaign(range(seeds), cores(), progress)
+    with bar() as told:
+        result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
     _show(result, json, out, "systems", print_systems)
     if out is not None:
         from cell.lab.paper.comparison_pictures import draw_systems
@@ -90,10 +84,7 @@ def systems(seeds: SeedsOption = 5, json: JsonOption = False, out: OutOption = N
 
 def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table: Any) -> None:
     """Print as JSON or as a table, and keep the numbers in the folder."""
-    if json:
-        print_json(result)
-    else:
-        table(result)
+    show(result, json, table)
     if out is not None:
         from cell.run.folder import write_json
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.poses import from_axes, from_parts, perturbed, transform
-from cell.lab.paper.campaign import Progress, run_all, spread
+from cell.lab.bench.over_cores import Progress, run_all
 from cell.lab.paper.cited import SYSTEMS, CitedSystem, cited
 from cell.lab.paper.rig import RigSpec, TrueHead, arm_error, draw_head, observe, sweep
 from cell.lab.paper.shapes import DENT_RADIUS, dented_plate, relief
@@ -35,7 +35,7 @@ TIMED_FRAMES, TIMED_ROUNDS = 8, 12
 FACING = np.diag([1.0, -1.0, -1.0])
 
 
-def systems(seeds: Iterable[int], workers: int = 1, progress: Progress | None = None) -> dict[str, Any]:
+def systems(seeds: Iterable[int], workers: int = 0, progress: Progress | None = None) -> dict[str, Any]:
     """Each cited system beside ours: error over the seeds in mm, what noise lets one expect, and points per second."""
     wanted = list(seeds)
     runs = run_all(one_system, [(system.key, seed) for system in SYSTEMS for seed in wanted], workers, progress)
@@ -54,10 +54,10 @@ def systems(seeds: Iterable[int], workers: int = 1, progress: Progress | None = 
                 },
                 "ours": {
                     "task": system.task,
-                    "mean_mm": spread([run["mean"] for run in own])["mean"],
-                    "p95_mm": spread([run["p95"] for run in own])["mean"],
-                    "worst_seed_p95_mm": spread([run["p95"] for run in own])["max"],
-                    "expected_mean_mm": spread([run["expected"] for run in own])["mean"],
+                    "mean_mm": float(np.mean([run["mean"] for run in own])),
+                    "p95_mm": float(np.mean([run["p95"] for run in own])),
+                    "worst_seed_p95_mm": max(run["p95"] for run in own),
+                    "expected_mean_mm": float(np.mean([run["expected"] for run in own])),
                     "points_per_s": None if system.claim_points_per_s is None else points_per_second(system.spec),
                     "measured": "simulated",
                 },

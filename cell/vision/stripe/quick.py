@@ -18,7 +18,6 @@ from cell.vision.stripe import find as find
 from cell.vision.stripe import fit as fit
 from cell.vision.stripe import search as stripe_search
 from cell.vision.stripe.belief import believe
-from cell.vision.stripe.methods import METHODS
 from cell.vision.stripe.noise import pixel_noise
 from cell.vision.stripe.ordinary import (
     HARDLY_ANY,
@@ -30,7 +29,7 @@ from cell.vision.stripe.ordinary import (
     is_textured,
     is_too_wide,
 )
-from cell.vision.stripe.profile import Array, Axis, Image, Method, StripeProfile, StripeSettings
+from cell.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
 from cell.vision.stripe.rivals import choose, survey
 from cell.vision.stripe.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 
@@ -54,9 +53,8 @@ class Verdict(Enum):
 
 
 def read_quickly(
-    image: Image, dark: Any, axis: Axis, settings: StripeSettings, method: Method,
-    like: StripeProfile | None,
-) -> tuple[StripeProfile, Verdict]:  # fmt: skip
+    image: Image, dark: Any, axis: Axis, settings: StripeSettings, like: StripeProfile | None
+) -> tuple[StripeProfile, Verdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
@@ -92,11 +90,7 @@ def read_quickly(
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
     rho = correlation(grain) if contrast > 0 and grain else NO_LAGS
-    if method is Method.MAXIMUM_LIKELIHOOD:
-        run(found, contrast, rho)
-    else:
-        variance = noise2, gain, frames if dark is not None else 0
-        fitted = METHODS[method](work, shade, start, found, variance, (contrast, rho), settings)
+    run(found, contrast, rho)
     saturated = np.empty(len(work), np.bool_)
     excess = 1 + SECOND_ORDER * contrast**2
     believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
