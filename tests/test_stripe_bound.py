@@ -9,7 +9,7 @@ from cell.lab.bench.stripe_accuracy import measure
 from cell.lab.bench.stripe_truth import Cell, bound, draw
 from cell.vision.pictures import PictureRefused
 from cell.vision.stripe.extract import StripeSettings, extract
-from cell.vision.stripe.stream import BLOCK, StripeStream, extract_all
+from cell.vision.stripe.stream import BLOCK, StripeStream
 
 SMALL = (256, 384)
 
@@ -80,17 +80,11 @@ def test_a_blinded_picture_is_refused():
         extract(np.full((480, 640), 255, np.uint8))
 
 
-def test_a_stream_on_two_cores_gives_the_profiles_of_one_in_order():
-    images = [draw(Cell(2, 100, 0.2), SMALL, seed)[0] for seed in range(BLOCK + 3)]
-    stream = StripeStream()
-    for profile, image in zip(extract_all(images), images, strict=True):
-        np.testing.assert_array_equal(profile.centres, stream.extract(image).centres)
-
-
 def test_in_a_stream_the_speckle_of_a_block_is_that_of_its_first_picture_with_a_stripe():
     dim = np.full(SMALL, 8, np.uint8)
     images = [draw(Cell(2, 120, contrast), SMALL, seed)[0] for seed, contrast in enumerate([0.2] * BLOCK + [0.1])]
-    profiles = list(extract_all([dim, *images]))
+    stream = StripeStream()
+    profiles = [stream.extract(image) for image in (dim, *images)]
     assert profiles[0].speckle is None
     assert len({profile.speckle for profile in profiles[1:BLOCK]}) == 1
     assert profiles[BLOCK].speckle != profiles[1].speckle == extract(images[0]).speckle
@@ -110,11 +104,3 @@ def test_the_stated_deviation_is_true_with_the_speckle_of_an_earlier_picture():
             if k > 0:
                 ratios.append(np.sqrt(np.mean((profile.centres - centres) ** 2) / np.mean(profile.sigma**2)))
     assert 0.85 < np.mean(ratios) < 1.05
-
-
-def test_a_stream_ends_with_the_picture_that_is_refused():
-    images = [draw(Cell(2, 100), SMALL, seed)[0] for seed in range(3)]
-    stream = extract_all([*images, np.full(SMALL, 255, np.uint8), images[0]])
-    assert len([next(stream) for _ in images]) == 3
-    with pytest.raises(PictureRefused):
-        next(stream)

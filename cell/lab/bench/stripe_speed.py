@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.lab.bench.stripe_truth import Cell, draw
-from cell.vision.stripe.extract import StripeProfile, StripeSettings, extract
-from cell.vision.stripe.stream import StripeStream, extract_all
+from cell.vision.stripe.extract import StripeSettings, extract
+from cell.vision.stripe.stream import StripeStream
 
 SHAPE = (1024, 1280)
 FRAMES = 32
@@ -35,10 +35,8 @@ def compare(progress: Callable[[float, str], None], repeats: int = 5) -> dict[st
     known = StripeSettings(speckle_contrast=0.0)
     candidates: list[tuple[str, Run, list[Image]]] = [
         ("reading each pixel once", _each(np.max), plain),
-        ("a stream, one core", _stream, plain),
-        ("a stream with speckle contrast 0.2, one core", _stream, speckled),
-        ("a stream, two cores", _two_cores, plain),
-        ("a stream with speckle contrast 0.2, two cores", _two_cores, speckled),
+        ("a stream", _stream, plain),
+        ("a stream with speckle contrast 0.2", _stream, speckled),
         ("single pictures", _each(extract), plain),
         ("single pictures with speckle contrast 0.2", _each(extract), speckled),
         ("single pictures, speckle declared absent", _each(lambda i: extract(i, settings=known)), plain),
@@ -75,10 +73,6 @@ def _stream(images: list[Image]) -> None:
     stream = StripeStream()
     for image in images:
         stream.extract(image)
-
-
-def _two_cores(images: list[Image]) -> list[StripeProfile]:
-    return list(extract_all(images, threads=2))
 
 
 def _best(run: Run, images: list[Image], repeats: int) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,7 +17,6 @@ def accuracy(
     ] = None,
     job: JobOption = "pot",
     workers: Annotated[int, typer.Option("--workers", min=0, max=64, help="Processes; 0 is one a core.")] = 0,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Draw every run's error to this PNG file.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate and run many simulated cells on the virtual clock and measure them against the truth.
@@ -28,19 +26,13 @@ def accuracy(
     Exit code 1 when a part was placed outside the job's tolerance, or a limit of level nominal is not kept.
     """
     from cell.lab.bench.accuracy import campaign
-    from cell.lab.bench.accuracy_picture import draw
     from cell.lab.cli.bench_tables import print_accuracy
-    from drivers.errors import ConfigError
 
     levels = list(dict.fromkeys(entry.value for entry in level or [Level.nominal]))
-    if picture is not None and picture.suffix != ".png":
-        raise ConfigError(f"--picture {picture} must end in .png")
     with bar() as told:
         told(0, "the first runs are on their way")
         done = counted(told, (seeds + 1) * len(levels))
         result = campaign(range(1, seeds + 1), levels, job, done, workers)
-    if picture is not None:
-        draw(picture, result)
     show(result, json, print_accuracy)
     by_level = result["levels"].values()
     outside = sum(entry["outcomes"]["placed_outside_tolerance"] for entry in by_level)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -27,7 +26,6 @@ def realism(
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many worlds: seeds 1 to this.")] = 20,
     job: JobOption = "pot",
     workers: Annotated[int, typer.Option("--workers", min=0, max=64, help="Processes; 0 is one a core.")] = 0,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Draw every effect to this PNG file.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Put each effect of a workshop into simulated cells and see whether what is stated of the part still holds.
@@ -37,7 +35,6 @@ def realism(
     outside the job's tolerance.
     """
     from cell.lab.bench.realism import ALONE, TOGETHER, campaign, is_well
-    from cell.lab.bench.realism_picture import draw
     from drivers.errors import ConfigError
     from sim_backends.world.effects import Effects
 
@@ -46,12 +43,8 @@ def realism(
     chosen = list(dict.fromkeys(effect or [name for name in known if name != "rolling_shutter"]))
     if unknown := [name for name in chosen if name not in known]:
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
-    if picture is not None and picture.suffix != ".png":
-        raise ConfigError(f"--picture {picture} must end in .png")
     with bar() as told:
         result = campaign(chosen, range(1, seeds + 1), job, counted(told, len(chosen) * seeds), workers)
-    if picture is not None:
-        draw(picture, result)
     show(result, json, _print)
     if not all(is_well(entry) for entry in result["effects"].values()):
         raise typer.Exit(1)
