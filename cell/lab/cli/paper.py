@@ -15,9 +15,7 @@ OutOption = Annotated[
 ]
 SeedsOption = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many simulated heads.")]
 
-paper = typer.Typer(
-    help="The paper, reproduced: its design study, equations, tables and the systems it cites.", no_args_is_help=True
-)
+paper = typer.Typer(help="The paper, reproduced: its design study, equations and table.", no_args_is_help=True)
 
 
 @paper.command()
@@ -62,24 +60,6 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
         from cell.lab.paper.comparison_pictures import draw_table1
 
         _name([draw_table1(result, out / "table1.png")])
-
-
-@paper.command()
-def systems(seeds: SeedsOption = 5, json: JsonOption = False, out: OutOption = None) -> None:
-    """The systems that the paper cites, theirs as published and ours for the same task in simulation.
-
-    With --out it also draws systems.png.
-    """
-    from cell.lab.cli.paper_tables import print_systems
-    from cell.lab.paper.systems import systems as campaign
-
-    with bar() as told:
-        result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
-    _show(result, json, out, "systems", print_systems)
-    if out is not None:
-        from cell.lab.paper.comparison_pictures import draw_systems
-
-        _name([draw_systems(result, out / "systems.png")])
 
 
 def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table: Any) -> None:

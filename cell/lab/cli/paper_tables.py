@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-from cell.cli.options import wide_console
 from cell.lab.cli.shown import empty
 
 WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
@@ -108,45 +107,6 @@ def print_table1(result: Mapping[str, Any]) -> None:
         _say(console, f"As printed the paper's figures cannot be right: {flaw}.")
     _say_noise(console, result["assumed_noise"])
     _say(console, result["note"])
-
-
-def print_systems(result: Mapping[str, Any]) -> None:
-    """A row for each system, then the head that was assumed for it."""
-    console = wide_console(150)
-    table = empty(f"other systems: theirs on hardware, ours simulated over {result['seeds']} heads each", "system",
-                   "<theirs", "<our task", "ours in mm: mean", "95 % below", "worst 95 %", "expected mean",
-                   "points/s")  # fmt: skip
-    for row in result["systems"]:
-        own = row["ours"]
-        rate = own["points_per_s"]
-        table.add_row(row["reference"] + " " + row["system"].split()[0], row["theirs"]["headline"], TASKS[own["task"]],
-                      *(f"{own[key]:.4f}" for key in ("mean_mm", "p95_mm", "worst_seed_p95_mm", "expected_mean_mm")),
-                      "" if rate is None else f"{rate:,.0f}")  # fmt: skip
-    console.print(table)
-    heads = empty("what was assumed for ours: lengths in mm, pixels in µm, noise 1σ", "system", "<sensor", "<optics",
-                   "<depths, rail", "<noise")  # fmt: skip
-    for row in result["systems"]:
-        head, noise = row["head"], row["noise"]
-        heads.add_row(
-            row["reference"] + " " + row["system"].split()[0],
-            f"{head['sensor_px']}, {head['pixel_um']:g}",
-            f"f {head['focal_mm']:g}, l {head['baseline_mm']:g}, meets axis at {head['light_plane_meets_axis_mm']:g}",
-            f"{head['depths_mm'][0]:g}…{head['depths_mm'][1]:g}, {head['rail_travel_mm']:g}",
-            f"stripe {noise['stripe_px']:g} px, dots {noise['dots_px']:g} px, rail {noise['rail_mm']:g}, arm "
-            f"{noise['arm_mm_radial']:g} and {noise['arm_mrad_per_axis']:g} mrad",
-        )
-    console.print(heads)
-    for row in result["systems"]:
-        _say(console, f"{row['reference']} {row['remark']}.")
-    _say(console, result["note"])
-
-
-TASKS = {
-    "dent": "single points of a dent's depth",
-    "arm_base": "points in the arm's base",
-    "form": "points over the depth, one rigid motion",
-    "stitched": "points over stations joined by overlap",
-}
 
 
 def print_acceptance(result: Mapping[str, Any]) -> None:

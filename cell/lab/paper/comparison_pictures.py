@@ -1,4 +1,4 @@
-"""Pictures of the comparisons: Table 1 as bars beside the paper's, and the cited systems' figures beside ours."""
+"""The picture of Table 1: its means as bars beside the paper's."""
 
 from __future__ import annotations
 
@@ -47,37 +47,5 @@ def draw_table1(result: Mapping[str, Any], path: Path) -> Path:
         fontsize=10,
     )
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
-    figure.savefig(path)
-    return path
-
-
-def draw_systems(result: Mapping[str, Any], path: Path) -> Path:
-    """Theirs and ours for each system, logarithmic."""
-    figure = Figure(figsize=(11, 5.6), dpi=110, layout="constrained")
-    axes = figure.subplots()
-    rows = result["systems"]
-    places = np.arange(len(rows))
-    expected = [row["ours"]["expected_mean_mm"] for row in rows]
-    series = (
-        ([row["theirs"]["mm"] for row in rows], "theirs, as published (hardware)", "tab:gray"),
-        ([row["ours"]["p95_mm"] for row in rows], "ours, 95 % of the points below (simulated)", "tab:blue"),
-        ([row["ours"]["mean_mm"] for row in rows], "ours, mean (simulated)", "tab:cyan"),
-    )
-    for k, (values, label, colour) in enumerate(series):
-        axes.bar(places + 0.27 * (k - 1), values, 0.25, color=colour, label=label)
-        # The number stands clear of the expected mean's line, which is drawn over the last bars.
-        tops = np.maximum(values, expected) if k == 2 else values
-        for place, value, top in zip(places, values, tops, strict=True):
-            axes.annotate(f"{value:.3g}", (place + 0.27 * (k - 1), top), (0, 3), textcoords="offset points",
-                          fontsize=8, ha="center", va="bottom")  # fmt: skip
-    axes.plot(places + 0.27, expected, "_", color="tab:green", markersize=26, markeredgewidth=2,
-              label="expected mean for the assumed noise")  # fmt: skip
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_xticks(places, [f"{row['system']} {row['reference']}\n{row['theirs']['headline']}" for row in rows],
-                    fontsize=7.5)  # fmt: skip
-    axes.set_ylabel("error in mm (log)")
-    axes.set_title("Systems that the paper cites: theirs measured on hardware, ours simulated")
-    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
     figure.savefig(path)
     return path
