@@ -46,20 +46,13 @@ def equations(json: JsonOption = False, out: OutOption = None) -> None:
 
 @paper.command()
 def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = None) -> None:
-    """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's figures.
-
-    With --out it also draws table1.png.
-    """
+    """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's."""
     from cell.lab.cli.paper_tables import print_table1
     from cell.lab.paper.table1 import table1 as campaign
 
     with bar() as told:
         result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
     _show(result, json, out, "table1", print_table1)
-    if out is not None:
-        from cell.lab.paper.comparison_pictures import draw_table1
-
-        _name([draw_table1(result, out / "table1.png")])
 
 
 def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table: Any) -> None:
