@@ -1,4 +1,4 @@
-"""A CAN bus inside this process, and the truth of a simulated vehicle that is driven over it."""
+"""What the tests of both vehicles share: a clock moved by hand, a CAN bus in this process, a vehicle driven over it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,20 @@ from typing import Any
 
 import can
 
+from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.peers.slcan import CanFrame
+
+
+class Hand(Clock):
+    """A clock that is moved by hand."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
 
 
 class InnerBus:

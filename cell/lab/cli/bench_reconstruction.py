@@ -21,7 +21,7 @@ def _print(report: dict[str, Any]) -> None:
     console = wide_console()
     console.print(
         formed(
-            "outliers in 300 × 480 points; beside a statistical removal on the same points",
+            "outliers in 300 × 480 points",
             {
                 "surface": "{surface}",
                 "<kind": "{kind}",
@@ -29,9 +29,6 @@ def _print(report: dict[str, Any]) -> None:
                 "recall": "{recall:.4f}",
                 "precision": "{precision:.4f}",
                 "ms": "{ms:.0f}",
-                "statistical: recall": "{statistical_recall:.3f}",
-                "precision ": "{statistical_precision:.3f}",
-                "ms ": "{statistical_ms:.0f}",
             },
             report["outliers"],
         )
