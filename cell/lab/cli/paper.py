@@ -22,7 +22,7 @@ paper = typer.Typer(help="The paper, reproduced: its design study, equations and
 def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     """Figure 2: error over the sensor for 30 and 35 mm of baseline, light on it, and which rule chooses 35 mm.
 
-    With --out it also draws figure2_errors.png and figure2_choice.png.
+    With --out it also draws figure2_errors.png.
     """
     from cell.lab.cli.paper_tables import print_figure2
     from cell.lab.paper.figure2 import figure2 as numbers
@@ -32,7 +32,10 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     if out is not None:
         from cell.lab.paper.figure2_pictures import draw
 
-        _name(draw(out))
+        path = out / "figure2_errors.png"
+        draw(path)
+        # On standard error, so that JSON on standard output stays alone.
+        typer.echo(f"drawn: {path}", err=True)
 
 
 @paper.command()
@@ -63,9 +66,3 @@ def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table
 
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / f"{name}.json", result)
-
-
-def _name(paths: list[Path]) -> None:
-    """Say on standard error what was drawn, so that JSON on standard output stays alone."""
-    for path in paths:
-        typer.echo(f"drawn: {path}", err=True)
