@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json, wide_console
+from cell.cli.options import JsonOption, wide_console
 from cell.lab.cli.shown import bar, counted, formed, show
 
 
@@ -18,22 +17,17 @@ def board(
     condition: Annotated[
         list[str] | None, typer.Option(help="Only conditions with this in their name; may be given again.")
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Look for a board in this picture instead.")] = None,
-    name: Annotated[str, typer.Option("--board", help="The board in that picture.")] = "marked_dots:9x7:20mm",
     json: JsonOption = False,
 ) -> None:
     """How surely boards are found, under which name their points, how exactly, and whether the covariance is true.
 
-    Exit code 1 when a board, or the order of its points, was taken for another, or the picture was refused.
+    Exit code 1 when a board, or the order of its points, was taken for another.
     """
     from cell.lab.bench.board import campaign
     from cell.lab.bench.board_conditions import CONDITIONS
     from cell.vision.board.spec import KINDS
     from drivers.errors import ConfigError
 
-    if picture is not None:
-        _one(picture, name, json)
-        return
     kinds = [k for k in KINDS if not kind or k in kind]
     if kind and len(kinds) != len(set(kind)):
         raise ConfigError(f"--kind {', '.join(kind)}: allowed are {', '.join(KINDS)}")
@@ -45,41 +39,6 @@ def board(
     show(report, json, _print)
     if report["wrong"]:
         raise typer.Exit(1)
-
-
-def _one(picture: Path, name: str, json: bool) -> None:
-    """Look for a board in a picture file and tell what was found."""
-    from cell.lab.bench.board import look
-    from cell.vision.board.spec import parse_board
-    from cell.vision.pictures import PictureRefused, read_picture
-
-    spec = parse_board(name)
-    try:
-        view, seconds = look(read_picture(picture), spec)
-    except PictureRefused as refused:
-        if json:
-            print_json({"picture": picture.name, "found": False, "reason": refused.reason, "text": str(refused)})
-        else:
-            typer.echo(f"{picture.name}: refused ({refused.reason}): {refused}")
-        raise typer.Exit(1) from refused
-    found = {
-        "picture": picture.name,
-        "found": True,
-        "board": spec.name,
-        "points": len(view.ids),
-        "of": len(spec.lattice()),
-        "order_assumed": view.order_assumed,
-        "median_sigma_px": round(float(sorted(view.sigma)[len(view.sigma) // 2]), 4),
-        "ms": round(1e3 * seconds, 1),
-    }
-    if json:
-        print_json({**found, "ids": view.ids.tolist(), "pixels": view.pixels.round(4).tolist()})
-    else:
-        order = "its order assumed, as the board is symmetric" if view.order_assumed else "its order certain"
-        typer.echo(
-            f"{picture.name}: {spec.name}, {found['points']} of {found['of']} points, sigma {found['median_sigma_px']} "
-            f"px, {order}, {found['ms']} ms"
-        )
 
 
 COLUMNS = {
