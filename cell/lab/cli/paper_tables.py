@@ -76,7 +76,7 @@ def print_table1(result: Mapping[str, Any]) -> None:
     console = Console()
     paper = result["paper"]["section_5_2"]
     points = empty(f"section 5.2: distance from the truth in mm, scan frame, {result['seeds']} heads (simulated)",
-                    "points", "<<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
+                    "points", "<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
     for count, ways in result["section_5_2"].items():
         for way, v in ways.items():
             points.add_row(count, WAYS[way], f"{v['mean']:.4f}", f"{v['max']:.4f}", f"{v['p85']:.4f}",

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from itertools import count
 from typing import Any, Protocol
 
-from cell.cli.options import print_json
+from cell.cli.options import new_table, print_json
 
 
 class Told(Protocol):
@@ -43,16 +43,9 @@ def counted(told: Told, total: float) -> Callable[[str], None]:
 
 
 def empty(title: str, *columns: str) -> Any:
-    """A table without rows. The first column is text, others are numbers but for those that begin with '<'; the first
-    and those that begin with '<<' keep to one line."""
-    from rich.table import Table
-
-    made = Table(title=title)
-    for index, name in enumerate(columns):
-        left = index == 0 or name.startswith("<")
-        whole = index == 0 or name.startswith("<<")
-        made.add_column(name.lstrip("<"), justify="left" if left else "right", overflow="fold", no_wrap=whole)
-    return made
+    """A table without rows. The first column is text, others are numbers but for those that begin with '<'."""
+    first, *others = columns
+    return new_table(title, first, *(name[1:] if name.startswith("<") else f">{name}" for name in others))
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Any:
