@@ -1,7 +1,7 @@
 """How the hot loops of the cell are compiled, and whether they can be.
 
-Where numba is missing, broken or switched off, `AVAILABLE` is False, `compiled` leaves functions as they are, and
-`cell.vision.stripe` takes the numpy way. That is enough to look at pictures, not to run a job, and is said once.
+Where numba is missing, broken or switched off, `AVAILABLE` is False and `compiled` leaves functions as they are. That
+is enough to look at a picture, not to run a job, and is said once.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ except Exception as error:  # A numba that does not fit the installed numpy or L
     _reason = f"{type(error).__name__}: {error}"
 if not AVAILABLE:
     warnings.warn(
-        f"numba cannot compile here ({_reason}): stripes are extracted some twenty times slower, calibrations and "
-        "clouds made some hundred times slower, so that a job's steps run past their deadlines. Reinstall numba",
+        f"numba cannot compile here ({_reason}): a picture's stripe takes seconds, calibrations and clouds are made "
+        "some hundred times slower, so that a job's steps run past their deadlines. Reinstall numba",
         RuntimeWarning,
         stacklevel=2,
     )

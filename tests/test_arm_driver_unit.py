@@ -344,6 +344,24 @@ def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
     assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
 
 
+def dashboard_of(server, status):
+    """A connected dashboard, and what it asks; `status` answers a question, None: that it is not understood."""
+    asked = []
+
+    def serve():
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"Connected\n")
+            for question in client.makefile("rb"):
+                asked.append(question.decode().strip())
+                told = status(asked[-1])
+                reply = f"could not understand: '{asked[-1]}'" if told is None else f"Safetystatus: {told}"
+                client.sendall(f"{reply}\n".encode())
+
+    threading.Thread(target=serve, daemon=True).start()
+    return Dashboard("arm", server.getsockname()[0]), asked
+
+
 @pytest.mark.parametrize("known", ["safetystatus", "safetymode"])
 @pytest.mark.parametrize(
     ("status", "why"),
@@ -357,19 +375,7 @@ def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
 )
 def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, status, why, known):
     """Before PolyScope 5.4 a controller knows only the safety mode."""
-    asked = []
-
-    def serve():
-        client, _ = server.accept()
-        with client:
-            client.sendall(b"Connected\n")
-            for question in client.makefile("rb"):
-                asked.append(question.decode().strip())
-                reply = f"Safetystatus: {status}" if asked[-1] == known else f"could not understand: '{asked[-1]}'"
-                client.sendall(f"{reply}\n".encode())
-
-    threading.Thread(target=serve, daemon=True).start()
-    dashboard = Dashboard("arm", server.getsockname()[0])
+    dashboard, asked = dashboard_of(server, lambda question: status if question == known else None)
     if not why:
         unlock("arm", dashboard, Clock(), False, lambda: None)
     else:
@@ -380,21 +386,10 @@ def test_reduced_mode_is_no_fault_and_a_protective_stop_needs_a_person(server, s
 
 
 def test_a_stop_that_comes_before_a_protective_stop_is_unlocked_leaves_it_locked(server):
-    asked = []
-
-    def serve():
-        client, _ = server.accept()
-        with client:
-            client.sendall(b"Connected\n")
-            for question in client.makefile("rb"):
-                asked.append(question.decode().strip())
-                client.sendall(b"Safetystatus: PROTECTIVE_STOP\n")
-
     def stopped():
         raise Aborted("stopped meanwhile")
 
-    threading.Thread(target=serve, daemon=True).start()
-    dashboard = Dashboard("arm", server.getsockname()[0])
+    dashboard, asked = dashboard_of(server, lambda question: "PROTECTIVE_STOP")
     with pytest.raises(Aborted, match="meanwhile"):
         unlock("arm", dashboard, Clock(), True, stopped)
     dashboard.close()

@@ -13,7 +13,6 @@ import pytest
 from cell.config import default_toml, load_config
 from cell.devices.makes import make_of
 from cell.devices.vehicle_makes import CanopenVehicleConfig
-from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.emergencies import meaning
@@ -22,19 +21,9 @@ from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.objects import HEARTBEAT, MOTION, STATUS
 from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
 from drivers.vehicle.cia402.units import UnitCheck
+from tests.inner_bus import Hand
 
 WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), 0.58, 0.5, 1.0)
-
-
-class Hand(Clock):
-    """A clock that is moved by hand."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.time = 0.0
-
-    def now(self) -> float:
-        return self.time
 
 
 @pytest.mark.parametrize(

@@ -210,9 +210,12 @@ def test_a_value_over_several_lines_and_a_key_that_is_missing_are_written_too() 
     assert "# said" in new and "# first" in new
 
 
-def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write() -> None:
+def test_what_cannot_be_changed_without_risk_is_refused_with_what_to_write(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"a\.b = 2"):
-        edited("a = { b = 1 }\n", {"a.b": "2"})
+        edited("a = 1\n", {"a.b": "2"})
+    monkeypatch.setattr("tomlkit.value", lambda value: 3)
+    with pytest.raises(ConfigError, match=r"a\.b = 2"):
+        edited("[a]\nb = 1\n", {"a.b": "2"})
 
 
 def test_the_old_file_is_kept_each_time(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from cell.geometry import poses
 from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane, closed_form, closed_form_jacobian, triangulate
+from cell.geometry.light_plane import LightPlane, closed_form, triangulate
 from cell.geometry.poses import from_parts, perturbed, transform
 from cell.geometry.seen import pose_equations, seen_points
 
@@ -143,12 +143,6 @@ def test_the_stand_off_of_the_text_is_imaged_at_0_419_mm():
     point = closed_form(0.419e-3, 0.0, 0.035, 8e-3, THETA)
     assert point[0, 2] == pytest.approx(0.150, abs=5e-5)
     assert closed_form(0.0, 0.0, 0.035, 8e-3, THETA)[0, 2] == pytest.approx(0.1225)
-
-
-def test_closed_form_jacobian_is_that_of_finite_differences():
-    at = np.array([0.4e-3, -0.3e-3, 0.035, 8e-3, THETA])
-    expected = numerical(lambda v: closed_form(v[0], v[1], *v[2:])[0], at, 1e-8)
-    np.testing.assert_allclose(closed_form_jacobian(*at), expected, rtol=2e-5, atol=1e-7)
 
 
 def test_rays_at_the_vanishing_line_are_rejected():

@@ -91,6 +91,6 @@ def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:
 
 @pytest.mark.parametrize(("part", "seed"), [("seat", 1), ("seat", 30), ("pot", 6)])
 def test_starts_that_mislead_a_search_with_few_points_lead_to_the_true_pose(part: str, seed: int) -> None:
-    for outcome in task(part, seed, peers=False):
+    for outcome in task(part, seed):
         assert outcome.error[0] < 5e-5, outcome
         assert outcome.error[1] < 2e-3, outcome

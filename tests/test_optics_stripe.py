@@ -22,7 +22,6 @@ from sim_backends.optics import (
     expected_image,
     render,
 )
-from sim_backends.optics.reference import reference_stripe
 from sim_backends.optics.stripe import crossings
 
 FOCAL_PX = 8e-3 / 4.8e-6
@@ -77,18 +76,6 @@ def test_stripe_on_a_plane_runs_where_the_two_planes_meet(tilt):
     truth = np.interp(np.arange(480), pixels[order, 1], pixels[order, 0])
     assert (light > 50).all()
     assert np.abs(seen - truth).max() < 0.002
-
-
-def test_stripe_on_a_mesh_agrees_with_the_physical_reference():
-    surface = height_field(lambda x, y: 0.006 + 0.004 * np.sin(120 * x) * np.cos(150 * y))
-    instance = MeshInstance(facing([0.05, -0.03, 0.02], 0.137), surface, 0.6)
-    window = (300, 100, 380, 180)
-    slow = reference_stripe(OPTICS, CLEAN, instance, EXPOSURE, window)
-    fast = stripe([instance])[100:180, 300:380]
-    error = centroids(fast)[0] - centroids(slow)[0]
-    assert np.sqrt((error**2).mean()) < 0.004
-    np.testing.assert_allclose(fast.sum(axis=1), slow.sum(axis=1), rtol=0.01)
-    np.testing.assert_allclose(fast.max(axis=1), slow.max(axis=1), rtol=0.02)
 
 
 def test_crossings_lie_on_the_light_plane_on_the_mesh_and_on_the_row():

@@ -1,4 +1,4 @@
-"""Promises of the stripe's centres beside the Cramér–Rao bound, of their stated deviations, and of both engines."""
+"""Promises of the stripe's centres beside the Cramér–Rao bound, and of their stated deviations."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import pytest
 from cell.lab.bench.stripe_accuracy import measure
 from cell.lab.bench.stripe_truth import Cell, bound, draw
 from cell.vision.pictures import PictureRefused
-from cell.vision.stripe.extract import Method, StripeSettings, extract
-from cell.vision.stripe.stream import BLOCK, StripeStream, extract_all
+from cell.vision.stripe.extract import StripeSettings, extract
+from cell.vision.stripe.stream import BLOCK, StripeStream
 
-LIKELIHOOD = (Method.MAXIMUM_LIKELIHOOD,)
 SMALL = (256, 384)
 
 
@@ -25,7 +24,7 @@ def test_the_bound_is_the_published_one(cell, published):
 
 @pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 100), Cell(3, 220), Cell(2, 100, slope=0.15)])
 def test_without_speckle_the_bound_is_attained_and_the_deviation_true(cell):
-    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    row = measure(cell)
     assert row["efficiency"] >= 0.95
     assert abs(row["bias_px"]) < 0.005
     assert row["stated_over_true"] == pytest.approx(1.0, abs=0.1)
@@ -34,28 +33,12 @@ def test_without_speckle_the_bound_is_attained_and_the_deviation_true(cell):
 
 @pytest.mark.parametrize("cell", [Cell(1.2, 100, 0.2), Cell(2, 100, 0.2), Cell(3, 60, 0.5)])
 def test_the_stated_deviation_is_not_too_small_under_speckle(cell):
-    (row,) = measure(cell, LIKELIHOOD, pictures=3)
+    row = measure(cell)
     assert row["stated_over_true"] > 0.95
     assert row["found"] > 0.98
     if cell.contrast < 0.3:
         assert row["efficiency"] > 0.85
         assert row["stated_over_true"] < 1.2
-
-
-@pytest.mark.parametrize("cell", [Cell(1.2, 40), Cell(2, 150, 0.2), Cell(3, 600)])
-def test_both_engines_agree(cell):
-    image, _ = draw(cell, SMALL, 5)
-    compiled, plain = extract(image, engine="compiled"), extract(image, engine="numpy")
-    np.testing.assert_array_equal(compiled.valid, plain.valid)
-    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
-    assert np.nanmax(np.abs(compiled.sigma / plain.sigma - 1)) < 1e-2
-
-
-def test_both_engines_agree_with_a_dark_frame():
-    image, _ = draw(Cell(2, 100), SMALL, 6)
-    dark, _ = draw(Cell(2, 0.001), SMALL, 7)
-    compiled, plain = (extract(image, dark, engine=engine) for engine in ("compiled", "numpy"))
-    assert np.nanmax(np.abs(compiled.centres - plain.centres)) < 1e-3
 
 
 def test_a_dark_frame_makes_the_deviation_larger_and_true():
@@ -68,16 +51,6 @@ def test_a_dark_frame_makes_the_deviation_larger_and_true():
         assert np.nanmedian(profile.sigma) > 1.1 * np.nanmedian(extract(image, settings=settings).sigma)
         z.append((profile.centres - centres) / profile.sigma)
     assert np.sqrt(np.nanmean(np.square(z))) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize("method", list(Method))
-def test_every_method_finds_the_stripe_with_a_deviation(method):
-    image, centres = draw(Cell(2, 150), SMALL, 1)
-    profile = extract(image, method=method)
-    assert profile.valid.mean() > 0.99
-    error = profile.centres - centres
-    assert np.sqrt(np.nanmean(error**2)) < (0.4 if method is Method.EXTREME_VALUE else 0.12)
-    assert np.nanmin(profile.sigma) > 0
 
 
 def test_where_a_reflection_is_brighter_the_neighbours_say_which_is_the_stripe():
@@ -107,22 +80,11 @@ def test_a_blinded_picture_is_refused():
         extract(np.full((480, 640), 255, np.uint8))
 
 
-def test_an_unknown_method_is_named():
-    with pytest.raises(ValueError, match="parabola"):
-        extract(np.zeros((64, 64), np.uint8), method="parabola")
-
-
-def test_a_stream_on_two_cores_gives_the_profiles_of_one_in_order():
-    images = [draw(Cell(2, 100, 0.2), SMALL, seed)[0] for seed in range(BLOCK + 3)]
-    stream = StripeStream()
-    for profile, image in zip(extract_all(images), images, strict=True):
-        np.testing.assert_array_equal(profile.centres, stream.extract(image).centres)
-
-
 def test_in_a_stream_the_speckle_of_a_block_is_that_of_its_first_picture_with_a_stripe():
     dim = np.full(SMALL, 8, np.uint8)
     images = [draw(Cell(2, 120, contrast), SMALL, seed)[0] for seed, contrast in enumerate([0.2] * BLOCK + [0.1])]
-    profiles = list(extract_all([dim, *images]))
+    stream = StripeStream()
+    profiles = [stream.extract(image) for image in (dim, *images)]
     assert profiles[0].speckle is None
     assert len({profile.speckle for profile in profiles[1:BLOCK]}) == 1
     assert profiles[BLOCK].speckle != profiles[1].speckle == extract(images[0]).speckle
@@ -142,11 +104,3 @@ def test_the_stated_deviation_is_true_with_the_speckle_of_an_earlier_picture():
             if k > 0:
                 ratios.append(np.sqrt(np.mean((profile.centres - centres) ** 2) / np.mean(profile.sigma**2)))
     assert 0.85 < np.mean(ratios) < 1.05
-
-
-def test_a_stream_ends_with_the_picture_that_is_refused():
-    images = [draw(Cell(2, 100), SMALL, seed)[0] for seed in range(3)]
-    stream = extract_all([*images, np.full(SMALL, 255, np.uint8), images[0]])
-    assert len([next(stream) for _ in images]) == 3
-    with pytest.raises(PictureRefused):
-        next(stream)

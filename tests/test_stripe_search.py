@@ -1,4 +1,4 @@
-"""The compiled search, which takes most lines side by side, against the same rules written without a compiler."""
+"""The search that takes most lines side by side, against the one that takes any line by itself."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from cell.lab.bench.stripe_truth import Cell, draw
-from cell.vision.stripe import search as stripe_search
-from cell.vision.stripe import without_compiler as stripe_numpy
 from cell.vision.stripe.extract import extract
-from cell.vision.stripe.find import CANDIDATES, CUT, ENERGY, NOWHERE, START
+from cell.vision.stripe.find import CANDIDATES, CUT, ENERGY, NOWHERE, START, find_line
+from cell.vision.stripe.search import find_lines
 
 SHAPE = (200, 333)
 LEAST_PEAK, SATURATION = 8.0, 255
@@ -49,20 +48,19 @@ PICTURES = {
 
 @pytest.mark.parametrize("with_dark", [False, True])
 @pytest.mark.parametrize("name", PICTURES)
-def test_any_line_is_searched_as_without_a_compiler(name, with_dark):
+def test_any_line_is_searched_side_by_side_as_by_itself(name, with_dark):
     image = PICTURES[name]
     dark = np.minimum(noise(6.0, image.shape), image) if with_dark else np.zeros((1, 1), np.uint8)
     seen = image - dark if with_dark else image
-    starts, several = [], []
-    for engine in (stripe_search, stripe_numpy):
-        start = np.zeros((len(image), CANDIDATES, START))
-        cut, cut_at = np.zeros((len(image), CUT), np.uint8), np.full(len(image), NOWHERE)
-        several.append(engine.find_lines(image, seen, dark, SATURATION, LEAST_PEAK, start, cut, cut_at))
-        starts.append(start)
-        for r in np.flatnonzero(cut_at != NOWHERE):
-            np.testing.assert_array_equal(cut[r], image[r, cut_at[r] : cut_at[r] + CUT])
-    np.testing.assert_allclose(starts[0], starts[1], atol=1e-3)
-    assert several[0] == several[1] == bool(starts[0][:, 1, ENERGY].any())
+    together, alone = np.zeros((2, len(image), CANDIDATES, START))
+    cut, cut_at = np.zeros((len(image), CUT), np.uint8), np.full(len(image), NOWHERE)
+    several = find_lines(image, seen, dark, SATURATION, LEAST_PEAK, together, cut, cut_at)
+    for r in np.flatnonzero(cut_at != NOWHERE):
+        np.testing.assert_array_equal(cut[r], image[r, cut_at[r] : cut_at[r] + CUT])
+    line, rises = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.uint8)
+    two = [find_line(image, seen, dark, r, SATURATION, LEAST_PEAK, line, rises, alone) for r in range(len(image))]
+    np.testing.assert_allclose(together, alone, atol=1e-3)
+    assert several == any(two) == bool(together[:, 1, ENERGY].any())
 
 
 def test_light_wider_than_any_stripe_in_a_picture_so_wide_that_it_is_shrunk_is_no_stripe():

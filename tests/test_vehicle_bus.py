@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import can
@@ -21,43 +21,10 @@ from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.agilex import AgilexPeer
-from sim_backends.peers.slcan import CanFrame
+from tests.inner_bus import Driven, InnerBus
 
 RATE = 4.0
 TRACK = 0.583
-
-
-class InnerBus:
-    """What the simulated vehicle's peer is on instead of its adapters: a virtual bus of python-can.
-
-    `frames` keeps what the driver has sent, by identifier. With `talking` False the vehicle's frames are lost.
-    """
-
-    def __init__(self, channel: str, receive: Callable[[CanFrame], None]) -> None:
-        self.talking = True
-        self.frames: list[tuple[int, bytes]] = []
-        self._receive = receive
-        self._bus = can.Bus(channel=channel, interface="virtual")
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._closing.set()
-        self._thread.join()
-        self._bus.shutdown()
-
-    def send(self, frames: list[CanFrame]) -> None:
-        for frame in frames if self.talking else ():
-            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            if (message := self._bus.recv(0.05)) is not None:
-                self.frames.append((message.arbitration_id, bytes(message.data)))
-                self._receive(CanFrame(message.arbitration_id, bytes(message.data)))
 
 
 class OnInnerBus(AgilexPeer):
@@ -70,7 +37,7 @@ class OnInnerBus(AgilexPeer):
         self._bus = self.inner  # type: ignore[assignment]
 
 
-class Bench:
+class Bench(Driven):
     """The driver and the vehicle's truth, at `RATE` times the wall."""
 
     def __init__(self, channel: str) -> None:
@@ -84,32 +51,9 @@ class Bench:
             "vehicle", "virtual", channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
         )
 
-    def speed(self) -> float:
-        """True wheel speed, m/s."""
-        return self.peer.model.feedback(self.world.now()).speed
-
     def velocities(self) -> list[bytes]:
         """The commanded velocities that came, as their bytes; zeros are standstill."""
-        return [data for number, data in self.bus.frames if number == 0x111]
-
-    def braked(self) -> bool:
-        """Whether the vehicle's brake is locked in truth."""
-        return self.peer.model.feedback(self.world.now()).braked
-
-    def until(self, happened: Callable[[], bool], timeout: float = 3.0) -> None:
-        """Wait for something, at most `timeout` wall seconds."""
-        end = time.monotonic() + timeout
-        while not happened():
-            assert time.monotonic() < end
-            time.sleep(0.01)
-
-    def drive_until_fast(self) -> None:
-        """Drive on until it goes at 0.3 m/s."""
-        end = time.monotonic() + 3.0
-        while self.speed() < 0.295:
-            assert time.monotonic() < end
-            self.vehicle.drive(0.3, 0.0)
-            time.sleep(0.01)
+        return [bytes(sent.data) for sent in self.bus.frames if sent.arbitration_id == 0x111]
 
 
 @contextmanager
@@ -139,7 +83,7 @@ def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
     with pytest.raises(InterlockError, match="the brake is locked"):
         bench.vehicle.drive(0.2, 0.0)
     time.sleep(0.1)
-    sent = [data for number, data in bench.bus.frames if number == 0x111]
+    sent = bench.velocities()
     assert sent, "standing still is commanded on"
     assert set(sent) == {bytes(8)}
 
@@ -149,7 +93,7 @@ def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
     bench.clock.sleep(DEAD_MAN_S + 0.6)
     bench.bus.frames.clear()
     time.sleep(0.1)
-    assert {data for number, data in bench.bus.frames if number == 0x111} == {bytes(8)}
+    assert set(bench.velocities()) == {bytes(8)}
     bench.until(lambda: bench.speed() == 0.0)
 
 

@@ -4,23 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.faults import driver_trouble, system_trouble
 from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, Feedback
 from drivers.vehicle.version import VersionAnswer
-
-
-class Hand(Clock):
-    """A clock that is moved by hand."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.time = 0.0
-
-    def now(self) -> float:
-        return self.time
+from tests.inner_bus import Hand
 
 
 class Bench:

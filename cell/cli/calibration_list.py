@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import ConfigOption, JsonOption, print_json
+from cell.cli.options import ConfigOption, JsonOption, new_table, print_json
 
 
 def register(group: typer.Typer) -> None:
@@ -20,7 +20,6 @@ def register(group: typer.Typer) -> None:
 def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> None:
     """List the stored calibrations, newest last: when, of which devices, how well they fit, what was found since."""
     from rich.console import Console
-    from rich.table import Table
 
     from cell.calibration.store import read_calibration
     from drivers.errors import CalibrationStale
@@ -40,9 +39,7 @@ def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> 
     if json:
         print_json(rows)
         return
-    table = Table(title=f"calibrations in {_folder(config)}")
-    for name in ("made", "name", "hash", "chi²/dof", "found since"):
-        table.add_column(name, overflow="fold")
+    table = new_table(f"calibrations in {_folder(config)}", "made", "name", "hash", "chi²/dof", "found since")
     for row in rows:
         if "unreadable" in row:
             table.add_row("", row["name"], "", "", row["unreadable"])

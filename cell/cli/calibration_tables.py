@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+
+from cell.cli.options import new_table
 
 
 def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> None:
@@ -15,15 +16,8 @@ def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> N
     console = Console()
     _coverage(console, figures)
     influence = figures["influence"]
-    table = Table(title=f"place error left by the calibration: {influence['total_mm']:.4f} mm RMS at the job's points")
-    for name, left in (
-        ("of", True),
-        ("sigma", False),
-        ("unit", True),
-        ("alone mm", False),
-        ("total if known mm", False),
-    ):
-        table.add_column(name, justify="left" if left else "right")
+    title = f"place error left by the calibration: {influence['total_mm']:.4f} mm RMS at the job's points"
+    table = new_table(title, "of", ">sigma", "unit", ">alone mm", ">total if known mm")
     for row in influence["groups"]:
         table.add_row(f"[bold]{row['name']}[/]", "", "", f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}")
     table.add_section()
@@ -33,9 +27,7 @@ def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> N
         )
     console.print(table)
     console.print("Parameters are known together better than apart: what they do alone does not add up to the total.")
-    table = Table(title="what to add, by the predicted covariance")
-    for name, left in (("what", True), ("kind", True), ("then mm", False), ("less", False)):
-        table.add_column(name, justify="left" if left else "right")
+    table = new_table("what to add, by the predicted covariance", "what", "kind", ">then mm", ">less")
     for row in figures["advice"]:
         table.add_row(row["what"], row["kind"], f"{row['then_mm']:.4f}", f"{100 * row['gain']:.1f} %")
     console.print(table)
@@ -47,10 +39,8 @@ def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> N
 
 
 def _coverage(console: Console, figures: Mapping[str, Any]) -> None:
-    table = Table(title="what the views cover")
-    names = ("camera", "field", "depth mm", "tilt x deg", "tilt y deg", "rail mm", "stripe depth mm", "worst cell px")
-    for name in names:
-        table.add_column(name, justify="left" if name == "camera" else "right")
+    names = (">field", ">depth mm", ">tilt x deg", ">tilt y deg", ">rail mm", ">stripe depth mm", ">worst cell px")
+    table = new_table("what the views cover", "camera", *names)
     for camera in ("scan", "target"):
         c = figures[f"{camera}_coverage"]
         ranges = ("depth_mm", "tilt_about_x_deg", "tilt_about_y_deg", "rail_mm", "stripe_depth_mm")

@@ -17,6 +17,7 @@ from cell.cli.options import (
     SeedOption,
     SimOption,
     SpeedOption,
+    new_table,
     print_json,
     wide_console,
 )
@@ -198,12 +199,9 @@ def find(
 def _print_found(found: list[Found]) -> None:
     if not found:
         return
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(show_lines=True)
-    for name in ("what", "where", "state", "for cell.toml"):
-        table.add_column(name, overflow="fold")
+    table = new_table(None, "what", "where", "state", "for cell.toml", show_lines=True)
     for row in found:
         table.add_row(row.what, row.where, Text(row.state, style="" if row.ok else "red"), Text(row.write))
     wide_console().print(table)
@@ -217,12 +215,9 @@ def devices(json: JsonOption = False) -> None:
     if json:
         print_json([row.as_dict() for row in rows])
         return
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table()
-    for name in ("kind", "driver", "source", "state"):
-        table.add_column(name, overflow="fold")
+    table = new_table(None, "kind", "driver", "source", "state")
     for row in rows:
         table.add_row(row.kind, row.make, row.source, Text(row.state, style="" if row.ok else "red"))
     wide_console().print(table)
@@ -230,12 +225,10 @@ def devices(json: JsonOption = False) -> None:
 
 def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
-    table = Table(title="devices", show_lines=True)
-    for name in ("device", "identity", "address", "ms p50\np99", "errors", "state"):
-        table.add_column(name, overflow="fold", justify="right" if name.startswith("ms") else "left")
+    columns = ("device", "identity", "address", ">ms p50\np99", "errors", "state")
+    table = new_table("devices", *columns, show_lines=True)
     for row in rows:
         mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
         mark += "\n[yellow]simulated[/]" if row.simulated else ""
@@ -249,9 +242,7 @@ def _print_table(rows: list[Diagnosis]) -> None:
             row.state,
         )
     console.print(table)
-    figures = Table(title="figures and what they may be")
-    for name in ("device", "figure", "value", "unit", "allowed", ""):
-        figures.add_column(name, overflow="fold", justify="right" if name in ("value", "allowed") else "left")
+    figures = new_table("figures and what they may be", "device", "figure", ">value", "unit", ">allowed", "")
     outside: list[str] = []
     for row in rows:
         for reading in row.readings:

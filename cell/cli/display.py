@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from cell.cli.end_screen import duration, end_screen
+from cell.cli.options import new_table
 from cell.report.figures import noise_rows
 from cell.which_config import DEVICES
 
@@ -67,10 +67,8 @@ def _simulated(row: Mapping[str, Any]) -> str:
 
 
 def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
-    table = Table(title="how far sweeps lie apart where they overlap, in mm")
-    table.add_column("sweeps")
-    for name in ("points", "mean", "expected ±", "rms", "expected", "95 % below"):
-        table.add_column(name, justify="right")
+    columns = ("sweeps", ">points", ">mean", ">expected ±", ">rms", ">expected", ">95 % below")
+    table = new_table("how far sweeps lie apart where they overlap, in mm", *columns)
     for seam in seams:
         values = (seam[f"{key}_mm"] for key in ("mean", "expected_mean", "rms", "expected_rms", "p95"))
         first, second = (str(number + 1) for number in seam["sweeps"])
@@ -79,10 +77,7 @@ def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
-    table = Table(title=f"assumed noise, 1 sigma (level {noise.get('level')})")
-    table.add_column("of")
-    table.add_column("sigma", justify="right")
-    table.add_column("unit")
+    table = new_table(f"assumed noise, 1 sigma (level {noise.get('level')})", "of", ">sigma", "unit")
     for row in noise_rows(noise):
         table.add_row(*row)
     console.print(table)
@@ -92,11 +87,7 @@ def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
     """A calibration for people: values with their standard deviations, then how well the observations fit."""
     console = Console()
     lens, plane, rail, hand = (summary[key] for key in ("scan_camera", "light_plane", "rail", "hand_eye"))
-    values = Table(title=f"calibration of {summary['date']}")
-    values.add_column("quantity")
-    values.add_column("value", justify="right")
-    values.add_column("sigma", justify="right")
-    values.add_column("unit")
+    values = new_table(f"calibration of {summary['date']}", "quantity", ">value", ">sigma", "unit")
     for name, unit in (("fx", "px"), ("fy", "px"), ("cx", "px"), ("cy", "px"), ("k1", "")):
         values.add_row(f"scan camera {name}", f"{lens[name]:.4f}", f"{lens[f'sigma_{name}']:.4f}", unit)
     values.add_row("light plane distance", f"{plane['distance_mm']:.4f}", f"{plane['sigma_distance_mm']:.4f}", "mm")
@@ -114,9 +105,8 @@ def print_calibration(summary: Mapping[str, Any], where: str | None) -> None:
     if (shutter := summary["shutter"]) is not None:
         values.add_row("last row after the first", f"{shutter['readout_ms']:+.4f}", f"{shutter['sigma_ms']:.4f}", "ms")
     console.print(values)
-    fit = Table(title="residuals; held-out views are predicted from the others")
-    for name in ("camera", "views", "chi²/dof", "dots px", "held-out px", "stripe mm", "held-out mm"):
-        fit.add_column(name, justify="left" if name == "camera" else "right")
+    columns = (">views", ">chi²/dof", ">dots px", ">held-out px", ">stripe mm", ">held-out mm")
+    fit = new_table("residuals; held-out views are predicted from the others", "camera", *columns)
     for camera in ("scan", "target"):
         q = summary[f"{camera}_quality"]
         keys = ("dots_rms_px", "held_out_dots_rms_px", "stripe_rms_mm", "held_out_stripe_rms_mm")

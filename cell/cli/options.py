@@ -77,3 +77,13 @@ def wide_console(least: int = 120) -> Any:
     from rich.console import Console
 
     return Console(width=max(Console().width, least))
+
+
+def new_table(title: str | None, *columns: str, **looks: Any) -> Any:
+    """A rich table without rows; columns that begin with '>' are numbers, flush right. `looks` are the table's own."""
+    from rich.table import Table
+
+    table = Table(title=title, **looks)
+    for name in columns:
+        table.add_column(name.lstrip(">"), justify="right" if name.startswith(">") else "left", overflow="fold")
+    return table

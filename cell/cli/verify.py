@@ -15,6 +15,7 @@ from cell.cli.options import (
     LevelOption,
     SeedOption,
     SimOption,
+    new_table,
     print_json,
 )  # fmt: skip
 
@@ -53,12 +54,10 @@ def verify(
 def print_verification(summary: Mapping[str, Any]) -> None:
     """The comparison for people: each figure with what a good calibration scatters by, then the decision."""
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
-    table = Table(title=f"observed today against the calibration of {summary['calibration_date']}")
-    for name in ("quantity", "difference", "sigma if good", "unit"):
-        table.add_column(name, justify="left" if name in ("quantity", "unit") else "right")
+    title = f"observed today against the calibration of {summary['calibration_date']}"
+    table = new_table(title, "quantity", ">difference", ">sigma if good", "unit")
     for row in summary["figures"]:
         table.add_row(row["name"], f"{row['value']:+.4f}", f"{row['sigma']:.4f}", row["unit"])
     for kind, value in summary["residuals_over_calibration"].items():
@@ -66,9 +65,8 @@ def print_verification(summary: Mapping[str, Any]) -> None:
             f"{kind}: residual over the calibration's", f"{value:.2f}", "1", f"≤ {summary['residuals_allowed']}"
         )
     console.print(table)
-    seen = Table(title=f"changes that show in {summary['detectable_share']:.0%} of checks like this one")
-    for name in ("part", "change", "from", "wanted", "unit"):
-        seen.add_column(name, justify="right" if name in ("from", "wanted") else "left")
+    title = f"changes that show in {summary['detectable_share']:.0%} of checks like this one"
+    seen = new_table(title, "part", "change", ">from", ">wanted", "unit")
     for row in summary["detectable"]:
         size = "none" if row["size"] is None else f"{row['size']:.3f}"
         enough = row["size"] is not None and row["size"] <= row["wanted"]
@@ -77,10 +75,9 @@ def print_verification(summary: Mapping[str, Any]) -> None:
         )
     console.print(seen)
     if summary["suspects"]:
-        suspects = Table(title="suspected parts")
-        allowed = f"of {summary['place']['allowed_mm']:g} mm allowed"
-        for name in ("part", "probability", "place off by, mm", "at most", allowed, "most probable change"):
-            suspects.add_column(name, justify="left" if name in ("part", "most probable change") else "right")
+        allowed = summary["place"]["allowed_mm"]
+        off = (">probability", ">place off by, mm", ">at most", f">of {allowed:g} mm allowed")
+        suspects = new_table("suspected parts", "part", *off, "most probable change")
         for row in summary["suspects"]:
             change = ", ".join(f"{name} {value:+.3f}" for name, value in row["change"].items())
             most = row["place_error_at_most_mm"]
@@ -89,7 +86,7 @@ def print_verification(summary: Mapping[str, Any]) -> None:
                 f"{row['probability']:.0%}",
                 f"{row['place_error_mm']:.3f}",
                 f"{most:.3f}",
-                f"{most / summary['place']['allowed_mm']:.0%}",
+                f"{most / allowed:.0%}",
                 change,
             )
         console.print(suspects)

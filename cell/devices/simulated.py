@@ -232,23 +232,10 @@ def with_endpoints(
 
 def endpoint_toml(config: dict[str, Any], endpoints: dict[str, Any]) -> str:
     """A configuration's tables as TOML, with the addresses of a served simulated cell in it."""
+    import tomlkit
+
     tables: dict[str, Any] = {name: table if isinstance(table, list) else dict(table) for name, table in config.items()}
     tables["cell"] |= {"time_scale": float(endpoints["speed"]), "truth": endpoints["truth"]["address"]}
     for name in DEVICES:
         tables[name] |= endpoints.get(name, {})
-    lines = ["# A simulated cell that is served: the configuration with its addresses."]
-    for name, table in tables.items():
-        several = isinstance(table, list)
-        for one in table if several else [table]:
-            lines += ["", f"[[{name}]]" if several else f"[{name}]"]
-            lines += [f"{key} = {_toml(value)}" for key, value in one.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    """A value as TOML has it; tables within tables in braces."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(inner) for inner in value) + "]"
-    return json.dumps(value, ensure_ascii=False)
+    return "# A simulated cell that is served: the configuration with its addresses.\n\n" + tomlkit.dumps(tables)

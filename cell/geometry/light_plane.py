@@ -150,23 +150,3 @@ def closed_form(
     d = focal / np.tan(theta) - xs
     d = np.where(d > least, d, np.nan)
     return np.column_stack([baseline * xs / d, baseline * ys / d, baseline * focal / d])
-
-
-def closed_form_jacobian(x: float, y: float, baseline: float, focal: float, theta: float) -> Array:
-    """∂(X, Y, Z)/∂(x', y', l, f, θ) of `closed_form`, (3, 5): the table of docs/theory.md, section 2."""
-    d = focal / np.tan(theta) - x
-    px, py, pz = baseline * x / d, baseline * y / d, baseline * focal / d
-    cot, csc2 = 1 / np.tan(theta), 1 / np.sin(theta) ** 2
-    return np.array(
-        [
-            [baseline * focal * cot / d**2, 0.0, px / baseline, -px * cot / d, px * pz * csc2 / baseline],
-            [baseline * y / d**2, baseline / d, py / baseline, -py * cot / d, py * pz * csc2 / baseline],
-            [
-                pz**2 / (baseline * focal),
-                0.0,
-                pz / baseline,
-                -(pz**2) * x / (baseline * focal**2),
-                pz**2 * csc2 / baseline,
-            ],
-        ]
-    )

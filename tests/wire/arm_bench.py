@@ -15,12 +15,14 @@ import sys
 
 import numpy as np
 
+from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.rtde import RtdePeer
 
 STIFFNESS = 2e4
+HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 
 
 class ArmBench:
@@ -62,6 +64,21 @@ class ArmBench:
     def _line(self) -> dict:
         assert self.process.stdout is not None
         return json.loads(self.process.stdout.readline())
+
+
+def soon(condition, seconds=3.0):
+    """Whether something happens within so many seconds."""
+    clock = Clock()
+    while not condition():
+        if clock.now() > seconds:
+            return False
+        clock.sleep(0.005)
+    return True
+
+
+def stand_at_home(arm):
+    assert soon(lambda: np.abs(arm.state().joints - HOME).max() < 1e-9)
+    arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
 
 
 def _table(height: float):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 
@@ -13,3 +15,11 @@ def ahead(clock: Clock, world: WorldClock) -> float:
     tried = [(clock.now(), world.now(), clock.now()) for _ in range(COMPARISONS)]
     before, there, after = min(tried, key=lambda times: times[2] - times[0])
     return 0.5 * (before + after) - there
+
+
+def until(clock: WorldClock, condition: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait for something, at most `seconds` of the world."""
+    deadline = clock.now() + seconds
+    while not condition():
+        assert clock.now() < deadline, "not within the deadline"
+        clock.sleep(0.02)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm_bench import ArmBench
+from arm_bench import ArmBench, soon, stand_at_home
 from scipy.spatial.transform import Rotation
 
 from drivers.arm.ur import UrArm
@@ -27,7 +27,6 @@ from drivers.interfaces import Arm, ArmSafety
 pytestmark = pytest.mark.wire
 
 LASER = 0
-HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +57,6 @@ def arm(bench, connected):
         connected.recover(confirmed=True)
         stand_at_home(connected)
     return connected
-
-
-def stand_at_home(arm):
-    assert soon(lambda: np.abs(arm.state().joints - HOME).max() < 1e-9)
-    arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
 
 
 def joints_away(arm, radians):
@@ -98,15 +92,6 @@ def gone(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     except FileNotFoundError:
         return True
-
-
-def soon(condition, seconds=3.0):
-    clock = Clock()
-    while not condition():
-        if clock.now() > seconds:
-            return False
-        clock.sleep(0.01)
-    return True
 
 
 def test_it_keeps_the_interface(arm):

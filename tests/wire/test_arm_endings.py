@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from arm_bench import ArmBench
+from arm_bench import HOME, ArmBench, soon, stand_at_home
 from cable import Cable
 
 from cell.devices.devices import Devices
@@ -30,7 +30,6 @@ from drivers.interfaces import ArmSafety
 pytestmark = pytest.mark.wire
 
 LASER = 0
-HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 SAFE_STOP_S = 5.0
 """What a cell's safe stop has for everything."""
 UR10E = [
@@ -75,11 +74,6 @@ class Shared:
             self._arm = None
 
 
-def stand_at_home(arm):
-    assert soon(lambda: np.abs(arm.state().joints - HOME).max() < 1e-9)
-    arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
-
-
 @pytest.fixture(scope="module")
 def shared(running):
     shared = Shared(running.address)
@@ -121,15 +115,6 @@ def dashboard(bench, command):
         lines.readline()
         connection.sendall(command.encode() + b"\n")
         return lines.readline().strip()
-
-
-def soon(condition, seconds=3.0):
-    clock = Clock()
-    while not condition():
-        if clock.now() > seconds:
-            return False
-        clock.sleep(0.005)
-    return True
 
 
 def swinging(arm, bench, kind="joints", speed=0.5):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arm_bench import ArmBench
+from arm_bench import ArmBench, soon
 from cable import Cable
 
 from cell.geometry.poses import to_ur
@@ -58,15 +58,6 @@ def send(address, script):
     with socket.create_connection((address, 30002), timeout=2.0) as connection:
         connection.sendall(f"sec other():\n  {script}\nend\n".encode())
         connection.recv(4096)
-
-
-def soon(condition, seconds=3.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        Clock().sleep(0.01)
-    return True
 
 
 def nudge(arm):

@@ -6,7 +6,7 @@ import itertools
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from sim_backends.models import ramp
 from sim_backends.models.rail import RailModel, RailParams, RailSettings
 from sim_backends.models.screw import Screw
 from sim_backends.peers.tmcl import TmclPeer
+from tests.wire.clocks import until
 
 STEPS = 200 * 256
 LEAD = 0.002
@@ -27,13 +28,6 @@ LEAD = 0.002
 
 def rail(seed: int = 1, **params: object) -> RailModel:
     return RailModel(RailParams(**params), np.random.default_rng(seed))  # type: ignore[arg-type]
-
-
-def until(clock: WorldClock, condition: Callable[[], object], seconds: float = 60.0) -> None:
-    deadline = clock.now() + seconds
-    while not condition():
-        assert clock.now() < deadline, "not within the deadline"
-        clock.sleep(0.02)
 
 
 def request(address: int, command: int, kind: int = 0, motor: int = 0, value: int = 0) -> bytes:

@@ -20,6 +20,7 @@ import pytest
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, State, VehicleModel, VehicleParams
 from sim_backends.peers.agilex import AgilexPeer
+from tests.wire.clocks import until
 
 DBC = Path(__file__).parents[2] / "drivers" / "vehicle" / "agilex_v2.dbc"
 
@@ -139,13 +140,6 @@ def receive(bus: can.BusABC, wanted: Callable[[can.Message], bool], seconds: flo
         if frame is not None and wanted(frame):
             return frame
     raise AssertionError("the frame did not come within the deadline")
-
-
-def until(clock: WorldClock, condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    deadline = clock.now() + seconds
-    while not condition():
-        assert clock.now() < deadline, "not within the deadline"
-        clock.sleep(0.02)
 
 
 def open_bus(peer: AgilexPeer) -> can.BusABC:

@@ -21,8 +21,7 @@ from cell.geometry.poses import difference
 from cell.lab.bench.board_conditions import CONDITIONS, Condition, View, draw_view
 from cell.lab.bench.board_render import Lens
 from cell.vision.board.board import board_pose, find_board
-from cell.vision.board.spec import KINDS, BoardSpec, Kind
-from cell.vision.board.view import BoardView
+from cell.vision.board.spec import KINDS, Kind
 from cell.vision.pictures import PictureRefused
 
 # A point farther than this share of a pitch from its own place bears another's name.
@@ -163,10 +162,3 @@ def campaign(
         "kinds": {kind: tally.row() for kind, tally in by_kind.items()},
         "rows": rows,
     }
-
-
-def look(picture: Any, spec: BoardSpec) -> tuple[BoardView, float]:
-    """The view of one picture, and the seconds that it took."""
-    start = time.perf_counter()
-    view = find_board(picture, spec)
-    return view, time.perf_counter() - start

@@ -6,11 +6,9 @@ measured with both. Frames are kept apart: the camera's alone is partly gauge, t
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +26,7 @@ from cell.lab.bench.calibration_world import (
     seen_dots,
     seen_rows,
 )
+from cell.lab.bench.over_cores import run_all
 
 TANGENTIAL = (6, 7)
 LENS_TO_MOUNT = 20
@@ -58,24 +57,10 @@ class Trial:
     errors: dict[str, dict[str, float]]
 
 
-def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None] = lambda done: None) -> dict[str, Any]:
+def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None]) -> dict[str, Any]:
     """Run the seeds on all cores and sum them up; `tell` hears how many are done."""
-    trials: list[Trial] = []
-    for trial in _trials(seeds, noise):
-        trials.append(trial)
-        tell(len(trials))
+    trials = run_all(partial(one_trial, noise=noise), seeds, progress=lambda done, _: tell(done))
     return summed_up(trials, noise)
-
-
-def _trials(seeds: Sequence[int], noise: Noise) -> Iterator[Trial]:
-    workers = min(os.cpu_count() or 1, len(seeds))
-    if workers < 2:
-        yield from (one_trial(seed, noise) for seed in seeds)
-        return
-    # There are as many processes as cores: a thread each is enough, and is set before their libraries load.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        yield from pool.map(one_trial, seeds, [noise] * len(seeds))
 
 
 def one_trial(seed: int, noise: Noise) -> Trial:

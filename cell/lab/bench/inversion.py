@@ -1,8 +1,7 @@
-"""The campaign behind `cell bench inversion`: starts from near and far on every part, ours beside the peers.
+"""The campaign behind `cell bench inversion`: starts from near and far on every part.
 
-A task is one part and one seed; cloud and starts are the same for every method, and the peers, which take most of the
-time, get every second round of the settings. Times are CPU times of one thread, so that a busy machine changes them
-little.
+A task is one part and one seed. Times are CPU times of one thread, so that a busy machine changes them little. What
+small_gicp and Open3D made of the same clouds and starts is in docs/libraries.md.
 """
 
 from __future__ import annotations
@@ -11,13 +10,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
 from cell.inversion import Prior
 from cell.inversion.correspondences import Scan
-from cell.lab.bench.inversion_methods import OURS, Method, methods
+from cell.inversion.registration import register
 from cell.lab.bench.inversion_parts import PARTS, nominal
 from cell.lab.bench.inversion_scenes import SETTINGS, TRUE, scan, start_away
 from drivers.errors import RefusedError
@@ -36,7 +34,6 @@ class Outcome:
     seed: int
     setting: str
     start: str
-    method: str
     error: tuple[float, float]
     seconds: float
 
@@ -53,67 +50,41 @@ def prior(kind: str, rng: np.random.Generator) -> Prior:
     return Prior(start_away(rng, metres, degrees), spread)
 
 
-@cache
-def ready(part: str, peers: bool) -> dict[str, Method | str]:
-    """The methods for a part, made and compiled once in each process."""
-    found = methods(nominal(part), peers)
-    rng = np.random.default_rng(0)
-    cloud, begin = Scan.of(scan(PARTS[part], rng), 2000), prior("near", rng)
-    for run in found.values():
-        if not isinstance(run, str):
-            run(cloud, begin)
-    return found
-
-
-def not_run(peers: bool) -> dict[str, str]:
-    """Why a method is not shown, by its name."""
-    return {name: run for name, run in ready("cap", peers).items() if isinstance(run, str)}
-
-
-def task(part: str, seed: int, peers: bool) -> list[Outcome]:
-    """Both starts and every method on one part; the setting goes round with the seed."""
-    rounds, turn = divmod(seed, len(SETTINGS))
-    label = list(SETTINGS)[turn]
+def task(part: str, seed: int) -> list[Outcome]:
+    """Both starts on one part; the setting goes round with the seed."""
+    label = list(SETTINGS)[seed % len(SETTINGS)]
     rng = np.random.default_rng(seed)
     cloud = Scan.of(scan(PARTS[part], rng, SETTINGS[label]))
     outcomes = []
     for kind in STARTS:
         begin = prior(kind, rng)
-        for method, run in ready(part, peers).items():
-            if isinstance(run, str) or (method != OURS and rounds % 2):
-                continue
-            started = time.process_time()
-            try:
-                error = PARTS[part].error(run(cloud, begin), TRUE)
-            except (RefusedError, RuntimeError, ValueError):
-                error = (float("inf"), float("inf"))
-            outcomes.append(Outcome(part, seed, label, kind, method, error, time.process_time() - started))
+        started = time.process_time()
+        try:
+            error = PARTS[part].error(register(cloud, nominal(part), begin).base_from_surface, TRUE)
+        except RefusedError:
+            error = (float("inf"), float("inf"))
+        outcomes.append(Outcome(part, seed, label, kind, error, time.process_time() - started))
     return outcomes
 
 
 def table(outcomes: Iterable[Outcome]) -> list[dict[str, object]]:
-    """One row for each part, start and method, and for all parts together."""
-    groups: dict[tuple[str, str, str], list[Outcome]] = defaultdict(list)
+    """One row for each part and start, and for all parts together."""
+    groups: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for outcome in outcomes:
-        groups[PARTS[outcome.part].title, outcome.start, outcome.method].append(outcome)
-    for (_, start, method), group in list(groups.items()):
-        groups["all parts", start, method] += group
-    return [
-        {"part": part, "start": start, "method": method, **_figures(group, groups[part, start, OURS])}
-        for (part, start, method), group in groups.items()
-    ]
+        for part in (PARTS[outcome.part].title, "all parts"):
+            groups[part, outcome.start].append(outcome)
+    ordered = sorted(groups.items(), key=lambda item: item[0][0] == "all parts")
+    return [{"part": part, "start": start, **_figures(group)} for (part, start), group in ordered]
 
 
-def _figures(group: list[Outcome], ours: list[Outcome]) -> dict[str, object]:
-    """Share converged (%), errors of those (mm, mrad), median time (ms) and its ratio to ours in the same tasks."""
+def _figures(group: list[Outcome]) -> dict[str, object]:
+    """Share converged (%), errors of those (mm, mrad) and the median time (ms)."""
     found = 1e3 * np.array([o.error for o in group if o.converged]).reshape(-1, 2)
     row: dict[str, object] = {"starts": len(group), "converged_percent": _percent(group)}
     for column, unit in enumerate(("mm", "mrad")):
         for name, share in (("median", 50), ("p95", 95)):
             row[f"{name}_{unit}"] = round(float(np.percentile(found[:, column], share)), 4) if len(found) else None
-    beside = {(o.part, o.seed): o.seconds for o in ours}
-    ratio = np.median([o.seconds / beside[o.part, o.seed] for o in group])
-    row |= {"ms": round(1e3 * float(np.median([o.seconds for o in group])), 1), "ratio": round(float(ratio), 2)}
+    row["ms"] = round(1e3 * float(np.median([o.seconds for o in group])), 1)
     settings = {label: [o for o in group if o.setting == label] for label in SETTINGS}
     return row | {"converged_percent_by_setting": {k: _percent(some) for k, some in settings.items() if some}}
 

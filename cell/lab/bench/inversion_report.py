@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -14,53 +10,32 @@ from scipy.stats import chi2
 
 from cell.inversion.closest import Array
 from cell.lab.bench import inversion_refusals as refusals
-from cell.lab.bench.inversion import Outcome, not_run, table, task
+from cell.lab.bench.inversion import table, task
 from cell.lab.bench.inversion_parts import PARTS
 from cell.lab.bench.inversion_scenes import RAIL_SIGMA, STRIPE_SIGMA
+from cell.lab.bench.over_cores import Progress, Task, run_all
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-
-def campaign(starts: int, cases: int, peers: bool, progress: Callable[[int, int], None]) -> dict[str, object]:
-    """Rows of `registration`, of `refusals` and the figures of `coverage`; `progress(done, total)` after each task."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    # Read by the numeric libraries when the workers load them: each method gets one thread.
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    outcomes: list[Outcome] = []
-    judged: list[refusals.Judged] = []
-    scores: list[tuple[Array, float]] = []
-    pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn"))
-    try:
-        absent = pool.submit(not_run, peers)
-        running: list[Future[Any]] = [pool.submit(task, part, seed, peers) for seed in range(starts) for part in PARTS]
-        for case in refusals.CASES:
-            running += [pool.submit(refusals.judge_case, case, seed) for seed in range(cases)]
-        running += [pool.submit(refusals.coverage, seed) for seed in range(5 * cases)]
-        for done, future in enumerate(as_completed(running), 1):
-            result = future.result()
-            if isinstance(result, list):
-                outcomes += result
-            elif isinstance(result, refusals.Judged):
-                judged.append(result)
-            elif isinstance(result, tuple):
-                scores.append(result)
-            progress(done, len(running))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def campaign(starts: int, cases: int, progress: Progress) -> dict[str, object]:
+    """Rows of `registration`, of `refusals` and the figures of `coverage`."""
+    tasks: list[Task] = [(task, part, seed) for seed in range(starts) for part in PARTS]
+    tasks += [(refusals.judge_case, case, seed) for case in refusals.CASES for seed in range(cases)]
+    tasks += [(refusals.coverage, seed) for seed in range(5 * cases)]
+    found = run_all(_run, tasks, progress=progress)
+    outcomes = [outcome for made in found if isinstance(made, list) for outcome in made]
+    judged = [made for made in found if isinstance(made, refusals.Judged)]
     order = {part: k for k, part in enumerate(PARTS)}
     outcomes.sort(key=lambda outcome: (order[outcome.part], outcome.start, outcome.seed))
     return {
         "registration": table(outcomes),
-        "not_run": absent.result(),
         "refusals": [_case_row(case, [j for j in judged if j.case == case]) for case in refusals.CASES],
-        "coverage": _coverage(scores),
+        "coverage": _coverage([made for made in found if isinstance(made, tuple)]),
         "assumed_noise": {"stripe_mm": 1e3 * STRIPE_SIGMA, "rail_mm": 1e3 * RAIL_SIGMA, "wild_points_percent": 1.0},
     }
+
+
+def _run(task: Task) -> Any:
+    return task[0](*task[1:])
 
 
 def _case_row(case: str, judged: list[refusals.Judged]) -> dict[str, object]:

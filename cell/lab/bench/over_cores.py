@@ -1,15 +1,19 @@
-"""Work that is spread over the cores, a process each, and handed on as it ends."""
+"""Work that is spread over the cores, a process each, and handed on as it ends. It must not depend on its process."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, TypeVar
 
 Task = tuple[Any, ...]
 """A function and what it is called with."""
+Progress = Callable[[int, int], None]
+"""Called with the number of finished items and of all."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 SINGLE_THREADED = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -28,3 +32,19 @@ def over_cores(tasks: Sequence[Task], workers: int = 0) -> Iterator[tuple[int, A
             yield waiting[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def run_all(
+    one: Callable[[Item], Result], items: Iterable[Item], workers: int = 0, progress: Progress | None = None
+) -> list[Result]:
+    """The results of `one` for each item, such as a seed, in their order; with one worker in this process."""
+    wanted = list(items)
+    results: dict[int, Result] = {}
+    ended: Iterable[tuple[int, Result]] = enumerate(map(one, wanted))
+    if workers != 1:
+        ended = over_cores([(one, item) for item in wanted], workers)
+    for index, result in ended:
+        results[index] = result
+        if progress is not None:
+            progress(len(results), len(wanted))
+    return [results[index] for index in range(len(wanted))]

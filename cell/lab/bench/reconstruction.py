@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cell.lab.bench.reconstruction_scenes import KINDS, SURFACES, Mask, Scene, cut_holes, scene, sweep
 from cell.reconstruction import fill_holes
@@ -20,8 +19,6 @@ SHARES = (0.01, 0.03, 0.05)
 HOLES = ((1, 1), (2, 6), (4, 12), (1, 60))
 CAMERAS = ((640, 480), (2048, 1088))
 LINES = 300
-NEIGHBOURS, DEVIATIONS = 16, 2.0
-"""Of the statistical removal: usual settings."""
 
 Tell = Callable[[float, str], None]
 
@@ -53,30 +50,18 @@ def _depths(made: Scene) -> tuple[np.ndarray, np.ndarray]:
 def _outliers(surface: str, kind: str, share: float, seed: int) -> dict[str, Any]:
     made = scene(surface, kind, share, seed)
     spent, found = _timed(lambda: find_outliers(made.depth, made.sigma))
-    points = np.stack([made.x, made.y, made.depth], axis=-1)[np.isfinite(made.depth)]
-    spent_peer, flagged = _timed(lambda: statistical_removal(points), 1)
-    peer = np.zeros(made.depth.shape, dtype=np.bool_)
-    peer[np.isfinite(made.depth)] = flagged
     return {
         "surface": surface,
         "kind": kind,
         "share": share,
-        **_judged(found, made.bad, ""),
+        **_judged(found, made.bad),
         "ms": 1e3 * spent,
-        **_judged(peer, made.bad, "statistical_"),
-        "statistical_ms": 1e3 * spent_peer,
     }
 
 
-def statistical_removal(points: np.ndarray) -> Mask:
-    """Points (n, 3) whose mean distance from their neighbours is beyond its mean by two standard deviations."""
-    distances = np.asarray(cKDTree(points).query(points, k=NEIGHBOURS + 1)[0])[:, 1:].mean(axis=1)
-    return np.asarray(distances > distances.mean() + DEVIATIONS * distances.std())
-
-
-def _judged(found: Mask, bad: Mask, prefix: str) -> dict[str, float]:
+def _judged(found: Mask, bad: Mask) -> dict[str, float]:
     hits, placed, flagged = (int(mask.sum()) for mask in (found & bad, bad, found))
-    return {f"{prefix}recall": hits / max(1, placed), f"{prefix}precision": hits / max(1, flagged)}
+    return {"recall": hits / max(1, placed), "precision": hits / max(1, flagged)}
 
 
 def _holes(surface: str, size: tuple[int, int], seed: int) -> dict[str, Any]:

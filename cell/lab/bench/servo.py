@@ -13,15 +13,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.lab.bench.stripe_truth import Cell as Stripe
 from cell.lab.bench.stripe_truth import draw
 from cell.supervisor import Cell
-from cell.vision.stripe.stream import extract_all
+from cell.vision.stripe.stream import StripeStream
 from drivers.arm.motion import UrMotion
 from drivers.arm.ur import UrArm
 from drivers.arm.ur_streaming import pace_of
@@ -38,7 +40,7 @@ def measure(seconds: float, seed: int, progress: Callable[[float, str], None]) -
     """Stream for `seconds` on the wall twice, without and with perception; figures of stream and bare loop."""
     pictures = [draw(Stripe(2.0, 120.0, 0.2), SHAPE, k)[0] for k in range(PICTURES)]
     cores = len(os.sched_getaffinity(0))
-    list(extract_all(pictures, threads=cores))
+    looked_at(pictures)
     rows = []
     with Cell.open(sim="all", seed=seed, speed=1.0, only=("arm",)) as cell:
         for busy in (False, True):
@@ -70,16 +72,23 @@ def streamed(cell: Cell, seconds: float, pictures: list[Any], cores: int, what: 
     motion = arm.follow(times, joints)
     assert isinstance(motion, UrMotion)
     begun, looked = time.monotonic(), 0
-    while not motion.done:
-        if pictures:
-            looked += sum(1 for _ in extract_all(pictures, threads=cores))
-        else:
-            cell.devices.clock.sleep(0.1)
+    with ThreadPoolExecutor(cores) as pool:
+        while not motion.done:
+            if pictures:
+                looked += sum(pool.map(looked_at, [pictures] * cores))
+            else:
+                cell.devices.clock.sleep(0.1)
     took = time.monotonic() - begun
     motion.wait(10.0)
     assert motion.pace is not None
     bare = json.loads(loop.communicate()[0])
     return {"beside": what, "pictures_per_s": looked / took, "stream": asdict(motion.pace), "bare": bare}
+
+
+def looked_at(pictures: list[NDArray[np.uint8]]) -> int:
+    """Read the stripes of a stream; returns of how many pictures."""
+    stream = StripeStream()
+    return sum(stream.extract(picture) is not None for picture in pictures)
 
 
 def bare_loop(seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""How near stripes of a workshop are read to their own bounds, how true the stated σ is, and what peers make of it."""
+"""How near stripes of a workshop are read to their own bounds, and how true the stated σ is."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.bench.stripe_speed import centre_of_gravity
 from cell.lab.bench.stripe_workshop import Scene, bound, draw
-from cell.vision.stripe.extract import Method, extract
+from cell.vision.stripe.extract import extract
 
 LEAST_EFFICIENCY, STATED, LEAST_FOUND, MOST_FALSE = 0.9, (0.8, 1.2), 0.95, 0.01
 FALSE_PX = 3.0
@@ -30,7 +29,6 @@ def scenes() -> list[Scene]:
 def measure(scene: Scene, pictures: int = 1, seed: int = 0) -> dict[str, Any]:
     """Errors of a scene's centres about their mean, for a profile without symmetry has its centre where one likes."""
     errors, stated = [], []
-    peers: dict[str, list[float]] = {"steger_px": [], "centre_of_gravity_px": []}
     found, false, marked = 0.0, 0.0, 0.0
     for k in range(pictures):
         image, centres = draw(scene, seed + k)
@@ -44,9 +42,6 @@ def measure(scene: Scene, pictures: int = 1, seed: int = 0) -> dict[str, Any]:
         marked += float(np.mean(seen.marks[there] > 0)) / pictures if there.any() else 0.0
         errors.append((error - middle)[there & ~wrong])
         stated.append(seen.sigma[there & ~wrong])
-        if scene.camera == "grey":
-            peers["steger_px"].append(_scatter(extract(image, method=Method.STEGER).centres - centres))
-            peers["centre_of_gravity_px"].append(_scatter(centre_of_gravity(image) - centres))
     error, sigma = np.concatenate(errors), np.concatenate(stated)
     rms = float(np.sqrt(np.mean(error**2))) if len(error) > 1 else float("nan")
     # The bound knows neither texture nor the print of coloured pictures.
@@ -62,7 +57,6 @@ def measure(scene: Scene, pictures: int = 1, seed: int = 0) -> dict[str, Any]:
         "found": found,
         "false": false,
         "marked": marked,
-        **{name: float(np.mean(values)) if values else None for name, values in peers.items()},
     }
     row["within_limits"] = within_limits(row)
     return row
@@ -93,8 +87,3 @@ def campaign(progress: Callable[[float, str], None], pictures: int = 3) -> dict[
         "within_limits": all(row["within_limits"] for row in rows),
         "rows": rows,
     }
-
-
-def _scatter(error: Any) -> float:
-    error = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean((error - np.median(error)) ** 2))) if len(error) else float("nan")

@@ -7,22 +7,23 @@ from __future__ import annotations
 
 import typer
 
-from cell.lab.cli import (
-    bench_acceptance,
-    bench_accuracy,
-    bench_board,
-    bench_calibration,
-    bench_endings,
-    bench_inversion,
-    bench_pages,
-    bench_realism,
-    bench_reconstruction,
-    bench_servo,
-    bench_soak,
-    bench_stripe,
-    bench_verify,
-    paper,
-)
+from cell.lab.cli.bench_acceptance import acceptance
+from cell.lab.cli.bench_accuracy import accuracy
+from cell.lab.cli.bench_board import board
+from cell.lab.cli.bench_calibration import calibration
+from cell.lab.cli.bench_endings import endings
+from cell.lab.cli.bench_inversion import inversion
+from cell.lab.cli.bench_realism import realism
+from cell.lab.cli.bench_reconstruction import reconstruction
+from cell.lab.cli.bench_streams import pages, servo, soak
+from cell.lab.cli.bench_stripe import stripe
+from cell.lab.cli.bench_verify import verify
+from cell.lab.cli.paper import paper
+
+BENCH = (
+    acceptance, accuracy, board, calibration, endings, inversion, pages, realism, reconstruction, servo, soak, stripe,
+    verify,
+)  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:
@@ -30,21 +31,7 @@ def register(app: typer.Typer) -> None:
     bench = typer.Typer(
         help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
     )
-    for command in (
-        bench_acceptance,
-        bench_accuracy,
-        bench_board,
-        bench_calibration,
-        bench_endings,
-        bench_inversion,
-        bench_pages,
-        bench_realism,
-        bench_reconstruction,
-        bench_servo,
-        bench_soak,
-        bench_stripe,
-        bench_verify,
-    ):
-        command.register(bench)
+    for command in BENCH:
+        bench.command()(command)
     app.add_typer(bench, name="bench")
-    paper.register(app)
+    app.add_typer(paper, name="paper")

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import typer
-
-from cell.cli.options import JsonOption, Level, LevelOption, SeedOption, print_json
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(acceptance)
+from cell.cli.options import JsonOption, Level, LevelOption, SeedOption
+from cell.lab.cli.shown import bar, show
 
 
 def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False) -> None:
@@ -18,11 +12,8 @@ def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: J
     A ball at ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts.
     """
     from cell.lab.bench.acceptance import acceptance as campaign
-    from cell.lab.cli.paper_tables import campaign_progress, print_acceptance
+    from cell.lab.cli.paper_tables import print_acceptance
 
-    with campaign_progress("places") as progress:
-        result = campaign(seed, level.value, progress)
-    if json:
-        print_json(result)
-    else:
-        print_acceptance(result)
+    with bar() as told:
+        result = campaign(seed, level.value, lambda done, total: told(done, "places", total))
+    show(result, json, print_acceptance)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cell.cli.options import JobOption, JsonOption, Level, print_json
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(accuracy)
+from cell.cli.options import JobOption, JsonOption, Level
+from cell.lab.cli.shown import bar, counted, show
 
 
 def accuracy(
@@ -22,7 +17,6 @@ def accuracy(
     ] = None,
     job: JobOption = "pot",
     workers: Annotated[int, typer.Option("--workers", min=0, max=64, help="Processes; 0 is one a core.")] = 0,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Draw every run's error to this PNG file.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Calibrate and run many simulated cells on the virtual clock and measure them against the truth.
@@ -31,34 +25,15 @@ def accuracy(
 
     Exit code 1 when a part was placed outside the job's tolerance, or a limit of level nominal is not kept.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from cell.lab.bench.accuracy import campaign
-    from cell.lab.bench.accuracy_picture import draw
     from cell.lab.cli.bench_tables import print_accuracy
-    from drivers.errors import ConfigError
 
     levels = list(dict.fromkeys(entry.value for entry in level or [Level.nominal]))
-    if picture is not None and picture.suffix != ".png":
-        raise ConfigError(f"--picture {picture} must end in .png")
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("the first runs are on their way", total=(seeds + 1) * len(levels))
-
-        def done(what: str) -> None:
-            progress.update(task, advance=1, description=what)
-            if not progress.console.is_terminal:
-                # A log shows no bar until its end.
-                progress.console.print(what, markup=False)
-
+    with bar() as told:
+        told(0, "the first runs are on their way")
+        done = counted(told, (seeds + 1) * len(levels))
         result = campaign(range(1, seeds + 1), levels, job, done, workers)
-    if picture is not None:
-        draw(picture, result)
-    if json:
-        print_json(result)
-    else:
-        print_accuracy(result)
+    show(result, json, print_accuracy)
     by_level = result["levels"].values()
     outside = sum(entry["outcomes"]["placed_outside_tolerance"] for entry in by_level)
     if outside or not all(entry.get("within_limits", True) for entry in by_level):

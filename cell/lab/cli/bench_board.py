@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json, wide_console
-
-
-def register(bench: typer.Typer) -> None:
-    """Add the command to the bench."""
-    bench.command(name="board")(board)
+from cell.cli.options import JsonOption, wide_console
+from cell.lab.cli.shown import bar, counted, formed, show
 
 
 def board(
@@ -22,138 +17,57 @@ def board(
     condition: Annotated[
         list[str] | None, typer.Option(help="Only conditions with this in their name; may be given again.")
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Look for a board in this picture instead.")] = None,
-    name: Annotated[str, typer.Option("--board", help="The board in that picture.")] = "marked_dots:9x7:20mm",
     json: JsonOption = False,
 ) -> None:
     """How surely boards are found, under which name their points, how exactly, and whether the covariance is true.
 
-    Exit code 1 when a board, or the order of its points, was taken for another, or the picture was refused.
+    Exit code 1 when a board, or the order of its points, was taken for another.
     """
     from cell.lab.bench.board import campaign
     from cell.lab.bench.board_conditions import CONDITIONS
     from cell.vision.board.spec import KINDS
     from drivers.errors import ConfigError
 
-    if picture is not None:
-        _one(picture, name, json)
-        return
     kinds = [k for k in KINDS if not kind or k in kind]
     if kind and len(kinds) != len(set(kind)):
         raise ConfigError(f"--kind {', '.join(kind)}: allowed are {', '.join(KINDS)}")
     chosen = [c for c in CONDITIONS if not condition or any(text in c.name for text in condition)]
     if not chosen:
         raise ConfigError(f"no condition is named like that; there are: {', '.join(c.name for c in CONDITIONS)}")
-    with _progress(views * len(kinds) * len(chosen)) as advance:
-        report = campaign(views, seed, kinds, chosen, advance)
-    if json:
-        print_json(report)
-    else:
-        _print(report)
+    with bar() as told:
+        report = campaign(views, seed, kinds, chosen, counted(told, views * len(kinds) * len(chosen)))
+    show(report, json, _print)
     if report["wrong"]:
         raise typer.Exit(1)
 
 
-def _one(picture: Path, name: str, json: bool) -> None:
-    """Look for a board in a picture file and tell what was found."""
-    from cell.lab.bench.board import look
-    from cell.vision.board.spec import parse_board
-    from cell.vision.pictures import PictureRefused, read_picture
-
-    spec = parse_board(name)
-    try:
-        view, seconds = look(read_picture(picture), spec)
-    except PictureRefused as refused:
-        if json:
-            print_json({"picture": picture.name, "found": False, "reason": refused.reason, "text": str(refused)})
-        else:
-            typer.echo(f"{picture.name}: refused ({refused.reason}): {refused}")
-        raise typer.Exit(1) from refused
-    found = {
-        "picture": picture.name,
-        "found": True,
-        "board": spec.name,
-        "points": len(view.ids),
-        "of": len(spec.lattice()),
-        "order_assumed": view.order_assumed,
-        "median_sigma_px": round(float(sorted(view.sigma)[len(view.sigma) // 2]), 4),
-        "ms": round(1e3 * seconds, 1),
-    }
-    if json:
-        print_json({**found, "ids": view.ids.tolist(), "pixels": view.pixels.round(4).tolist()})
-    else:
-        order = "its order assumed, as the board is symmetric" if view.order_assumed else "its order certain"
-        typer.echo(
-            f"{picture.name}: {spec.name}, {found['points']} of {found['of']} points, sigma {found['median_sigma_px']} "
-            f"px, {order}, {found['ms']} ms"
-        )
-
-
-class _progress:
-    """A progress bar on standard error that counts views."""
-
-    def __init__(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.completed:>5.0f} of {task.total:.0f} views"),
-            BarColumn(bar_width=30),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.description}"),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task("", total=total)
-
-    def __enter__(self) -> Any:
-        self._bar.start()
-        return lambda text: self._bar.update(self._task, advance=1, description=text)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-
-COLUMNS = (
-    ("views", "views", "{:d}"),
-    ("found %", "found", "{:.1%}"),
-    ("refused %", "refused", "{:.1%}"),
-    ("wrong", "wrong", "{:d}"),
-    ("points px", "centre_rms_px", "{:.3f}"),
-    ("pose mm", "pose_mm", "{:.3f}"),
-    ("mrad", "pose_mrad", "{:.3f}"),
-    ("z", "z", "{:.2f}"),
-    ("z of the axes", "z_axes", "{}"),
-    ("in 95 %", "coverage_95", "{:.1%}"),
-    ("found ms", "found_ms", "{:.0f}"),
-    ("refused ms", "refused_ms", "{:.0f}"),
-)
-
-
-def _text(value: Any) -> Any:
-    """The smallest and the largest of a list, anything else as it is."""
-    return f"{min(value):.2f}-{max(value):.2f}" if isinstance(value, list) else value
+COLUMNS = {
+    "views": "{views:d}",
+    "found %": "{found:.1%}",
+    "refused %": "{refused:.1%}",
+    "wrong": "{wrong:d}",
+    "points px": "{centre_rms_px:.3f}",
+    "pose mm": "{pose_mm:.3f}",
+    "mrad": "{pose_mrad:.3f}",
+    "z": "{z:.2f}",
+    "z of the axes": "{least_z:.2f}-{most_z:.2f}",
+    "in 95 %": "{coverage_95:.1%}",
+    "found ms": "{found_ms:.0f}",
+    "refused ms": "{refused_ms:.0f}",
+}
 
 
 def _print(report: dict[str, Any]) -> None:
-    from rich.table import Table
-
     console = wide_console()
-    lines = [(row["condition"], row["expect"], row) for row in report["rows"] if row["kind"] == "all"]
-    kinds = [(kind, "found", row) for kind, row in report["kinds"].items()]
+    lines = [row for row in report["rows"] if row["kind"] == "all"]
+    kinds = [{"condition": kind, "expect": "found", **row} for kind, row in report["kinds"].items()]
     for title, first, rows in (
         (f"all kinds of boards, {report['views_per_line']} views of each, RMS errors", "condition", lines),
         ("by kind, where the board is to be found", "kind", kinds),
     ):
-        table = Table(title=title)
-        table.add_column(first)
-        table.add_column("to be")
-        for heading, _, _ in COLUMNS:
-            table.add_column(heading, justify="right")
-        for name, expect, row in rows:
-            shown = ["" if row[key] is None else form.format(_text(row[key])) for _, key, form in COLUMNS]
-            table.add_row(name, expect, *shown)
-        console.print(table)
+        axes = [row["z_axes"] or [None] for row in rows]
+        shown = [row | {"least_z": min(z), "most_z": max(z)} for row, z in zip(rows, axes, strict=True)]
+        console.print(formed(title, {first: "{condition}", "<to be": "{expect}", **COLUMNS}, shown))
     console.print(
         "simulated pictures: 40 electrons per DN, read noise 0.4 DN. wrong: a point under another's name, or a board "
         "found that is not there."

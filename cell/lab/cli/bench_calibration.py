@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption, wide_console
+from cell.lab.cli.shown import bar, show, table
 
 FRAMES = {
     "camera": "camera frame, 1000 points",
@@ -18,11 +19,6 @@ FRAMES = {
 }
 
 
-def register(bench: typer.Typer) -> None:
-    """Add the command of this file to `cell bench`."""
-    bench.command()(calibration)
-
-
 def calibration(
     seeds: Annotated[int, typer.Option(min=2, max=1000, help="How many heads are drawn and calibrated.")] = 30,
     json: JsonOption = False,
@@ -31,27 +27,16 @@ def calibration(
 
     The observations are drawn by code that shares nothing with the estimator; all figures are of simulation.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from cell.lab.bench.calibration import campaign
     from cell.lab.bench.calibration_world import Noise
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("seeds", total=seeds)
-        result = campaign(range(1, seeds + 1), Noise(), lambda done: progress.update(task, completed=done))
-    if json:
-        print_json(result)
-    else:
-        _print(result)
+    with bar() as told:
+        result = campaign(range(1, seeds + 1), Noise(), lambda done: told(done, f"{done} of {seeds} heads", seeds))
+    show(result, json, _print)
 
 
 def _print(result: Mapping[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
+    console = wide_console(150)
     noise = result["assumed_noise"]
     console.print(
         f"simulated, {result['seeds']} seeds, 20 poses each; assumed 1 sigma: dots {noise['dots_px']:g} px, stripe "
@@ -59,17 +44,15 @@ def _print(result: Mapping[str, Any]) -> None:
         f"{noise['arm_rotation_mrad']:g} mrad",
         soft_wrap=True,
     )
-    table = Table(title="errors in mm, means over the seeds")
-    titles = ("of", "mean D", "85 %", "max D", "bound of mean D", "ratio", "best on same noise", "ratio")
-    for name in (*titles, "reachable: mean, 85 %, max"):
-        table.add_column(name, justify="left" if name == "of" else "right")
+    rows = []
     for frame, title in FRAMES.items():
         row, theory = result["frames_mm"][frame], result["frames_mm"][frame]["theory"]
         shown = "" if theory is None else f"{theory['mean']:.3f}  {theory['p85']:.3f}  {theory['max']:.3f}"
         values = [f"{row[key]:.4f}" for key in ("mean", "p85", "max", "bound_mean")]
         values += [f"{row['ratio']:.3f}", f"{row['best_mean']:.4f}", f"{row['ratio_same_noise']:.3f}"]
-        table.add_row(title, *values, shown)
-    console.print(table)
+        rows.append((title, *values, shown))
+    titles = ("of", "mean D", "85 %", "max D", "bound of mean D", "ratio", "best on same noise", "ratio")
+    console.print(table("errors in mm, means over the seeds", (*titles, "reachable: mean, 85 %, max"), rows))
     console.print("Where the camera's frame lies is partly gauge: its error goes into the hand-eye, not into a place.")
     console.print(
         "Best on same noise: the linear estimate that attains the bound, on the same observations; it shares the "

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, SeedOption, print_json
-
-
-def register(bench: typer.Typer) -> None:
-    """Add the command of this file to `cell bench`."""
-    bench.command("endings")(endings)
+from cell.cli.options import JsonOption, SeedOption
+from cell.lab.cli.shown import bar, show, table
 
 
 def endings(
@@ -24,41 +20,20 @@ def endings(
     import tempfile
     from pathlib import Path
 
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from cell.lab.bench.endings import campaign, summary
 
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with (
-        tempfile.TemporaryDirectory(prefix="cell-endings-") as folder,
-        Progress(*columns, console=Console(stderr=True)) as bar,
-    ):
-        task = bar.add_task("", total=2 * count)
-        found = campaign(
-            Path(folder), count, seed, speed, lambda done, text: bar.update(task, completed=done, description=text)
-        )
+    with tempfile.TemporaryDirectory(prefix="cell-endings-") as folder, bar() as told:
+        found = campaign(Path(folder), count, seed, speed, lambda done, text: told(done, text, 2 * count))
     result = summary(found, seed, speed)
-    if json:
-        print_json(result)
-    else:
-        _print(result)
+    show(result, json, _print)
     if result["moved_or_shone_after"]:
         raise typer.Exit(1)
 
 
-def _print(result: dict[str, object]) -> None:
+def _print(result: dict[str, Any]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table(
-        title=f"{result['trials']} endings at random instants, simulated cell, {result['speed']:g} × the wall"
-    )
-    table.add_column("ended in")
-    for name in ("kills", "signals, aborts", f"moves or shines {result['limit_s']} s after", "last motion, s after"):
-        table.add_column(name, justify="right")
-    rows = result["work"]
-    assert isinstance(rows, list)
-    for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    Console().print(table)
+    title = f"{result['trials']} endings at random instants, simulated cell, {result['speed']:g} × the wall"
+    late = f"moves or shines {result['limit_s']} s after"
+    columns = ("ended in", "kills", "signals, aborts", late, "last motion, s after")
+    Console().print(table(title, columns, (row.values() for row in result["work"])))

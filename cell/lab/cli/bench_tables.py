@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from cell.lab.cli.paper_tables import print_acceptance
+from cell.lab.cli.shown import empty, table
 from cell.report.figures import noise_rows
 from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 
@@ -44,24 +44,21 @@ def print_accuracy(result: Mapping[str, Any]) -> None:
 
 
 def _errors(console: Console, level: str, figures: Mapping[str, Any]) -> None:
-    table = Table(title=f"level {level}, {figures['runs']} runs")
-    table.add_column("D = distance from the truth")
-    for name in ("measured", "expected", "limit", "paper"):
-        table.add_column(name, justify="right")
-    table.add_column("unit")
+    columns = ("D = distance from the truth", "measured", "expected", "limit", "paper", "<unit")
+    shown = empty(f"level {level}, {figures['runs']} runs", *columns)
     limits = figures.get("limits", {})
     for text, unit, key, name in _ROWS:
         bound = figures[key].get("absolute_bound" if name == "absolute_mean" else "bound")
         expected = _shown(bound) if name.endswith("mean") else ""
         limit = limits.get(key, {}).get(name)
-        table.add_row(text, _shown(figures[key][name]), expected, _shown(limit), _PAPER.get((key, name), ""), unit)
+        shown.add_row(text, _shown(figures[key][name]), expected, _shown(limit), _PAPER.get((key, name), ""), unit)
     covered = limits.get("coverage_95")
     allowed = "" if covered is None else f"{100 * covered['low']:.0f}–{100 * covered['high']:.0f}"
     share = figures["coverage_95"]
-    table.add_row("in the stated 95 % ellipsoid", "" if share is None else f"{100 * share:.1f}", "95", allowed, "", "%")
+    shown.add_row("in the stated 95 % ellipsoid", "" if share is None else f"{100 * share:.1f}", "95", allowed, "", "%")
     for name, value in figures["chi2_per_dof"].items():
-        table.add_row(f"χ²/dof, {name}", _shown(value), "1", "", "", "")
-    console.print(table)
+        shown.add_row(f"χ²/dof, {name}", _shown(value), "1", "", "", "")
+    console.print(shown)
 
 
 def _outcomes(console: Console, figures: Mapping[str, Any]) -> None:
@@ -75,13 +72,8 @@ def _outcomes(console: Console, figures: Mapping[str, Any]) -> None:
 
 
 def _noise(console: Console, level: str, noise: Mapping[str, Any]) -> None:
-    table = Table(title=f"assumed noise, 1 sigma (level {level})")
-    table.add_column("of")
-    table.add_column("sigma", justify="right")
-    table.add_column("unit")
-    for row in noise_rows({"sigmas": noise}):
-        table.add_row(*row)
-    console.print(table)
+    rows = noise_rows({"sigmas": noise})
+    console.print(table(f"assumed noise, 1 sigma (level {level})", ("of", "sigma", "<unit"), rows))
 
 
 def _shown(value: float | None) -> str:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, Level, LevelOption, print_json
-
-
-def register(bench: typer.Typer) -> None:
-    """Add the command of this file to `cell bench`."""
-    bench.command("verify")(verify)
+from cell.cli.options import JsonOption, Level, LevelOption, wide_console
+from cell.lab.cli.shown import bar, counted, show, table
 
 
 def verify(
@@ -20,48 +16,28 @@ def verify(
     json: JsonOption = False,
 ) -> None:
     """Find 0.2 mm or 0.05° in every part of the chain, over many simulated worlds (no pictures are rendered)."""
-    from rich.console import Console
-    from rich.progress import Progress
-    from rich.table import Table
-
-    from cell.lab.bench.verification import CHECKS_OF_A_GOOD_ONE, KINDS_OF_CHANGE, campaign, disturbances
+    from cell.lab.bench.verification import KINDS_OF_CHANGE, campaign, disturbances
 
     chosen = disturbances()
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=seeds * (len(chosen) + KINDS_OF_CHANGE + 1))
+    with bar() as told:
+        progress = counted(told, seeds * (len(chosen) + KINDS_OF_CHANGE + 1))
+        found = campaign(range(1, seeds + 1), level.value, chosen, progress)
+    show(found.summary(level.value, seeds) | {"seeds": seeds, "level": level.value}, json, _print)
 
-        def progress(text: str) -> None:
-            bar.update(task, advance=1, description=text)
 
-        summary = campaign(range(1, seeds + 1), level.value, chosen, progress).summary(level.value, seeds)
-    if json:
-        print_json(summary)
-        return
-    table = Table(title=f"verification over {seeds} worlds, level {level.value}")
-    columns = (
-        "disturbance",
-        "checks",
-        "found %",
-        "in 95 % from",
-        "unit",
-        "its part named first %",
-        "among the suspects %",
-    )
-    for k, name in enumerate(columns):
-        table.add_column(name, justify="right" if k else "left")
-    for row in summary["disturbances"]:
-        keys = ("checks", "found_percent", "detectable_mean", "unit", "named_first_percent", "among_suspects_percent")
-        table.add_row(row["name"], *(str(row[key]) for key in keys))
-    console = Console()
-    console.print(table)
-    promised = Table(title="changes as large as the verification says it finds in 95 % of checks")
-    for k, name in enumerate(
-        ("part", "change", "mean", "largest", "wanted", "unit", "checks", "found %", "bad at a third %")
-    ):
-        promised.add_column(name, justify="right" if k > 1 else "left")
-    for row in summary["detectable"]:
-        promised.add_row(*(str(value) for value in row.values()))
-    console.print(promised)
+def _print(summary: dict[str, Any]) -> None:
+    from cell.lab.bench.verification import CHECKS_OF_A_GOOD_ONE
+
+    console, seeds = wide_console(150), summary["seeds"]
+    keys = ("name", "checks", "found_percent", "detectable_mean", "unit", "named_first_percent",
+            "among_suspects_percent")  # fmt: skip
+    columns = ("disturbance", "checks", "found %", "in 95 % from", "unit", "its part named first %",
+               "among the suspects %")  # fmt: skip
+    rows = ([row[key] for key in keys] for row in summary["disturbances"])
+    console.print(table(f"verification over {seeds} worlds, level {summary['level']}", columns, rows))
+    of_size = ("part", "<change", "mean", "largest", "wanted", "unit", "checks", "found %", "bad at a third %")
+    title = "changes as large as the verification says it finds in 95 % of checks"
+    console.print(table(title, of_size, (row.values() for row in summary["detectable"])))
     console.print(f"found of changes of this size: {summary['found_at_detectable_percent']:g} %")
     console.print(
         f"called bad where the place is off by a third of its tolerance: {summary['bad_at_a_third_percent']:g} %"

@@ -7,28 +7,22 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, print_json
+from cell.cli.options import JsonOption
+from cell.lab.cli.shown import bar, show
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the pictures and the numbers as JSON; made if it is not there.")
 ]
 SeedsOption = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many simulated heads.")]
 
-paper = typer.Typer(
-    help="The paper, reproduced: its design study, equations, tables and the systems it cites.", no_args_is_help=True
-)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the group of this file."""
-    app.add_typer(paper, name="paper")
+paper = typer.Typer(help="The paper, reproduced: its design study, equations and table.", no_args_is_help=True)
 
 
 @paper.command()
 def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     """Figure 2: error over the sensor for 30 and 35 mm of baseline, light on it, and which rule chooses 35 mm.
 
-    With --out it also draws figure2_errors.png and figure2_choice.png.
+    With --out it also draws figure2_errors.png.
     """
     from cell.lab.cli.paper_tables import print_figure2
     from cell.lab.paper.figure2 import figure2 as numbers
@@ -38,7 +32,10 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     if out is not None:
         from cell.lab.paper.figure2_pictures import draw
 
-        _name(draw(out))
+        path = out / "figure2_errors.png"
+        draw(path)
+        # On standard error, so that JSON on standard output stays alone.
+        typer.echo(f"drawn: {path}", err=True)
 
 
 @paper.command()
@@ -52,56 +49,20 @@ def equations(json: JsonOption = False, out: OutOption = None) -> None:
 
 @paper.command()
 def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = None) -> None:
-    """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's figures.
-
-    With --out it also draws table1.png.
-    """
-    from cell.lab.cli.paper_tables import campaign_progress, print_table1
-    from cell.lab.paper.campaign import cores
+    """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's."""
+    from cell.lab.cli.paper_tables import print_table1
     from cell.lab.paper.table1 import table1 as campaign
 
-    with campaign_progress("heads") as progress:
-        result = campaign(range(seeds), cores(), progress)
+    with bar() as told:
+        result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
     _show(result, json, out, "table1", print_table1)
-    if out is not None:
-        from cell.lab.paper.comparison_pictures import draw_table1
-
-        _name([draw_table1(result, out / "table1.png")])
-
-
-@paper.command()
-def systems(seeds: SeedsOption = 5, json: JsonOption = False, out: OutOption = None) -> None:
-    """The systems that the paper cites, theirs as published and ours for the same task in simulation.
-
-    With --out it also draws systems.png.
-    """
-    from cell.lab.cli.paper_tables import campaign_progress, print_systems
-    from cell.lab.paper.campaign import cores
-    from cell.lab.paper.systems import systems as campaign
-
-    with campaign_progress("heads") as progress:
-        result = campaign(range(seeds), cores(), progress)
-    _show(result, json, out, "systems", print_systems)
-    if out is not None:
-        from cell.lab.paper.comparison_pictures import draw_systems
-
-        _name([draw_systems(result, out / "systems.png")])
 
 
 def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table: Any) -> None:
     """Print as JSON or as a table, and keep the numbers in the folder."""
-    if json:
-        print_json(result)
-    else:
-        table(result)
+    show(result, json, table)
     if out is not None:
         from cell.run.folder import write_json
 
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / f"{name}.json", result)
-
-
-def _name(paths: list[Path]) -> None:
-    """Say on standard error what was drawn, so that JSON on standard output stays alone."""
-    for path in paths:
-        typer.echo(f"drawn: {path}", err=True)

@@ -2,42 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
-from cell.cli.options import wide_console
-from cell.lab.paper.campaign import Progress as Report
+from cell.lab.cli.shown import empty
 
 WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
 """The head as drawn; calibrated by the paper's steps one by one; by the joint adjustment."""
-
-
-@contextmanager
-def campaign_progress(what: str) -> Iterator[Report]:
-    """A bar on standard error; gives what to call with the number done and the number of all."""
-    columns = (TextColumn(f"{what:<12}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=None)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield report
-
-
-def _table(title: str, *columns: str) -> Table:
-    """A table whose first column is text in one line; columns that start with '<' are text too, '<<' in one line."""
-    table = Table(title=title)
-    for index, name in enumerate(columns):
-        left = index == 0 or name.startswith("<")
-        whole = index == 0 or name.startswith("<<")
-        table.add_column(name.lstrip("<"), justify="left" if left else "right", overflow="fold", no_wrap=whole)
-    return table
 
 
 def _say(console: Console, text: str) -> None:
@@ -48,20 +21,20 @@ def print_figure2(result: Mapping[str, Any]) -> None:
     """The design study: maps, limits on δ, the choice of the baseline, and the paper's statements with a verdict."""
     console = Console()
     delta = result["assumed"]["stripe_error_um"]
-    maps = _table(f"largest error over ±1 mm of sensor in mm, stripe error {delta:.2f} µm", "baseline in mm",
+    maps = empty(f"largest error over ±1 mm of sensor in mm, stripe error {delta:.2f} µm", "baseline in mm",
                   "dX", "dY", "dZ", "dZ in the middle", "nearest Z", "farthest Z")  # fmt: skip
     for row in result["maps"]:
         top = row["largest_mm"]
         shown = (top["dx"], top["dy"], top["dz"], row["centre_mm"]["dz"])
         maps.add_row(f"{row['baseline_mm']:g}", *(f"{v:.3f}" for v in shown), *(f"{z:.0f}" for z in row["depth_mm"]))
     console.print(maps)
-    limits = _table("stripe error δ in µm at which the paper's claims hold", "focal length in mm",
+    limits = empty("stripe error δ in µm at which the paper's claims hold", "focal length in mm",
                     "0.5 mm at l = 30 mm", "0.2 mm at l = 35 mm")  # fmt: skip
     for row in result["limits"]:
         focal, small, large = row.values()
         limits.add_row(f"{focal:g}", f"{small:.3f}", f"{large:.3f}")
     console.print(limits)
-    choice = _table("choice of the baseline", "baseline in mm", "largest dZ in mm", "δ limit for 0.2 mm in µm",
+    choice = empty("choice of the baseline", "baseline in mm", "largest dZ in mm", "δ limit for 0.2 mm in µm",
                     "light, min/max over ±1 mm", "Z in mm")  # fmt: skip
     for row in result["choice"]["baselines"]:
         choice.add_row(f"{row['baseline_mm']:g}", f"{row['largest_dz_mm']:.3f}", f"{row['delta_limit_um']:.3f}",
@@ -75,7 +48,7 @@ def print_figure2(result: Mapping[str, Any]) -> None:
     _say(console, f"Assumed: f = {given['focal_mm']:g} mm, light plane and axis meet at {given['stand_off_mm']:g} mm, "
          f"pixels of {given['pixel_um']:g} µm; light: {given['laser_mw']:g} mW over {given['fan_deg']:g}°, "
          f"f/{given['f_number']:g}, albedo {given['albedo']:g}, transmission {given['transmission']:g}.")  # fmt: skip
-    verdicts = _table("what the paper says", "", "<statement", "<verdict", "<why")
+    verdicts = empty("what the paper says", "", "<statement", "<verdict", "<why")
     for number, row in enumerate(result["statements"], 1):
         verdicts.add_row(str(number), row["paper"], row["verdict"], row["why"])
     console.print(verdicts)
@@ -85,7 +58,7 @@ def print_figure2(result: Mapping[str, Any]) -> None:
 def print_equations(result: Mapping[str, Any]) -> None:
     """One row for each comparison."""
     console = Console()
-    table = _table("largest deviation from ray-traced truth in mm", "equation", "<compared", "as printed", "corrected",
+    table = empty("largest deviation from ray-traced truth in mm", "equation", "<compared", "as printed", "corrected",
                    "<verdict")  # fmt: skip
     for row in result["rows"]:
         table.add_row(row["equation"], row["compared"], _small(row["printed_mm"]), _small(row["corrected_mm"]),
@@ -102,8 +75,8 @@ def print_table1(result: Mapping[str, Any]) -> None:
     """Both tests beside the paper's figures, the assumed noise below."""
     console = Console()
     paper = result["paper"]["section_5_2"]
-    points = _table(f"section 5.2: distance from the truth in mm, scan frame, {result['seeds']} heads (simulated)",
-                    "points", "<<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
+    points = empty(f"section 5.2: distance from the truth in mm, scan frame, {result['seeds']} heads (simulated)",
+                    "points", "<head", "mean", "largest", "85 % below", "below 0.54 mm", "mean, aligned")  # fmt: skip
     for count, ways in result["section_5_2"].items():
         for way, v in ways.items():
             points.add_row(count, WAYS[way], f"{v['mean']:.4f}", f"{v['max']:.4f}", f"{v['p85']:.4f}",
@@ -119,7 +92,7 @@ def print_table1(result: Mapping[str, Any]) -> None:
          f"{outliers['recall_near']:.4f}; least of all heads {result['least_outlier_recall']:.4f} and "
          f"{result['least_outlier_precision']:.4f}. Paper: {paper['outliers']} seen, the largest "
          f"{paper['largest_outlier_mm']} mm off.")  # fmt: skip
-    table = _table("Table 1: 45 points in 5 segments, arm base, mean/largest in mm (paper's as printed)", "head",
+    table = empty("Table 1: 45 points in 5 segments, arm base, mean/largest in mm (paper's as printed)", "head",
                    "X", "Y", "Z", "D")  # fmt: skip
     rows = [(WAYS[way], entry) for way, entry in result["table_1"].items()]
     rows += [
@@ -136,49 +109,10 @@ def print_table1(result: Mapping[str, Any]) -> None:
     _say(console, result["note"])
 
 
-def print_systems(result: Mapping[str, Any]) -> None:
-    """A row for each system, then the head that was assumed for it."""
-    console = wide_console(150)
-    table = _table(f"other systems: theirs on hardware, ours simulated over {result['seeds']} heads each", "system",
-                   "<theirs", "<our task", "ours in mm: mean", "95 % below", "worst 95 %", "expected mean",
-                   "points/s")  # fmt: skip
-    for row in result["systems"]:
-        own = row["ours"]
-        rate = own["points_per_s"]
-        table.add_row(row["reference"] + " " + row["system"].split()[0], row["theirs"]["headline"], TASKS[own["task"]],
-                      *(f"{own[key]:.4f}" for key in ("mean_mm", "p95_mm", "worst_seed_p95_mm", "expected_mean_mm")),
-                      "" if rate is None else f"{rate:,.0f}")  # fmt: skip
-    console.print(table)
-    heads = _table("what was assumed for ours: lengths in mm, pixels in µm, noise 1σ", "system", "<sensor", "<optics",
-                   "<depths, rail", "<noise")  # fmt: skip
-    for row in result["systems"]:
-        head, noise = row["head"], row["noise"]
-        heads.add_row(
-            row["reference"] + " " + row["system"].split()[0],
-            f"{head['sensor_px']}, {head['pixel_um']:g}",
-            f"f {head['focal_mm']:g}, l {head['baseline_mm']:g}, meets axis at {head['light_plane_meets_axis_mm']:g}",
-            f"{head['depths_mm'][0]:g}…{head['depths_mm'][1]:g}, {head['rail_travel_mm']:g}",
-            f"stripe {noise['stripe_px']:g} px, dots {noise['dots_px']:g} px, rail {noise['rail_mm']:g}, arm "
-            f"{noise['arm_mm_radial']:g} and {noise['arm_mrad_per_axis']:g} mrad",
-        )
-    console.print(heads)
-    for row in result["systems"]:
-        _say(console, f"{row['reference']} {row['remark']}.")
-    _say(console, result["note"])
-
-
-TASKS = {
-    "dent": "single points of a dent's depth",
-    "arm_base": "points in the arm's base",
-    "form": "points over the depth, one rigid motion",
-    "stitched": "points over stations joined by overlap",
-}
-
-
 def print_acceptance(result: Mapping[str, Any]) -> None:
     """The worst of each figure, with what noise alone lets one expect."""
     console = Console()
-    table = _table(f"acceptance after VDI/VDE 2634-2 and ISO 10360-13, level {result['level']} (simulated)", "figure",
+    table = empty(f"acceptance after VDI/VDE 2634-2 and ISO 10360-13, level {result['level']} (simulated)", "figure",
                    "worst place in mm", "expected from stated σ in mm")  # fmt: skip
     for key, name in ACCEPTANCE.items():
         expected = result["expected"].get(key)

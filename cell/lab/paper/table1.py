@@ -6,7 +6,7 @@ figures were measured on its hardware; ours are simulated and say so.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.geometry.poses import from_axes, perturbed, transform
-from cell.lab.paper.campaign import Progress, run_all, spread
+from cell.lab.bench.over_cores import Progress, run_all
 from cell.lab.paper.rig import RigSpec, Sweep, arm_error, draw_head, observe, sweep
 from cell.lab.paper.solved import Solved, aligned, expected_length, in_scan_frame, point_covariances, solve
 from cell.lab.paper.spoiled import found_outliers, reconstruct, spoil
@@ -41,7 +41,7 @@ PAPER: dict[str, float | int | str] = {
 """What section 5.2 states of its 1000 points."""
 
 
-def table1(seeds: Iterable[int], workers: int = 1, progress: Progress | None = None) -> dict[str, Any]:
+def table1(seeds: Iterable[int], workers: int = 0, progress: Progress | None = None) -> dict[str, Any]:
     """Both tests over the seeds, summarised beside the paper's figures. All lengths in mm."""
     runs = run_all(one_seed, seeds, workers, progress)
     ways = ("nominal", "staged", "joint")
@@ -61,7 +61,7 @@ def table1(seeds: Iterable[int], workers: int = 1, progress: Progress | None = N
             for count in POINT_COUNTS
         },
         "bound_scan_frame_mm": float(np.mean([run["bound_scan_frame"] for run in runs])),
-        "mean_change_mm": spread([run["mean_change"] for run in runs]),
+        "mean_change_mm": _spread([run["mean_change"] for run in runs]),
         "outliers": {key: float(np.mean([run["outliers"][key] for run in runs])) for key in runs[0]["outliers"]},
         "least_outlier_recall": float(min(run["outliers"]["recall"] for run in runs)),
         "least_outlier_precision": float(min(run["outliers"]["precision"] for run in runs)),
@@ -183,3 +183,9 @@ def _forty_five(solved: Solved, flange_from_camera: pin.SE3, swept: Sweep, rng: 
 def _axes(error: Array) -> dict[str, dict[str, float]]:
     columns = {"x": error[:, 0], "y": error[:, 1], "z": error[:, 2], "d": np.linalg.norm(error, axis=1)}
     return {axis: {"mean": float(v.mean()), "max": float(v.max())} for axis, v in columns.items()}
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    """Mean, median, 95th percentile and largest of values over seeds."""
+    mean, median, p95, largest = np.mean(values), *np.percentile(values, (50, 95)), max(values)
+    return {"mean": float(mean), "median": float(median), "p95": float(p95), "max": float(largest)}

@@ -1,26 +1,23 @@
 """Sub-pixel centres of the laser stripe, one per image row (or column), with an honest standard deviation each.
 
-`extract` is the way in, to all pictures and methods; weighted maximum likelihood is the default and the one that
-attains the bound (docs/theory.md, section 5). What a centre means in space is the business of the geometry.
+`extract` is the way in, to all pictures; a centre is the likeliest one, which attains the bound (docs/theory.md,
+section 5, with what other ways make of the same pictures). What it means in space is the business of the geometry.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cell import compiled
 from cell.vision.stripe.careful import read_carefully
-from cell.vision.stripe.look import choose_mix
 from cell.vision.stripe.planes import FULL, Picture, as_picture
 from cell.vision.stripe.planes import Laser as Laser
 from cell.vision.stripe.profile import Array as Array
 from cell.vision.stripe.profile import Axis as Axis
 from cell.vision.stripe.profile import Image as Image
 from cell.vision.stripe.profile import Mark as Mark
-from cell.vision.stripe.profile import Method as Method
 from cell.vision.stripe.profile import StripeProfile as StripeProfile
 from cell.vision.stripe.profile import StripeSettings as StripeSettings
 from cell.vision.stripe.quick import Verdict, read_quickly, refuse_white
@@ -35,8 +32,6 @@ def extract(
     axis: Axis = "rows",
     settings: StripeSettings | None = None,
     *,
-    method: Method | str = Method.MAXIMUM_LIKELIHOOD,
-    engine: Literal["auto", "compiled", "numpy"] = "auto",
     like: StripeProfile | None = None,
     laser: Laser | str = Laser.AUTO,
 ) -> StripeProfile:
@@ -44,28 +39,23 @@ def extract(
 
     8 or 16 bits, 10 to 14 of them at either end; colours red first; alpha is left out. `laser` names the channel to
     read, "auto" finds that in which the laser stands out. `dark` is a frame of the same view without the laser and is
-    subtracted; its noise counts, and where it is bright it tells the surface's albedo. `engine` "numpy" does without
-    the compiler, as "auto" does where there is none. `like` is the profile of an earlier picture of the same scene,
-    whose noise, speckle and profile hold for this one as far as it has them; None: they are measured, where the
-    settings do not declare them. An ordinary grey 8-bit picture takes .5 ms; what is not ordinary is read carefully
-    and takes a hundred times that. Raises ValueError for an image of another type, a dark frame of another size, an
-    unknown method or laser, `PictureRefused` for a picture that is blinded.
+    subtracted; its noise counts, and where it is bright it tells the surface's albedo. `like` is the profile of an
+    earlier picture of the same scene, whose noise, speckle and profile hold for this one as far as it has them; None:
+    they are measured, where the settings do not declare them. An ordinary grey 8-bit picture takes .5 ms; what is not
+    ordinary is read carefully and takes a hundred times that. Raises ValueError for an image of another type, a dark
+    frame of another size, an unknown laser, `PictureRefused` for a picture that is blinded.
     """
     settings = settings or StripeSettings()
-    method, laser = Method(method), Laser(laser)
+    laser = Laser(laser)
     _check(image, dark)
-    if engine == "compiled" and not compiled.AVAILABLE:
-        raise ValueError('engine "compiled": numba is missing or switched off here; take "numpy" or "auto"')
-    plain = image.ndim == 2 and image.dtype == np.uint8
-    likelihood = method is Method.MAXIMUM_LIKELIHOOD
-    if not plain:
+    if image.ndim != 2 or image.dtype != np.uint8:
         picture = as_picture(image, settings.saturation_dn)
-        if not picture.plain and likelihood:
+        if not picture.plain:
             return _carefully(picture, dark, axis, settings, laser, like, None)
-        image, dark = _one_plane(picture, dark, laser, settings)
-    quick = compiled.AVAILABLE and engine != "numpy"
-    profile, verdict = read_quickly(image, dark, axis, settings, method, quick, like)
-    if verdict is Verdict.ORDINARY or not likelihood:
+        dark = None if dark is None else _whole(_same_range(dark, picture, settings))
+        image = _whole(picture)
+    profile, verdict = read_quickly(image, dark, axis, settings, like)
+    if verdict is Verdict.ORDINARY:
         return profile
     starts = profile.centres if _trusted(profile) else None
     careful = _carefully(as_picture(image, settings.saturation_dn), dark, axis, settings, laser, like, starts)
@@ -127,16 +117,9 @@ def _same_range(dark: Any, picture: Picture, settings: StripeSettings) -> Pictur
     return Picture(off.value.mean(axis=2), np.asarray(off.saturated.any(axis=2)), False, off.full)
 
 
-def _one_plane(picture: Picture, dark: Any, laser: Laser, settings: StripeSettings) -> tuple[Image, Any]:
-    """The plane in which the laser stands out, and the dark frame's, in whole DN, for methods that take no other."""
-    off = None if dark is None else _same_range(dark, picture, settings)
-    mix = choose_mix(picture, off, laser)
-
-    def whole(part: Picture) -> Image:
-        value, usable = part.plane(mix)
-        return np.where(usable, np.clip(np.rint(value), 0, 254), 255).astype(np.uint8)
-
-    return whole(picture), None if off is None else whole(off)
+def _whole(grey: Picture) -> Image:
+    """A grey picture in whole DN of 8 bits, saturated pixels at the end of the range."""
+    return np.where(grey.saturated, 255, np.clip(np.rint(grey.value), 0, 254)).astype(np.uint8)
 
 
 def _check(image: Any, dark: Any) -> None:

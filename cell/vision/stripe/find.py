@@ -1,7 +1,7 @@
 """Where the stripe is in one line of the picture: the compiled search for its peaks, and their start values.
 
-A line is an image row, or a column for stripes along columns. This search takes any line; `stripe_search.py` runs it
-where a line is not an ordinary one. `stripe_numpy.py` says the same without a compiler.
+A line is an image row, or a column for stripes along columns. This search takes any line; `search.py` runs it where
+a line is not an ordinary one.
 
 Loops that run for every line take the whole picture and the line's number: a view of the line is counted as a reference
 by the compiler, which costs as much as the loop. Unsigned indices save the question whether they count from the end.

@@ -1,7 +1,7 @@
 """The likeliest centre of the stripe in each line: the compiled maximum likelihood fit (docs/theory.md, section 5).
 
 Fisher scoring on centre, amplitude, width and linear background, `LANES` lines at a time; one step is in
-`stripe_lanes.py`. `stripe_numpy.py` says the same without a compiler.
+`lanes.py`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FITTED = 8
 PARAMETERS = 5
 # Standard deviation of the prior on the logarithm of the width: from the count of pixels, and that of a clipped peak.
 WIDTH_PRIOR, CLIPPED_PRIOR = 0.25, 0.7
-# Centres half way between two pixels are common in whole numbers: both engines are to go to the same side.
+# Centres half way between two pixels are common in whole numbers: rounding is not to decide on the side.
 NEAREST = 0.499
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,17 +18,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Axis = Literal["rows", "columns"]
-
-
-class Method(StrEnum):
-    """How a centre is had from the pixels around the peak."""
-
-    MAXIMUM_LIKELIHOOD = "maximum_likelihood"
-    EXTREME_VALUE = "extreme_value"
-    CENTRE_OF_GRAVITY = "centre_of_gravity"
-    GAUSSIAN_3_POINT = "gaussian_3_point"
-    GAUSSIAN_LEAST_SQUARES = "gaussian_least_squares"
-    STEGER = "steger"
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,7 @@ from cell.vision.pictures import PictureRefused, Reason
 from cell.vision.stripe import find as find
 from cell.vision.stripe import fit as fit
 from cell.vision.stripe import search as stripe_search
-from cell.vision.stripe import without_compiler as stripe_numpy
 from cell.vision.stripe.belief import believe
-from cell.vision.stripe.methods import METHODS
 from cell.vision.stripe.noise import pixel_noise
 from cell.vision.stripe.ordinary import (
     HARDLY_ANY,
@@ -31,7 +29,7 @@ from cell.vision.stripe.ordinary import (
     is_textured,
     is_too_wide,
 )
-from cell.vision.stripe.profile import Array, Axis, Image, Method, StripeProfile, StripeSettings
+from cell.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
 from cell.vision.stripe.rivals import choose, survey
 from cell.vision.stripe.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 
@@ -55,9 +53,8 @@ class Verdict(Enum):
 
 
 def read_quickly(
-    image: Image, dark: Any, axis: Axis, settings: StripeSettings, method: Method, quick: bool,
-    like: StripeProfile | None,
-) -> tuple[StripeProfile, Verdict]:  # fmt: skip
+    image: Image, dark: Any, axis: Axis, settings: StripeSettings, like: StripeProfile | None
+) -> tuple[StripeProfile, Verdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
@@ -66,8 +63,7 @@ def read_quickly(
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
-    search = (stripe_search if quick else stripe_numpy).find_lines
-    several = search(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
+    several = stripe_search.find_lines(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
@@ -77,7 +73,7 @@ def read_quickly(
     of_dark = (0.0, 0.0) if dark is None else (noise2 / frames, gain * (1 + 1 / frames))
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
-        (fit if quick else stripe_numpy).fit_lines(
+        fit.fit_lines(
             work, cut, cut_at, shade, start, widths, np.log(widths), which, settings.saturation_dn,
             (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
         )  # fmt: skip
@@ -94,11 +90,7 @@ def read_quickly(
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
     rho = correlation(grain) if contrast > 0 and grain else NO_LAGS
-    if method is Method.MAXIMUM_LIKELIHOOD:
-        run(found, contrast, rho)
-    else:
-        variance = noise2, gain, frames if dark is not None else 0
-        fitted = METHODS[method](work, shade, start, found, variance, (contrast, rho), settings)
+    run(found, contrast, rho)
     saturated = np.empty(len(work), np.bool_)
     excess = 1 + SECOND_ORDER * contrast**2
     believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)

@@ -6,11 +6,7 @@ the first picture of every `BLOCK` and hold for the others of the block, which s
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -44,44 +40,3 @@ class StripeStream:
         self._like = profile if told else replace(profile, noise=None)
         self._seen += 1
         return profile
-
-
-def extract_all(
-    images: Iterable[Image],
-    dark: Dark | None = None,
-    axis: Axis = "rows",
-    settings: StripeSettings | None = None,
-    threads: int = 2,
-) -> Iterator[StripeProfile]:
-    """The profiles of a stream of images, in its order, as `StripeStream` gives them, with `threads` cores.
-
-    A block of pictures each, and no more ahead than that. Raises what `extract` raises, at the picture it is about.
-    """
-
-    def profiles(block: list[Image]) -> list[StripeProfile | Exception]:
-        stream = StripeStream(dark, axis, settings)
-        made: list[StripeProfile | Exception] = []
-        for image in block:
-            try:
-                made.append(stream.extract(image))
-            except Exception as error:
-                made.append(error)
-                break
-        return made
-
-    waiting: deque[Future[list[StripeProfile | Exception]]] = deque()
-    rest = iter(images)
-    with ThreadPoolExecutor(threads, "stripe") as pool:
-        while block := list(islice(rest, BLOCK)):
-            waiting.append(pool.submit(profiles, block))
-            if len(waiting) > threads:
-                yield from _given(waiting.popleft())
-        while waiting:
-            yield from _given(waiting.popleft())
-
-
-def _given(block: Future[list[StripeProfile | Exception]]) -> Iterator[StripeProfile]:
-    for profile in block.result():
-        if isinstance(profile, Exception):
-            raise profile
-        yield profile
