@@ -407,7 +407,9 @@ def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns() -> N
     """Its poses lie on the line and turn evenly about one axis, no farther apart than a collision check may skip."""
     ways = Ways(CONFIG)
     begin = ways.forward(HOME)
-    goal = from_parts(begin.translation + [0.0, -0.03, 0.08], pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation)
+    goal = from_parts(
+        begin.translation + np.array([0.0, -0.03, 0.08]), pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation
+    )
     line = [ways.forward(joints) for joints in ways._way(HOME, Command("arm", "move_linear", {"flange": to_ur(goal)}))]
     assert len(line) >= 0.3 / LINE_STEP_RAD
     for k, pose in enumerate(line, start=1):
