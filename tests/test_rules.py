@@ -207,6 +207,21 @@ def test_a_rule_is_lifted_inside_its_context_only() -> None:
         interlocks.require(MOVE)
 
 
+@pytest.mark.parametrize(
+    ("holding", "held"), [(None, True), (True, True), (False, False)], ids=["none", "part", "empty"]
+)
+def test_the_part_is_in_the_way_unless_the_claws_switch_shows_none(holding: bool | None, held: bool) -> None:
+    """Without a claw nothing tells: what a run has said is believed."""
+    about: list[Any] = []
+    claw = None if holding is None else Told("claw", None)
+    if claw is not None:
+        claw.holding = holding
+    rules(
+        claw=claw, part=("part",), station=("station",), clear=lambda joints, command, others: about.extend(others)
+    ).require(MOVE)
+    assert about == ["part", "station"] if held else about == ["station"]
+
+
 def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
     claw = Told("claw", None)
     claw.holding = True
