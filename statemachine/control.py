@@ -40,7 +40,7 @@ class RunControl:
         """Set by the run once it has come to an end of its own."""
         self.late = False
         """Whether somebody asked to end the run when it had come to a good end already, or was just coming to it."""
-        self._change = threading.Condition()
+        self._lock = threading.RLock()
         self._paused = False
         self._wanted: str | None = None
         self._question = 0
@@ -59,20 +59,16 @@ class RunControl:
         # A signal after the run's own end still tells the program to end.
         if signal is not None and self.signal is None and (first or self.over):
             self.signal = signal
-        with self._change:
-            self._change.notify_all()
 
     def pause(self) -> None:
         """Hold the run at its next safe point: before its next free motion, or its next step."""
-        with self._change:
+        with self._lock:
             self._paused = True
-            self._change.notify_all()
 
     def go_on(self) -> None:
         """Let a held run go on."""
-        with self._change:
+        with self._lock:
             self._paused = False
-            self._change.notify_all()
 
     def confirm(self, by: str, number: int | None = None) -> bool:
         """A person has looked and says that the run may go on; False when the run waits for nobody's word.
@@ -80,11 +76,10 @@ class RunControl:
         Said before it is asked for, it does not count, nor with the `number` of another question: it could not have
         been about this.
         """
-        with self._change:
+        with self._lock:
             if self._wanted is None or number not in (None, self._question):
                 return False
             self._confirmed = by
-            self._change.notify_all()
             return True
 
     def obey(self, requests: Iterable[Asked]) -> None:
@@ -109,7 +104,7 @@ class RunControl:
     @property
     def held_s(self) -> float:
         """Wall seconds that the run was held in its steps, until now: they count towards no deadline."""
-        with self._change:
+        with self._lock:
             since = self._held_since
             return self._held_s + (0.0 if since is None else time.monotonic() - since)
 
@@ -125,7 +120,7 @@ class RunControl:
         if not self.paused():
             return
         say(True)
-        with self._change:
+        with self._lock:
             self._held_since = time.monotonic()
         try:
             while self.paused():
@@ -133,14 +128,14 @@ class RunControl:
                     token.check()
                 look()
         finally:
-            with self._change:
+            with self._lock:
                 self._held_s += time.monotonic() - (self._held_since or time.monotonic())
                 self._held_since = None
         say(False)
 
     def ask(self, what: str) -> int:
         """From now on the run waits for a person's word about `what`; the number of this question."""
-        with self._change:
+        with self._lock:
             self._wanted, self._confirmed = what, None
             self._question += 1
             return self._question
@@ -148,7 +143,7 @@ class RunControl:
     @property
     def question(self) -> tuple[int, str] | None:
         """What the run waits for a person's word about, and the number of that question; None when it does not."""
-        with self._change:
+        with self._lock:
             return None if self._wanted is None else (self._question, self._wanted)
 
     def answer(self) -> str | None:
@@ -157,5 +152,5 @@ class RunControl:
 
     def asked_no_more(self) -> None:
         """The run does not wait for a person any more."""
-        with self._change:
+        with self._lock:
             self._wanted = None

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cell.check.contact import contact_notes, contact_problems
+from cell.check.contact import contact_notes, contact_problems, under_part
 from cell.config import CellConfig, load_config
 from cell.job import Job, load_job, shipped_jobs
 from cell.toml_file import read_toml, validate
@@ -58,6 +58,13 @@ def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
 def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str, config: CellConfig) -> None:
     problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".stl")))
     assert any(re.search(told, problem) for problem in problems), problems
+
+
+def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it(config: CellConfig) -> None:
+    """The surface lies 0.1 mm below that plane, within `place.contact_travel`."""
+    higher = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "8.49 mm"])
+    assert under_part(higher, POT.with_suffix(".stl"))[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
+    assert list(contact_problems(higher, config, POT.with_suffix(".stl"))) == []
 
 
 def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:

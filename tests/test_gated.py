@@ -35,6 +35,7 @@ def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) ->
 def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:
     arm, rail, vehicle = devices.arm, devices.rail, devices.vehicle
     devices.gate.enter(CancelToken())
+    rail.home().wait(60.0)
     joints = arm.state().joints
     assert devices.stop() == []
     for begin in (

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config import load_config
@@ -20,6 +21,7 @@ from cell.devices.gated_laser import UNATTENDED_S
 from cell.devices.interlocks import Command
 from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
+from cell.devices.ways import LINE_STEP_RAD, Ways
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
 from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
@@ -401,6 +403,21 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
     assert world.world.collisions.found == ()
 
 
+def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns() -> None:
+    """Its poses lie on the line and turn evenly about one axis, no farther apart than a collision check may skip."""
+    ways = Ways(CONFIG)
+    begin = ways.forward(HOME)
+    goal = from_parts(
+        begin.translation + np.array([0.0, -0.03, 0.08]), pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation
+    )
+    line = [ways.forward(joints) for joints in ways._way(HOME, Command("arm", "move_linear", {"flange": to_ur(goal)}))]
+    assert len(line) >= 0.3 / LINE_STEP_RAD
+    for k, pose in enumerate(line, start=1):
+        share = k / len(line)
+        np.testing.assert_allclose(pose.translation, begin.translation + share * np.array([0, -0.03, 0.08]), atol=1e-5)
+        np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, 0.3 * share, 0.0], atol=1e-5)
+
+
 def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:
     stood = devices.arm.state().joints
     down = shifted(devices, 0.0, 0.0, -0.05)
@@ -599,6 +616,17 @@ def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell:
     jogged("vehicle", "-0.1m")
     moved = jogged("arm", "z", "+10mm")["flange"].split("moved ")[1]
     assert float(moved.removesuffix(" mm")) == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("axis", "turn"), [("rx", (0.05, 0.0, 0.0)), ("rz", (0.0, 0.0, -0.05))])
+def test_a_jog_turns_the_flange_about_an_axis_of_the_base_where_it_stands(
+    cell: Cell, axis: str, turn: tuple[float, ...]
+) -> None:
+    before = from_ur(cell.devices.arm.state().flange)
+    jog(cell, parse_jog("arm", [axis, f"{sum(turn)} rad"]))
+    after = from_ur(cell.devices.arm.state().flange)
+    np.testing.assert_allclose(pin.log3(after.rotation @ before.rotation.T), turn, atol=1e-3)
+    np.testing.assert_allclose(after.translation, before.translation, atol=1e-4)
 
 
 @pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])

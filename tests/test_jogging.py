@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
-from cell.devices.jogging import Jog, needed_for, parse_jog
-from drivers.errors import ConfigError
+from cell.devices.jogging import Jog, begin_program, needed_for, parse_jog
+from drivers.errors import ConfigError, DeviceFault
+from drivers.interfaces import ArmSafety
 
 
 @pytest.mark.parametrize(
@@ -46,3 +48,34 @@ def test_arm_and_vehicle_are_jogged_beside_each_other_unless_a_person_lifts_that
     assert needed_for(arm, ["vehicle_parked"]) == ("arm",)
     assert needed_for(arm, ["arm_stowed"]) == ("arm", "vehicle")
     assert needed_for(vehicle, ["arm_stowed"]) == ("vehicle",)
+
+
+@pytest.mark.parametrize(
+    ("code", "controlled", "safety", "recovered"),
+    [
+        ("arm.link_lost", True, ArmSafety.NORMAL, True),
+        ("arm.link_closed", True, ArmSafety.NORMAL, True),
+        ("arm.wrong_model", True, ArmSafety.NORMAL, None),
+        ("", True, ArmSafety.NORMAL, False),
+        ("", False, ArmSafety.NORMAL, True),
+        ("", True, ArmSafety.PROTECTIVE_STOP, True),
+    ],
+)
+def test_the_program_begins_anew_only_where_it_has_ended(
+    code: str, controlled: bool, safety: ArmSafety, recovered: bool | None
+) -> None:
+    """`recovered` is None where another fault of the arm is passed on."""
+    called: list[bool] = []
+
+    def state() -> SimpleNamespace:
+        if code:
+            raise DeviceFault("arm", code, "as the test has it", recoverable=True, hint="")
+        return SimpleNamespace(controlled=controlled, safety=safety)
+
+    arm = SimpleNamespace(state=state, recover=lambda: called.append(True))
+    if recovered is None:
+        with pytest.raises(DeviceFault, match="as the test has it"):
+            begin_program(arm)  # type: ignore[arg-type]
+    else:
+        begin_program(arm)  # type: ignore[arg-type]
+    assert bool(called) == bool(recovered)

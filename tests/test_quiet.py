@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pinocchio as pin
@@ -87,6 +89,14 @@ def test_one_that_does_not_is_stated_and_noted() -> None:
 def test_one_that_rocks_too_much_is_refused_by_name() -> None:
     with pytest.raises(RefusedError, match=r"the vehicle rocks by ±0\.\d\d mrad, which moves the board by"):
         Station(1e-3).fixed()
+
+
+def test_what_the_points_own_noise_does_is_no_swing_however_near_the_board_is_seen() -> None:
+    """With a metre to a pixel no least height hides it: only the points' own standard deviations tell it."""
+    for seed in range(50):
+        station = Station(0.0, seed=seed)
+        assert swing([station.view() for _ in range(4)], 1.0) == 0.0
+    assert swing([replace(view, sigma=0.1 * view.sigma) for view in (station.view() for _ in range(4))], 1.0) > 0.0
 
 
 def test_views_that_share_no_point_or_are_but_one_tell_nothing() -> None:

@@ -26,7 +26,7 @@ from cell.steps.frame_times import step_of_clock
 from cell.steps.laser_sweep import UNCHECKED, _home, laser_sweep
 from cell.steps.moves import HOME, Mover
 from cell.steps.rail_sweep import rail_sweep
-from cell.steps.swath import Collector, Swath, SweepErrors
+from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from cell.steps.sweep_record import SweepRecord
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
@@ -260,6 +260,12 @@ def test_lateness_that_is_allowed_is_in_the_budget() -> None:
     assert swath.residual < 10e-6
     assert swath.shift == pytest.approx(0.5 * late * SCAN.speed, abs=15e-6)
     assert np.sqrt(np.trace(swath.covariance[:3, :3])) == pytest.approx(swath.shift / np.sqrt(3), rel=0.1)
+
+
+def test_what_times_leave_open_adds_up_for_the_shift_and_by_squares_for_its_variance() -> None:
+    errors = SweepErrors(np.eye(6), 1e-5, 1e-4, late=2e-3)
+    known = [TimeBound("rail", "rail", 1e-3), TimeBound("scan_camera", "camera", 2e-3)]
+    assert shift_by_times(known, 0.01, errors) == pytest.approx((3e-5, 0.01**2 * (1e-6 + 4e-6 + 4e-6) / 3))
 
 
 def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well() -> None:

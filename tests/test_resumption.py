@@ -343,6 +343,17 @@ def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(tmp
         StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point, as_written=False)
 
 
+@pytest.mark.parametrize("wrong", [np.zeros((6, 6)), -np.eye(6)], ids=["zero", "negative"])
+def test_a_sweep_whose_board_has_no_covariance_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: np.ndarray
+) -> None:
+    taken = sweep()
+    save_sweep(tmp_path, SweepRecord((taken,)), replace(fix(BOARD), covariance=wrong))
+    monkeypatch.setattr(stored_sweep, "_swath", lambda *given: taken)
+    with pytest.raises(RefusedError, match="board_covariance"):
+        StoredSweep.load(tmp_path, CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point, as_written=False)
+
+
 @pytest.mark.parametrize("outcome", ["placed", "done", "refused"])
 def test_a_run_that_came_to_its_end_is_not_resumed(tmp_path: Path, outcome: str) -> None:
     """One that was to end after a step would drive on and place."""

@@ -53,6 +53,23 @@ def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarr
                  np.zeros((LINES, 90), dtype=bool), flanges)  # fmt: skip
 
 
+def test_each_sweep_rocks_by_itself() -> None:
+    """A column moves the points of its own sweep alone, as the base turns about the vehicle's axes."""
+    cloud, hz = scanned(0.0, 0.0, 1.3), 1.3
+    cloud = replace(cloud, sweeps=np.repeat([0, 1], LINES // 2))
+    lines, rows = np.array([0, 70, 100]), np.array([5, 40, 80])
+    columns = rocking_motions(cloud, lines, rows, VEHICLE, TIMES, hz, size=1e-4)
+    assert columns.shape == (3, 3, 8)
+    arms = cloud.points[lines, rows] - VEHICLE.translation
+    for k, line in enumerate(lines):
+        phase = 2 * np.pi * hz * TIMES[line]
+        moved = [np.cross(1e-4 * axis, arms[k]) * wave(phase)
+                 for axis in VEHICLE.rotation[:, :2].T for wave in (np.sin, np.cos)]  # fmt: skip
+        expected = np.zeros((3, 8))
+        expected[:, 4 * (k > 0) : 4 * (k > 0) + 4] = np.column_stack(moved)
+        np.testing.assert_allclose(columns[k], expected, atol=1e-12)
+
+
 def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
     prior = Prior(SURFACE, np.diag([1e-3**2] * 3 + [5e-3**2] * 3))
 

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.devices.contact import GuardedMotion
 from cell.devices.interlocks import Command, Interlocks, Situation
 from cell.devices.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
 from cell.geometry.poses import to_ur
@@ -46,6 +47,9 @@ class Ended:
 
     def __init__(self, done: bool) -> None:
         self.done = done
+
+    def wait(self, timeout: float) -> None:
+        pass
 
 
 def arm_state(**shown: Any) -> ArmState:
@@ -201,6 +205,34 @@ def test_a_rule_is_lifted_inside_its_context_only() -> None:
         interlocks.require(MOVE)
     with pytest.raises(InterlockError, match="vehicle_parked"):
         interlocks.require(MOVE)
+
+
+@pytest.mark.parametrize(
+    ("holding", "held"), [(None, True), (True, True), (False, False)], ids=["none", "part", "empty"]
+)
+def test_the_part_is_in_the_way_unless_the_claws_switch_shows_none(holding: bool | None, held: bool) -> None:
+    """Without a claw nothing tells: what a run has said is believed."""
+    about: list[Any] = []
+    claw = None if holding is None else Told("claw", None)
+    if claw is not None:
+        claw.holding = holding
+    rules(
+        claw=claw, part=("part",), station=("station",), clear=lambda joints, command, others: about.extend(others)
+    ).require(MOVE)
+    assert about == ["part", "station"] if held else about == ["station"]
+
+
+def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
+    claw = Told("claw", None)
+    claw.holding = True
+    ended = Ended(True)
+    ended.contact = True
+    guarded = GuardedMotion(ended, Told("arm", arm_state()))  # type: ignore[arg-type]
+    interlocks = rules(claw=claw, last=guarded)
+    with pytest.raises(InterlockError, match=r"nobody has seen where the arm stood.*claw_at_contact"):
+        interlocks.require(Command("claw", "release"))
+    guarded.wait(1.0)
+    interlocks.require(Command("claw", "release"))
 
 
 def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:

@@ -18,6 +18,7 @@ from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.runner import Runner
+from statemachine.script import Again, Script
 from statemachine.sequence import Sequence
 
 NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]
@@ -861,6 +862,32 @@ def test_nothing_is_tried_again_on_a_cell_of_which_it_is_not_known_that_it_stand
     assert "no frame" in result.reason
     assert "not confirmed" in result.reason
     assert bench.log.count("board_photo") == 1
+
+
+def test_a_script_goes_back_only_in_a_cell_that_is_known_to_stand(tmp_path):
+    def safe_stop(reason):
+        bench.safe_stop(reason)
+        if reason.startswith("before"):
+            raise OSError("vehicle stopped and braked: not confirmed")
+
+    bench = Bench(tmp_path, board_photo=failing(ValueError("no board")))
+    bench.runner.safe_stop = safe_stop
+    bench.runner.script = Script(on_refusal=lambda step, failure: Again("board_photo", "wiped the lens"))
+    result = bench.run()
+    assert (result.outcome, result.code) == (Outcome.FAULTED, "safe_stop")
+    assert bench.log.count("board_photo") == 1
+
+
+def test_a_failure_that_cannot_be_classified_is_a_fault(tmp_path):
+    def classify(error):
+        raise KeyError("no such kind")
+
+    bench = Bench(tmp_path, board_photo=failing(ValueError("no board")))
+    bench.runner.classify = classify
+    result = bench.run()
+    assert (result.outcome, result.code) == (Outcome.FAULTED, "run.internal")
+    assert "no board" in result.reason
+    assert "no such kind" in result.reason
 
 
 def test_after_a_recovery_the_cell_has_to_be_known_to_stand_before_the_step_is_tried_again(tmp_path):

@@ -279,6 +279,9 @@ def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told() -> No
     assert told is not None
     assert "370 mm" in told
     assert site.whereabouts.pose().x == pytest.approx(start.x + 0.4)
+    turned = Planar(start.x + 0.4, start.y, start.yaw + 0.5)
+    assert "28.6 deg" in str(site.whereabouts.see(turned))
+    assert site.whereabouts.see(turned) is None, "it stands where it was seen before, turned by as much"
 
 
 def test_another_jobs_board_tells_nothing_about_this_place() -> None:

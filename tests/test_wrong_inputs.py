@@ -229,6 +229,7 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("calibration.large.board", '"marked_dots:9x7:1mm"', ("calibration.large.board", "pixels apart")),
     ("calibration.fine.base_from_board", pose(-5650, 262, 20, 180), ("fine.base_from_board", "not on the deck")),
     ("calibration.fine.base_from_board", pose(-565, 262, -400, 180), ("fine.base_from_board", "not on the deck")),
+    ("calibration.fine.base_from_board", pose(-565, 432, 20, 180), ("fine.base_from_board", "not on the deck")),
     ("calibration.large.base_from_board", pose(-680, -190, 900, 180), ("calibration.large.base_from_board", "300 mm")),
     ("calibration.fine.base_from_board", pose(-565, 262, 20), ("calibration view 1",)),
     ("calibration.max_age", '"0 day"', ("calibration.max_age", "0.01 to 3650 day")),
