@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cell import compiled
 from cell.vision.stripe.careful import read_carefully
 from cell.vision.stripe.look import choose_mix
+from cell.vision.stripe.neighbours import widen_what_departs
 from cell.vision.stripe.planes import FULL, Picture, as_picture
 from cell.vision.stripe.planes import Laser as Laser
 from cell.vision.stripe.profile import Array as Array
@@ -65,6 +66,8 @@ def extract(
         image, dark = _one_plane(picture, dark, laser, settings)
     quick = compiled.AVAILABLE and engine != "numpy"
     profile, verdict = read_quickly(image, dark, axis, settings, method, quick, like)
+    if likelihood:
+        widen_what_departs(profile.centres, profile.sigma)
     if verdict is Verdict.ORDINARY or not likelihood:
         return profile
     starts = profile.centres if _trusted(profile) else None
@@ -94,6 +97,7 @@ def _carefully(
         picture, off = picture.turned(), None if off is None else off.turned()
     taught = like.learned if like is not None else None
     seen = read_carefully(picture, off, laser, settings, taught, starts)
+    widen_what_departs(seen.centres, seen.sigma)
     double = np.nan_to_num(seen.rival) > DOUBLE
     return StripeProfile(
         axis, seen.centres, seen.sigma, seen.amplitude, seen.width, seen.saturated,
