@@ -27,13 +27,13 @@ OPTICS = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 RNG = np.random.default_rng(0)
 
 
-def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_option() -> None:
+def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() -> None:
     for name in Effects.names():
         alone = effects_of(f"nominal+{name}")
         assert getattr(alone, name) == getattr(ALONE, name) > 0
         assert sum(bool(getattr(alone, other)) for other in Effects.names()) == 1
     off = [name for name in Effects.names() if not getattr(effects_of("workshop"), name)]
-    assert off == ["rolling_shutter"]
+    assert off == ["rolling_shutter", "droop"]
     for level in ("ideal", "nominal", "harsh"):
         assert effects_of(level) == Effects()
 
@@ -169,6 +169,19 @@ def test_a_rolling_shutter_shears_what_moves_and_nothing_else() -> None:
         world.arm.tick(0.1)
         world.vehicle.tick(0.1)
     assert still.render("scan", 0.1, 0.002).shape == plain.render("scan", 0.1, 0.002).shape
+
+
+def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_changes() -> None:
+    plain, worn = (World(2, level, clock=SteppedClock()) for level in ("nominal", "nominal+droop"))
+    for world in (plain, worn):
+        world.rail.carriage = lambda t: t  # type: ignore[method-assign]
+    assert np.array_equal(plain.scene.flange_from_scan_camera, worn.scene.flange_from_scan_camera)
+    for way, sunk in ((0.0, 0.0), (0.05, 25e-6), (0.1, 100e-6)):
+        moved = np.linalg.inv(plain.flange_from_camera("scan", way)) @ worn.flange_from_camera("scan", way)
+        assert moved[:3, 3] == pytest.approx([0.0, 0.0, sunk], abs=1e-12)
+        angle = np.arccos(np.clip((np.trace(moved[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+        assert angle == pytest.approx(10.0 * sunk, abs=1e-7)
+    assert np.array_equal(plain.flange_from_camera("target", 0.1), worn.flange_from_camera("target", 0.1))
 
 
 def test_the_fan_ends_and_the_sun_moves() -> None:

@@ -66,6 +66,12 @@ class Effects:
     dust: float = _row("1", "spots per cm² on the surface, and shadows on the laser's window", "assumed")
     sheet_ends: float = _row("rad", "angle from the fan's middle at which it fades out", "fan angle of a line laser")
     sunlight: float = _row("1", "light of the sun's patch, of the room's; it moves over table and board", "assumed")
+    droop: float = _row(
+        "m",
+        "how far the scan head's carriage has sunk, along the camera's axis, at the far end of its travel: as the "
+        "square of its way; it rolls about the way by 10 mrad per mm",
+        "a carriage on one guide, worn where it works; size assumed",
+    )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -103,8 +109,8 @@ WORKSHOP = Effects(
     sheet_ends=0.17,
     sunlight=0.4,
 )
-"""All of them together; a rolling shutter is an option that is added by its name."""
-ALONE = dataclasses.replace(WORKSHOP, rolling_shutter=10e-3)
+"""All of them together; a rolling shutter and a carriage that droops are options that are added by their names."""
+ALONE = dataclasses.replace(WORKSHOP, rolling_shutter=10e-3, droop=0.1e-3)
 """The size of each when it is added alone."""
 WARMING_K, WARMING_S = 10.0, 1200.0
 """How much warmer laser and cameras become after they are switched on, and in what time (1/e)."""

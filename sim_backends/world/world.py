@@ -33,6 +33,8 @@ from sim_backends.world.station import Station
 Pose = NDArray[np.float64]
 
 
+ROLL = 10.0
+"""Of a carriage that droops, rad per m."""
 BANDS = 6
 """In so many bands a rolling shutter is drawn."""
 
@@ -127,8 +129,11 @@ class World:
         """True pose (4, 4) of the camera "scan" or "target" on the flange at world time `t`."""
         if camera == "target":
             return self.scene.flange_from_target_camera
-        made = self.scene.flange_from_scan_camera.copy()
-        made[:3, 3] += made[:3, :3] @ (self.rail.carriage(t) * self.scene.rail_direction)
+        made, carriage = self.scene.flange_from_scan_camera.copy(), self.rail.carriage(t)
+        made[:3, 3] += made[:3, :3] @ (carriage * self.scene.rail_direction)
+        if droop := self.scene.effects.droop * (carriage / self.rail.params.travel[1]) ** 2:
+            made[:3, 3] += droop * made[:3, 2]
+            made[:3, :3] = made[:3, :3] @ rotation(ROLL * droop * self.scene.rail_direction)
         return made
 
     # --- what the cameras see ---

@@ -49,6 +49,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "dust": ("dust",),
     "sheet_ends": ("sheet ends",),
     "sunlight": ("ambient light",),
+    "droop": ("carriage",),
 }
 """A refusal with one of these words names the effect: words that no other refusal has."""
 

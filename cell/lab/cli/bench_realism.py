@@ -39,8 +39,9 @@ def realism(
     from sim_backends.world.effects import Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
-    # A rolling shutter is no part of the workshop: a scan camera needs a global one.
-    chosen = list(dict.fromkeys(effect or [name for name in known if name != "rolling_shutter"]))
+    # No parts of the workshop: a scan camera needs a global shutter, a carriage that droops is a broken one.
+    options = ("rolling_shutter", "droop")
+    chosen = list(dict.fromkeys(effect or [name for name in known if name not in options]))
     if unknown := [name for name in chosen if name not in known]:
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
     with bar() as told:

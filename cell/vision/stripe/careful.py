@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.vision.stripe.belief import MISFIT_SIGMAS
 from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
 from cell.vision.stripe.learning import FREE_SCALE, learn_profile
 from cell.vision.stripe.look import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
@@ -217,11 +218,12 @@ def _believed(
     out = {name: np.full(lines, np.nan) for name in ("centres", "sigma", "amplitude", "width", "misfit")}
     rows = fitted.lines[keep]
     out["centres"][rows] = k * fitted.centre[keep] + 0.5 * (k - 1)
-    out["sigma"][rows] = k * sigma[keep]
     out["amplitude"][rows] = fitted.amplitude[keep]
     out["width"][rows] = k * width * np.exp(fitted.log_scale[keep])
     usual = float(np.median(fitted.chi2[keep])) if keep.any() else 1.0
-    out["misfit"][rows] = fitted.chi2[keep] / max(usual, 1e-6)
+    misfit = fitted.chi2[keep] / max(usual, 1e-6)
+    allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / (8 * width + 2))
+    out["sigma"][rows], out["misfit"][rows] = k * sigma[keep] * np.sqrt(np.maximum(1.0, misfit / allowed)), misfit
     saturated = np.zeros(lines, np.bool_)
     inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
     saturated[rows] = inside[keep].any(axis=1)

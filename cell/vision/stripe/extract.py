@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.vision.stripe.careful import read_carefully
+from cell.vision.stripe.neighbours import widen_what_departs
 from cell.vision.stripe.planes import FULL, Picture, as_picture
 from cell.vision.stripe.planes import Laser as Laser
 from cell.vision.stripe.profile import Array as Array
@@ -55,6 +56,7 @@ def extract(
         dark = None if dark is None else _whole(_same_range(dark, picture, settings))
         image = _whole(picture)
     profile, verdict = read_quickly(image, dark, axis, settings, like)
+    widen_what_departs(profile.centres, profile.sigma)
     if verdict is Verdict.ORDINARY:
         return profile
     starts = profile.centres if _trusted(profile) else None
@@ -84,6 +86,7 @@ def _carefully(
         picture, off = picture.turned(), None if off is None else off.turned()
     taught = like.learned if like is not None else None
     seen = read_carefully(picture, off, laser, settings, taught, starts)
+    widen_what_departs(seen.centres, seen.sigma)
     double = np.nan_to_num(seen.rival) > DOUBLE
     return StripeProfile(
         axis, seen.centres, seen.sigma, seen.amplitude, seen.width, seen.saturated,
