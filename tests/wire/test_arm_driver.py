@@ -537,7 +537,7 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             prompt = promptly()
             bench.ask("late_states")
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
-            late = arm.latch_clock()
+            late = min((arm.latch_clock() for _ in range(4)), key=lambda latch: latch.bound)
             # The states show nothing of it, but half of their lateness of 0.1 s is what is not known now.
             assert late.bound == pytest.approx(0.05 * rate, rel=0.2)
             error = (late.host - late.device) - (prompt.host - prompt.device)

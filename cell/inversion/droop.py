@@ -1,0 +1,101 @@
+"""A scan head's carriage that sinks along its travel: seen as a bow of the scan along the rail, stated as a tilt.
+
+A worn guide lets the carriage sink by the square of its way. The scanned surface then seems bowed the other way; the
+constant and the even slope of that go into the pose, unseen. The bow tells how large they may be. A surface that is
+bent along the sweep looks the same, so the pose is not corrected: what the carriage may have done to it is added to
+its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.inversion.closest import Array
+from cell.inversion.correspondences import Scan, correspondences
+from cell.inversion.nominal import NominalSurface
+from cell.reconstruction.cloud import Cloud, Indices
+
+GATE_M = 0.5e-3
+LEAST_LINES = 40
+LEAST_POINTS = 8
+LEAST_SAG = 40e-6
+"""At the end of the travel, m. Screws, facets and form make a bow of half of it (docs/theory.md, section 8)."""
+EVIDENCE = 6.0
+"""The bow over its own standard deviation."""
+BLOCK = 12
+"""Neighbouring lines whose errors count as one: they share facets of the drawing and the part's form."""
+ROLL = 10.0
+"""How far the carriage rolls about its way while it sinks, rad per m: guides 0.1 m apart, of which one is worn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """The scan head in the base: `camera` (3,) m where it is at the rail's zero, its optical `axis` and the `way` of
+    the rail, unit vectors (3,), and the `travel`, m."""
+
+    camera: Array
+    axis: Array
+    way: Array
+    travel: float
+
+
+@dataclass(frozen=True, eq=False)
+class Droop:
+    """How far the carriage may have sunk at the end of its travel: `sag`, m, and its standard deviation `sigma`."""
+
+    sag: float
+    sigma: float
+    head: Head
+
+    def motions(self, cloud: Cloud, lines: Indices, rows: Indices) -> Array:
+        """(n, 3, 2) displacements in m, base axes, of the points at (lines, rows): by the sag and by the roll."""
+        share = (cloud.rail[lines] / self.head.travel)[:, None] ** 2
+        size = float(np.hypot(self.sag, self.sigma))
+        arms = cloud.points[lines, rows] - self.head.camera - cloud.rail[lines][:, None] * self.head.way
+        return np.stack([size * share * self.head.axis, size * share * ROLL * np.cross(self.head.way, arms)], axis=2)
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        return (
+            f"the scan is bowed along the rail, as if its carriage had sunk by {1e3 * abs(self.sag):.2f} ± "
+            f"{1e3 * self.sigma:.2f} mm at the end of its travel, or the surface were bent; the stated uncertainty "
+            "allows for the carriage. Look for play in its guide, then run `cell calibrate`"
+        )
+
+
+def find_droop(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, head: Head) -> Droop | None:
+    """The sag that a scan shows at the pose found; None without any, and where the carriage stood still."""
+    measured = bow(cloud, nominal, base_from_surface, head)
+    if measured is None:
+        return None
+    sag, sigma = measured
+    return Droop(sag, sigma, head) if abs(sag) > max(LEAST_SAG, EVIDENCE * sigma) else None
+
+
+def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tuple[float, float] | None:
+    """The sag that fits best and its standard deviation, m; each sweep may lie and lean by itself."""
+    scan = Scan.of(cloud)
+    found = correspondences(pose, scan, nominal, GATE_M)
+    of, facing = scan.lines[found.index], found.normals @ head.axis
+    count = np.bincount(of, minlength=cloud.shape[0])
+    good = count >= LEAST_POINTS
+    if np.count_nonzero(good) < LEAST_LINES or float(np.ptp(cloud.rail[good])) < 0.1 * head.travel:
+        return None
+    # Least squares of each line: how far it lies off along the camera's axis.
+    square = np.bincount(of, facing**2, minlength=cloud.shape[0])[good]
+    off = np.bincount(of, facing * found.heights, minlength=cloud.shape[0])[good] / np.maximum(square, 1e-6)
+    sweeps = cloud.sweeps[good] if len(cloud.sweeps) else np.zeros(len(off), dtype=np.intp)
+    way = cloud.rail[good] / head.travel
+    own = (sweeps[:, None] == np.unique(sweeps)).astype(np.float64)
+    columns = np.hstack([(way**2)[:, None], own, own * way[:, None]])
+    inverse = np.linalg.pinv(columns)
+    sizes = inverse @ off
+    left = off - columns @ sizes
+    # What neighbouring lines share counts once.
+    blocks = np.arange(len(off)) // BLOCK
+    moved = np.array([inverse[0, blocks == k] @ left[blocks == k] for k in range(blocks[-1] + 1)])
+    return float(sizes[0]), float(np.linalg.norm(moved))
