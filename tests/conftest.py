@@ -71,6 +71,7 @@ GROUPS = (
         "test_quiet.py",
         "test_unmoved.py",
         "test_second_look.py",
+        "test_droop.py",
         "test_causes.py",
         "test_standing.py",
         "test_timing.py",

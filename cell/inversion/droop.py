@@ -19,11 +19,11 @@ from cell.inversion.nominal import NominalSurface
 from cell.reconstruction.cloud import Cloud, Indices
 
 GATE_M = 0.5e-3
-LEAST_LINES = 40
+LEAST_LINES, LEAST_SHARE = 40, 0.1
 LEAST_POINTS = 8
-LEAST_SAG = 40e-6
-"""At the end of the travel, m. Screws, facets and form make a bow of half of it (docs/theory.md, section 8)."""
-EVIDENCE = 6.0
+LEAST_SAG = 36e-6
+"""At the end of the travel, m. Calibration and facets make a bow of up to 33 µm (docs/theory.md, section 8)."""
+EVIDENCE = 4.0
 """The bow over its own standard deviation."""
 BLOCK = 12
 """Neighbouring lines whose errors count as one: they share facets of the drawing and the part's form."""
@@ -33,13 +33,25 @@ ROLL = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """The scan head in the base: `camera` (3,) m where it is at the rail's zero, its optical `axis` and the `way` of
-    the rail, unit vectors (3,), and the `travel`, m."""
+    """The scan head in the base for each line of a cloud: the `cameras` (lines, 3) m, their optical `axes` and the
+    `ways` of the rail, unit vectors (lines, 3), and the carriage's way as a `share` (lines,) of its travel."""
 
-    camera: Array
-    axis: Array
-    way: Array
-    travel: float
+    cameras: Array
+    axes: Array
+    ways: Array
+    share: Array
+
+    @classmethod
+    def of(
+        cls, cloud: Cloud, base_from_flange: pin.SE3, flange_from_camera: pin.SE3, rail_direction: Array, travel: float
+    ) -> Head:
+        """`rail_direction` is the camera's travel per metre of the rail in its own frame; `base_from_flange` holds
+        where the cloud does not tell the flange of each line."""
+        flanges = cloud.flanges if len(cloud.flanges) else np.tile(base_from_flange.homogeneous, (cloud.shape[0], 1, 1))
+        cameras = flanges @ flange_from_camera.homogeneous
+        moved = cameras[:, :3, :3] @ rail_direction
+        ways = moved / np.linalg.norm(rail_direction)
+        return cls(cameras[:, :3, 3] + cloud.rail[:, None] * moved, cameras[:, :3, 2], ways, cloud.rail / travel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +64,10 @@ class Droop:
 
     def motions(self, cloud: Cloud, lines: Indices, rows: Indices) -> Array:
         """(n, 3, 2) displacements in m, base axes, of the points at (lines, rows): by the sag and by the roll."""
-        share = (cloud.rail[lines] / self.head.travel)[:, None] ** 2
-        size = float(np.hypot(self.sag, self.sigma))
-        arms = cloud.points[lines, rows] - self.head.camera - cloud.rail[lines][:, None] * self.head.way
-        return np.stack([size * share * self.head.axis, size * share * ROLL * np.cross(self.head.way, arms)], axis=2)
+        head = self.head
+        sunk = np.hypot(self.sag, self.sigma) * head.share[lines, None] ** 2
+        arms = cloud.points[lines, rows] - head.cameras[lines]
+        return np.stack([sunk * head.axes[lines], sunk * ROLL * np.cross(head.ways[lines], arms)], axis=2)
 
     @property
     def words(self) -> str:
@@ -80,16 +92,17 @@ def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tup
     """The sag that fits best and its standard deviation, m; each sweep may lie and lean by itself."""
     scan = Scan.of(cloud)
     found = correspondences(pose, scan, nominal, GATE_M)
-    of, facing = scan.lines[found.index], found.normals @ head.axis
+    of = scan.lines[found.index]
+    facing = np.einsum("ni,ni->n", found.normals, head.axes[of])
     count = np.bincount(of, minlength=cloud.shape[0])
     good = count >= LEAST_POINTS
-    if np.count_nonzero(good) < LEAST_LINES or float(np.ptp(cloud.rail[good])) < 0.1 * head.travel:
+    if np.count_nonzero(good) < LEAST_LINES or float(np.ptp(head.share[good])) < LEAST_SHARE:
         return None
     # Least squares of each line: how far it lies off along the camera's axis.
     square = np.bincount(of, facing**2, minlength=cloud.shape[0])[good]
     off = np.bincount(of, facing * found.heights, minlength=cloud.shape[0])[good] / np.maximum(square, 1e-6)
     sweeps = cloud.sweeps[good] if len(cloud.sweeps) else np.zeros(len(off), dtype=np.intp)
-    way = cloud.rail[good] / head.travel
+    way = head.share[good]
     own = (sweeps[:, None] == np.unique(sweeps)).astype(np.float64)
     columns = np.hstack([(way**2)[:, None], own, own * way[:, None]])
     inverse = np.linalg.pinv(columns)

@@ -11,6 +11,7 @@ from cell.geometry.poses import compose_covariance
 from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.inversion import invert_pose as register
 from cell.inversion.causes import find_causes, likeliest
+from cell.inversion.droop import Head, find_droop
 from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
 from cell.job import Job
 from cell.reconstruction.cloud import Indices
@@ -28,13 +29,15 @@ from statemachine.runner import StepContext
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """When each line of the cloud was taken, (lines,) in s, and what the arm's base stands on.
+    """When each line of the cloud was taken, (lines,) in s, what the arm's base stands on, and the scan head that a
+    rail carried, None where the arm did.
 
     The clock may begin anew with each sweep: nothing is carried over from one to the next.
     """
 
     times: Vector
     base_from_vehicle: pin.SE3
+    head: Head | None = None
 
 
 def invert_pose(
@@ -60,14 +63,14 @@ def invert_pose(
     mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
     spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
 
-    def registered(sweeps: Motions, systematic: Vector) -> PlacePose:
+    def registered(sweeps: Motions, systematic: Vector, calibration: Motions = scan.by_calibration) -> PlacePose:
         return register(
             scan.cloud,
             nominal,
             Prior(expected, spread),
             Tolerance(job.place.tolerance, job.place.tolerance_angle),
             systematic=systematic,
-            calibration=scan.by_calibration,
+            calibration=calibration,
             sweeps=sweeps,
         )
 
@@ -83,6 +86,18 @@ def invert_pose(
         raise told.showing(seen=refused.seen) from refused
     if taken is None:
         return found
+    droop = None if taken.head is None else find_droop(scan.cloud, nominal, found.base_from_surface, taken.head)
+
+    def by_calibration(lines: Indices, rows: Indices) -> Vector:
+        moved = [scan.by_calibration(lines, rows)] + ([] if droop is None else [droop.motions(scan.cloud, lines, rows)])
+        return np.concatenate(moved, axis=2)
+
+    if droop is not None:
+        try:
+            found = replace(registered(scan.by_poses, kinematic, by_calibration), notes=(droop.words,))
+        except NotObservable as refused:
+            told = NotObservable(f"{refused}. Before: {droop.words}", *refused.numbers)
+            raise told.showing(seen=refused.seen) from refused
     if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
@@ -92,7 +107,7 @@ def invert_pose(
         return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
     unknown = rocking_covariance(rocking, vehicle, expected.translation)
-    return replace(registered(by_poses, kinematic + unknown), notes=(words(rocking),))
+    return replace(registered(by_poses, kinematic + unknown, by_calibration), notes=(*found.notes, words(rocking)))
 
 
 def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
@@ -105,7 +120,11 @@ def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
 
 def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:
     """`invert_pose` where a job is done."""
-    taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse())
+    head = None
+    if here.job.scan.mode == "rail":
+        known, travel = here.calibration.scan, here.config.rail.travel[1]
+        head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
+    taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
         return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
     except NotObservable as refused:
