@@ -4,6 +4,7 @@ It also says when a process counts as frozen, for the arm's own child process.
 """
 
 import os
+import resource
 import select
 import signal
 import sys
@@ -16,6 +17,8 @@ FROZEN_S = 0.25
 HUNG_S = 2.0
 """An owner without a beat for so long counts as frozen even if it computes."""
 LOOK_S = 0.05
+ALONE_S = 0.3
+"""Processor time that a thread in real time may take without waiting once: no work here takes a tenth of it."""
 
 
 class Owner:
@@ -52,12 +55,24 @@ class Owner:
 
 
 def raise_priority() -> None:
-    """Run before the processes that compute, where the system allows it: in real time, else with a lower niceness."""
+    """Run before the processes that compute, where the system allows it: in real time, else with a lower niceness.
+
+    A thread that spins in real time would leave nothing to all others: after `ALONE_S` this process loses the right.
+    """
     try:
+        _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+        resource.setrlimit(resource.RLIMIT_RTTIME, (int(1e6 * ALONE_S), most))
+        signal.signal(signal.SIGXCPU, lambda number, frame: _lower_priority())
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except (AttributeError, OSError):
+    except (AttributeError, OSError, ValueError):
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, -10)
+
+
+def _lower_priority() -> None:
+    for thread in os.listdir("/proc/self/task"):  # noqa: PTH208 (pathlib starts too slowly here)
+        with suppress(OSError):
+            os.sched_setscheduler(int(thread), os.SCHED_OTHER, os.sched_param(0))
 
 
 def main(pipe: int, told: int, port: int, pause: float, silence: float, words: list[bytes]) -> None:
