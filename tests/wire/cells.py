@@ -110,10 +110,10 @@ def assert_safe(endpoints: dict[str, Any]) -> None:
     assert not truth["arm"]["moving"]
 
 
-def wait_for_step(folder: Path, step: str, timeout: float = 120.0) -> Path:
-    """Wait until the newest run in `folder` is in `step`; gives the run's folder."""
+def wait_for_step(folder: Path, step: str, process: subprocess.Popen[str], timeout: float = 120.0) -> Path:
+    """Wait until the newest run in `folder`, which `process` does, is in `step`; gives the run's folder."""
     deadline = time.monotonic() + timeout
-    while time.monotonic() < deadline:
+    while time.monotonic() < deadline and process.poll() is None:
         for run in sorted((folder / "runs").glob("*")):
             try:
                 record = read(run)
@@ -122,4 +122,4 @@ def wait_for_step(folder: Path, step: str, timeout: float = 120.0) -> Path:
             if not record.finished and any(row.name == step and row.state == "running" for row in record.steps):
                 return run
         Clock().sleep(0.05)
-    raise AssertionError(f"no run came to {step} within {timeout} s")
+    raise AssertionError(f"no run came to {step} within {timeout} s, or before its process ended: {process.poll()}")

@@ -141,7 +141,7 @@ def test_a_vehicle_that_was_turned_by_hand_is_not_driven_blind(place: Path) -> N
 def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
-            folder = wait_for_step(place, "place")
+            folder = wait_for_step(place, "place", run)
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
         assert_safe(endpoints)
@@ -168,7 +168,7 @@ def test_an_aborted_run_is_resumed_without_driving_or_sweeping_again(place: Path
 def test_a_vehicle_that_was_pushed_meanwhile_makes_the_resumed_run_sweep_again(place: Path) -> None:
     with served(place, "--seed", "3"):
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
-            wait_for_step(place, "place")
+            wait_for_step(place, "place", run)
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
         assert cell("jog", "vehicle", "-0.003m", "-c", "sim.toml", folder=place).returncode == 0

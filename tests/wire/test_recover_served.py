@@ -40,7 +40,7 @@ def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(serving: t
 def test_a_homing_that_stopped_goes_on_after_cell_confirm(serving: tuple[Path, dict[str, Any]]) -> None:
     folder, endpoints = serving
     with started("home", "arm", folder=folder) as homing:
-        run = wait_for_step(folder, "homing")
+        run = wait_for_step(folder, "homing", homing)
         ask(endpoints, op="fault", name="arm.protective_stop")
         while (asked := awaited_word(run)) is None:
             assert homing.poll() is None

@@ -110,7 +110,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
         code, _, error = typed("run", "-c", str(tmp_path / "sim.toml"))
         assert (code, "calibrat" in error) == (1, True), error
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
-            wait_for_step(place, "laser_sweep")
+            wait_for_step(place, "laser_sweep", run)
             os.kill(run.pid, signal.SIGINT)
             out, err = run.communicate(timeout=30)
         assert run.returncode == 130, err
@@ -124,7 +124,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
 def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
-            wait_for_step(place, "drive_to_target")
+            wait_for_step(place, "drive_to_target", run)
             code, _, error = typed("jog", "rail", "+1mm", "-c", str(place / "sim.toml"))
             asked, _, trouble = typed("abort", "-c", str(place / "sim.toml"))
             out, err = run.communicate(timeout=30)
@@ -137,7 +137,7 @@ def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Callable[.
 
 def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path) -> None:
     with started("dry-run", "--seed", "3", "--json", folder=place) as run:
-        wait_for_step(place, "drive_to_target")
+        wait_for_step(place, "drive_to_target", run)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         world = next(pid for pid in children if b"sim_backends" in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(int(world), signal.SIGKILL)
