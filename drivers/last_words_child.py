@@ -4,7 +4,6 @@ It also says when a process counts as frozen, for the arm's own child process.
 """
 
 import os
-import resource
 import select
 import signal
 import sys
@@ -18,7 +17,7 @@ HUNG_S = 2.0
 """An owner without a beat for so long counts as frozen even if it computes."""
 LOOK_S = 0.05
 ALONE_S = 0.3
-"""Processor time that a thread in real time may take without waiting once: no work here takes a tenth of it."""
+"""Processor time that a thread in real time may take without waiting once."""
 
 
 class Owner:
@@ -60,12 +59,14 @@ def raise_priority() -> None:
     A thread that spins in real time would leave nothing to all others: after `ALONE_S` this process loses the right.
     """
     try:
+        import resource  # not on Windows, where this file is imported as well
+
         _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
         resource.setrlimit(resource.RLIMIT_RTTIME, (int(1e6 * ALONE_S), most))
         signal.signal(signal.SIGXCPU, lambda number, frame: _lower_priority())
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except (AttributeError, OSError, ValueError):
-        with suppress(OSError):
+    except (ImportError, AttributeError, OSError, ValueError):
+        with suppress(OSError, AttributeError):
             os.setpriority(os.PRIO_PROCESS, 0, -10)
 
 

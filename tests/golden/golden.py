@@ -66,6 +66,8 @@ def main() -> int:
     parser.add_argument("what", choices=("write", "compare"))
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="how many, from 1 (default: %(default)s)")
     asked = parser.parse_args()
+    if asked.what == "compare" and not HASHES.is_file():
+        parser.error(f"there is no {HASHES.name} to compare with: run `write` on the state before the change")
     kept = {} if asked.what == "write" else json.loads(HASHES.read_text(encoding="utf-8"))
     found: dict[str, str] = {}
     for name, value in hashes(list(SEEDS)[: asked.seeds]):
