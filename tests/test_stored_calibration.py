@@ -252,6 +252,15 @@ def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
     assert note in found(tmp_path).summary()["notes"]
 
 
+def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: Path) -> None:
+    path = tmp_path / f"{made().name}.json"
+    save_calibration(made(), path)
+    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
+    edited(path, "scan", "flange_from_camera", 0, 3, value=0.001)
+    with pytest.raises(CalibrationEdited, match="changed after it was written"):
+        found(tmp_path)
+
+
 def test_one_without_its_digest_is_edited_and_one_from_before_is_read_with_a_note(tmp_path: Path) -> None:
     path, own = tmp_path / "own.json", made()
     path.write_text(json.dumps(own.as_dict()), encoding="utf-8")

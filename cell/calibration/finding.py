@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from cell.calibration.store import CalibrationEdited, CellCalibration, read_calibration
+from cell.calibration.store import CalibrationEdited, CellCalibration, name_of, read_calibration
 from drivers.errors import CalibrationStale, NotConnectedError
 
 
@@ -21,39 +21,13 @@ def find_calibration(
     """The stored calibration of these devices under this configuration, not older than `max_age` s.
 
     `kinematics` names the arm's table, as of `kinematics_name`; `untold` says why the arm has not told it now, if so.
-    A copy that somebody edited is passed over, and `scan.unread` says so; jobs warn of it.
+    An edited copy beside it is passed over; `scan.unread` says so, and jobs warn of it.
 
-    Raises `CalibrationStale` that says what is missing or what differs, `CalibrationEdited` where nothing but an edited
-    file is of these devices, and `NotConnectedError` when the arm has to be asked again before anybody can tell.
+    Raises `CalibrationStale` that says what is missing or what differs, `CalibrationEdited` where the file that the
+    cell writes was edited or nothing intact is of these devices, and `NotConnectedError` when the arm has to be asked
+    again before anybody can tell.
     """
-    found: list[CellCalibration] = []
-    unreadable: list[tuple[str, str]] = []
-    edited: list[CalibrationEdited] = []
-    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
-        try:
-            found.append(read_calibration(path))
-        except CalibrationStale as error:
-            if isinstance(error, CalibrationEdited) and error.identities == identities:
-                edited.append(error)
-            unreadable.append((path.name, str(error)))
-    if edited and not any(entry.identities == identities for entry in found):
-        raise edited[0]
-    newest = _newest(folder, found, unreadable, identities, configuration, max_age, kinematics, untold)
-    notes = (f"{error} It is passed over, and the calibration of {newest.date} is used." for error in edited)
-    return replace(newest, scan=replace(newest.scan, unread=(*newest.scan.unread, *notes)))
-
-
-def _newest(
-    folder: Path,
-    found: list[CellCalibration],
-    unreadable: list[tuple[str, str]],
-    identities: dict[str, str],
-    configuration: str,
-    max_age: float,
-    kinematics: str,
-    untold: str,
-) -> CellCalibration:
-    """The newest of those found that holds. Raises as `find_calibration` does."""
+    found, unreadable, edited = _stored(folder, identities)
     own = [entry for entry in found if entry.identities == identities]
     if not own:
         devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
@@ -97,7 +71,33 @@ def _newest(
             f"the calibration of {newest.date} holds no more, as was found since: {newest.scan.refused}. Then run "
             "`cell calibrate`"
         )
-    return newest
+    notes = (f"{error} It is passed over, and the calibration of {newest.date} is used." for error in edited)
+    return replace(newest, scan=replace(newest.scan, unread=(*newest.scan.unread, *notes)))
+
+
+def _stored(
+    folder: Path, identities: dict[str, str]
+) -> tuple[list[CellCalibration], list[tuple[str, str]], list[CalibrationEdited]]:
+    """The calibrations in `folder`; name and trouble of each file that cannot be read; edited copies of these devices'.
+
+    Raises `CalibrationEdited` as `find_calibration` does.
+    """
+    found: list[CellCalibration] = []
+    unreadable: list[tuple[str, str]] = []
+    edited: list[CalibrationEdited] = []
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        try:
+            found.append(read_calibration(path))
+        except CalibrationStale as error:
+            if isinstance(error, CalibrationEdited) and error.identities == identities:
+                # Another file of these devices may be older than what was edited.
+                if path.stem == name_of(identities):
+                    raise
+                edited.append(error)
+            unreadable.append((path.name, str(error)))
+    if edited and not any(entry.identities == identities for entry in found):
+        raise edited[0]
+    return found, unreadable, edited
 
 
 def _exchanged(found: list[CellCalibration], identities: dict[str, str]) -> str:

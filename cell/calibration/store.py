@@ -96,7 +96,7 @@ class CellCalibration:
     @property
     def name(self) -> str:
         """What its file is called: the serial numbers that it belongs to."""
-        return "-".join(self.identities[device] for device in sorted(self.identities))
+        return name_of(self.identities)
 
     def as_dict(self) -> dict[str, Any]:
         """For storage."""
@@ -220,6 +220,11 @@ def nominal_camera(config: CameraConfig) -> CameraModel:
     return CameraModel(
         config.width, config.height, focal, focal, (config.width - 1) / 2, (config.height - 1) / 2, (0.0,) * 5
     )
+
+
+def name_of(identities: dict[str, str]) -> str:
+    """What the file of these devices' calibration is called, without its ending."""
+    return "-".join(identities[device] for device in sorted(identities))
 
 
 def save_calibration(calibration: CellCalibration, path: Path) -> None:
