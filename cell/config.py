@@ -55,6 +55,8 @@ __all__ = [
 
 Confirm = Literal["person", "simulated"]
 """Who confirms what a person has to: a person, or the simulated cell itself."""
+CALIBRATION_DEPTHS = {"fine": (0.120, 0.130, 0.142), "large": (0.560, 0.650, 0.700)}
+"""Nearest, usual and farthest distance of the calibration's views, m."""
 
 
 class CellSection(Table):

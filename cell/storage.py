@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import secrets
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,10 @@ from drivers.errors import CellError
 DIGEST, PARTS = "sha256", "sha256_of"
 """Keys of a file: the digest of all the rest, and short ones of its parts, by which an edit can be located."""
 UNDATED = ("run", "started", "ended", "at", "calibration_date")
+CLOCK_SLACK_S = 3600.0
+"""How far a date may lie in the future: clocks of two machines differ."""
+FIRST_S = 978_307_200.0
+"""2001-01-01: nothing was calibrated before."""
 
 
 class EditedError(ValueError):
@@ -180,3 +185,14 @@ def require_unchanged(arrays: dict[str, Any]) -> None:
     told, now = json.loads(str(arrays.pop(DIGEST))), json.loads(sealed_arrays(arrays))
     if changed := sorted(name for name in told.keys() | now.keys() if told.get(name) != now.get(name)):
         raise EditedError(f"it was changed after it was written: {', '.join(changed)}")
+
+
+def require_date(name: str, seconds: float) -> None:
+    """Raise `ValueError` where a date, seconds since the epoch, is none or lies in the future."""
+    if not FIRST_S <= seconds < float("inf"):
+        raise ValueError(f"{name} is {seconds}, no date in seconds since 1970 (from {FIRST_S:.0f}, 2001-01-01)")
+    if (ahead := seconds - time.time()) > CLOCK_SLACK_S:
+        raise ValueError(
+            f"{name} lies {ahead / 3600:.1f} hours in the future, so its age is not known (allowed: "
+            f"{CLOCK_SLACK_S / 3600:g} h); set this machine's clock"
+        )

@@ -29,6 +29,7 @@ from cell.devices.mix import Sim
 from cell.devices.simulated import Simulation, is_whole
 from cell.devices.stopping import stop_cell
 from cell.job import Job, load_job
+from cell.motion.arm_models import HOME
 from cell.opened import Opened
 from cell.opening import open_devices
 from cell.run.folder import find_run
@@ -42,7 +43,7 @@ from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
 from cell.run.runs import Runs
 from cell.steps.kinds import find_kind
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.whereabouts import Whereabouts
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import Event

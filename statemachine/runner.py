@@ -15,8 +15,7 @@ from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy, Step
 from statemachine.recovery import Recover, performed
-from statemachine.script import NO_SCRIPT, Again, Script
-from statemachine.scripting import Scripting
+from statemachine.script import NO_SCRIPT, Again, Script, Scripting
 from statemachine.sequence import Sequence, SequenceError, Trigger
 from statemachine.standing import hold
 from statemachine.step import Event, FaultRecord, Observer, RunResult, StepCall, StepContext, StepRecord

@@ -17,8 +17,7 @@ from drivers.arm.faults import fault, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import Snapshot, safety_code
-from drivers.arm.motion import UrMotion
-from drivers.arm.trajectory import Trajectory, pose_difference
+from drivers.arm.motion import Trajectory, UrMotion, pose_difference
 from drivers.arm.wrong_arm import flange_agrees, require_same_flange, same_payload
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError

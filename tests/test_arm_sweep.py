@@ -12,9 +12,10 @@ from test_rail_sweep import CONFIG, ERRORS, GEOMETRY, SCAN
 
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts, from_ur
+from cell.motion.arm_models import HOME
 from cell.steps.arm_sweep import LATENCY_S, arm_sweep
 from cell.steps.camera_poses import ScanPlan
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.swath import Collector, Swath
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame

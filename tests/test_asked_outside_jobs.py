@@ -19,8 +19,8 @@ from cell.console.desk import Desk
 from cell.console.run_view import RunView
 from cell.devices.direct import VirtualCell
 from cell.devices.jogging import Jog, jog
+from cell.motion.arm_models import HOME
 from cell.run.run import Run
-from cell.steps.moves import HOME
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
 from tests.console.server import until

@@ -361,7 +361,7 @@ def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_a
 def test_the_collision_bodies_of_the_cell_hang_where_the_cameras_are(tmp_path: Path) -> None:
     """A turned tool: what the planner keeps clear is where the world has cameras, laser and rail."""
     from cell.motion.bodies import tool_bodies
-    from cell.steps.moves import mounted
+    from cell.mounting import mounted
 
     config: dict[str, dict[str, Any]] = {
         "scan_camera": {"flange_from_camera": pose((-50.0, -90.0, 80.0), (0.0, 5.0, 30.0))},

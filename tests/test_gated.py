@@ -9,7 +9,7 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.devices.interlocks import Command, Rule, Situation
-from cell.steps.moves import HOME
+from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken
 

@@ -24,9 +24,9 @@ from cell.devices.rules import RULES, markdown
 from cell.devices.ways import LINE_STEP_RAD, Ways
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
+from cell.motion.arm_models import HOME
 from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
 from cell.run.lock import CellLock
-from cell.steps.moves import HOME
 from cell.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError

@@ -14,11 +14,12 @@ from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import Job, load_job
+from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
 from cell.motion.trajectory import Trajectory
 from cell.obstacles import StationObstacle
 from cell.steps.approach import Planar
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.way import Upright, Way
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import parse_board

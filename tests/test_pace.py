@@ -9,9 +9,10 @@ from cell import Cell
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_parts, from_ur
+from cell.motion.arm_models import HOME
 from cell.run.pace import LEAST, Pace
 from cell.steps.drive_to_target import drive_to_target
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from drivers.errors import ConfigError
 from tests.test_whereabouts import JOB, VEHICLE_FROM_BASE, Site
 

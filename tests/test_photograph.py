@@ -13,8 +13,9 @@ from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import from_matrix, from_parts
 from cell.job import PhotoSection, load_job
+from cell.motion.arm_models import HOME
 from cell.steps.camera_poses import look_pose
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.photograph import BoardFix, photograph
 from cell.steps.workplace import PHOTO_RATE_HZ
 from cell.vision import parse_board

@@ -15,11 +15,12 @@ from cell.geometry.poses import from_matrix, from_parts, from_ur
 from cell.inversion import NominalSurface
 from cell.job import load_job
 from cell.lab.bench.whole_job import NoFrames
+from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
 from cell.run.resumption import UnfinishedRun
 from cell.steps import drive_to_target
 from cell.steps.kinds import PLACE
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.place import PlaceResult, place
 from cell.steps.touch import Touch

@@ -20,11 +20,12 @@ from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_ur
 from cell.job import ScanSection, load_job
 from cell.lab.bench.whole_job import NoFrames
+from cell.motion.arm_models import HOME
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan
 from cell.steps.frame_times import step_of_clock
 from cell.steps.laser_sweep import UNCHECKED, _home, laser_sweep
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from cell.steps.sweep_record import SweepRecord

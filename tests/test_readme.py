@@ -12,7 +12,7 @@ import typer
 
 from cell.cli.app import app
 from cell.steps.kinds import PLACE
-from statemachine.diagram import mermaid
+from statemachine.sequence import mermaid
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 

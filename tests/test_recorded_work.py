@@ -15,9 +15,10 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.direct import VirtualCell
 from cell.job import load_job
+from cell.motion.arm_models import HOME
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.vision import parse_board
 from drivers.camera.folder import read_image
 from drivers.errors import RefusedError

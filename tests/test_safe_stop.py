@@ -11,7 +11,7 @@ import pytest
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
-from cell.steps.moves import HOME
+from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, DeviceFault
 from statemachine.cancel import CancelToken
 from tests.test_fixed_vehicle import fixed_cell

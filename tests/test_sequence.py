@@ -6,9 +6,8 @@ import re
 
 import pytest
 
-from statemachine.diagram import mermaid
 from statemachine.policy import Policy, Step
-from statemachine.sequence import Sequence, SequenceError, State, Trigger
+from statemachine.sequence import Sequence, SequenceError, State, Trigger, mermaid
 
 STEPS = ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place")
 ENDS = (State.PLACED, State.REFUSED, State.FAULTED, State.ABORTED)

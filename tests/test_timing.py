@@ -19,7 +19,7 @@ from cell.calibration.sessions import kept_if_refused
 from cell.calibration.solve.reference import Reference
 from cell.calibration.solve.results import KEPT, Quality, TargetCalibration
 from cell.calibration.store import CellCalibration, save_calibration
-from cell.calibration.timing import Shutter, Timing, changed, link_of
+from cell.calibration.timing import Shutter, Timing
 from cell.calibration.timing_fit import (
     TimedFrame,
     TimedSweep,
@@ -30,6 +30,7 @@ from cell.calibration.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
+from cell.calibration.timing_link import changed, link_of
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.geometry.camera import CameraModel

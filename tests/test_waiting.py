@@ -14,8 +14,8 @@ import pytest
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.devices.stopping import stop_cell
+from cell.motion.arm_models import HOME
 from cell.run.faults import classify
-from cell.steps.moves import HOME
 from drivers.clock import Clock
 from drivers.errors import Aborted
 from statemachine.cancel import Cancelled

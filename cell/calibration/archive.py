@@ -20,10 +20,9 @@ import pinocchio as pin
 
 from cell.calibration.observations import ScanObservation, TargetObservation
 from cell.calibration.solve.adjustment import Priors
-from cell.calibration.validation import require_date
 from cell.calibration.witness import Witness, read_edge
 from cell.geometry.camera import Array, CameraModel
-from cell.storage import DIGEST, replacing, require_unchanged, sealed_arrays
+from cell.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
 from cell.vision.board.spec import parse_board
 from cell.vision.board.view import BoardView
 from cell.vision.stripe.extract import StripeProfile

@@ -5,7 +5,6 @@ The digest of its file shows an edit; this shows what no calibration says, whoev
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,15 +13,12 @@ from cell.calibration.solve.faults import SCALE_RANGE
 from cell.config import CellConfig
 from cell.geometry.camera import Array
 from cell.geometry.light_plane import LightPlane
+from cell.storage import require_date
 from drivers.errors import CalibrationStale
 
 if TYPE_CHECKING:
     from cell.calibration.store import CellCalibration
 
-CLOCK_SLACK_S = 3600.0
-"""How far a date may lie in the future: clocks of two machines differ."""
-FIRST_S = 978_307_200.0
-"""2001-01-01: nothing was calibrated before."""
 LENS = range(4, 9)
 """Parameters of a lens that a calibration may leave as they are; all others it must have estimated."""
 LEAST_EIGENVALUE, SYMMETRIC = 1e-10, 1e-5
@@ -62,17 +58,6 @@ def require_valid(calibration: CellCalibration) -> None:
     if (witness := scan.witness) is not None:
         _require("scan.witness.rail, m", witness.rail, -10.0, 10.0)
         _require("scan.witness.sigma, px", witness.sigma[witness.rows], 1e-9, 1e3)
-
-
-def require_date(name: str, seconds: float) -> None:
-    """Raise `ValueError` where a date, seconds since the epoch, is none or lies in the future."""
-    if not FIRST_S <= seconds < float("inf"):
-        raise ValueError(f"{name} is {seconds}, no date in seconds since 1970 (from {FIRST_S:.0f}, 2001-01-01)")
-    if (ahead := seconds - time.time()) > CLOCK_SLACK_S:
-        raise ValueError(
-            f"{name} lies {ahead / 3600:.1f} hours in the future, so its age is not known (allowed: "
-            f"{CLOCK_SLACK_S / 3600:g} h); set this machine's clock"
-        )
 
 
 def require_covariance(name: str, covariance: Array, fixed: range) -> None:

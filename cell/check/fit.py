@@ -13,17 +13,17 @@ import numpy as np
 
 from cell.calibration.store import nominal_camera
 from cell.check.contact import contact_problems
-from cell.check.depths import CALIBRATION_DEPTHS
 from cell.check.place import mesh_box, place_problems, surface_problems, way_problems
 from cell.check.reach import reach_problems
-from cell.config import CellConfig
+from cell.config import CALIBRATION_DEPTHS, CellConfig
 from cell.device_config import CameraConfig
 from cell.geometry.poses import transform
 from cell.job import Job
 from cell.motion.bodies import tool_bodies, vehicle_bodies
-from cell.steps.camera_poses import centre_of, look_pose
+from cell.steps.camera_poses import look_pose
 from cell.steps.kinds import find_kind
 from cell.vision import BoardSpec, parse_board
+from cell.vision.board.spec import centre_of
 from drivers.errors import ConfigError
 
 RAMP_MARGIN = 0.0005

@@ -17,8 +17,8 @@ from cell.inversion.nominal import read_mesh
 from cell.job import Job
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
 from cell.steps.approach import MAX_HEADING, Planar, wrap
-from cell.steps.camera_poses import centre_of
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 from drivers.interfaces import Vector
 
 Box = tuple[Vector, Vector]

@@ -14,24 +14,25 @@ from cell.config import CellConfig
 from cell.geometry.light_plane import LightPlane
 from cell.geometry.poses import from_parts
 from cell.job import Job
-from cell.motion.arm_models import arm_kinematics
+from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
+from cell.mounting import deck_plates, mounted
 from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.steps.arm_sweep import RUN_UP_S
 from cell.steps.camera_poses import (
     base_from_place_at_target,
-    centre_of,
     look_pose,
     photo_pose,
     scan_calibration_views,
     scan_plans,
     target_calibration_views,
 )
-from cell.steps.moves import HOME, ROOM_ABOVE, deck_plates, mounted
+from cell.steps.moves import ROOM_ABOVE
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 from drivers.interfaces import Vector
 
 Goal = tuple[str, pin.SE3, tuple[Pair, ...]]

@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.commission.check import Check, Finding, Result
 from cell.commission.desk import Desk
 from cell.geometry.poses import from_ur
-from cell.steps.moves import HOME
+from cell.motion.arm_models import HOME
 from drivers.errors import LimitError
 from drivers.interfaces import Vector
 

@@ -22,9 +22,10 @@ from cell.config import load_config
 from cell.devices.devices import Devices
 from cell.devices.truth_link import cause_fault, make_ready
 from cell.job import Job, load_job
+from cell.motion.arm_models import HOME
 from cell.motion.kinematics import Joints
 from cell.run.recorded_work import Hands
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer

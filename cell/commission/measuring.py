@@ -16,7 +16,7 @@ from cell.commission.desk import Desk
 from cell.commission.mounting import Axes, RoughMounting, axes_from_shifts, solve_mounting
 from cell.commission.seeing import Eye, Seen, find_view, see
 from cell.geometry.poses import from_parts
-from cell.steps.camera_poses import centre_of
+from cell.vision.board.spec import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
 
 SMALL_TURN, TURN = math.radians(5.0), math.radians(12.0)

@@ -17,8 +17,8 @@ from cell.config import CameraConfig
 from cell.device_config import PlateConfig
 from cell.geometry.camera import Array, CameraModel
 from cell.geometry.poses import from_parts, from_ur
-from cell.steps.camera_poses import centre_of
 from cell.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
+from cell.vision.board.spec import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame, Image
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.run.run import Run
-from cell.run.sweeping import Sweeping
-from cell.steps.swath import Collector
+from cell.steps.swath import Collector, Sweeping
 from drivers.interfaces import Frame
 
 WIDTH = 640

@@ -20,12 +20,13 @@ from cell.console.meshes import LINKS, coarser, link_meshes
 from cell.device_config import CameraConfig
 from cell.inversion.nominal import read_mesh
 from cell.job import Job, load_job
-from cell.motion.arm_models import arm_kinematics
+from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.mounting import deck_plates, mounted
 from cell.obstacles import station_obstacles, vehicle_obstacles
-from cell.steps.camera_poses import base_from_place_at_target, centre_of
-from cell.steps.moves import HOME, deck_plates, mounted
+from cell.steps.camera_poses import base_from_place_at_target
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 from drivers.link_table import LinkTable
 
 ON_RAIL = "scan head"

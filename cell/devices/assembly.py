@@ -18,8 +18,7 @@ from cell.devices.make import Surroundings
 from cell.devices.rules import RULES
 from cell.devices.ways import Ways
 from cell.geometry.poses import to_ur
-from cell.motion.arm_models import arm_kinematics
-from cell.steps.moves import HOME
+from cell.motion.arm_models import HOME, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vector, Vehicle

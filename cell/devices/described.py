@@ -15,8 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.check.depths import CALIBRATION_DEPTHS
-from cell.config import DEVICES, CellConfig
+from cell.config import CALIBRATION_DEPTHS, DEVICES, CellConfig
 from cell.device_config import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
 from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
 from cell.devices.rail_makes import ModbusRailConfig

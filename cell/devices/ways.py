@@ -21,8 +21,8 @@ from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import Joints
 from cell.motion.point_speed import PointSpeed, carried_points
+from cell.mounting import deck_plates, mounted
 from cell.obstacles import vehicle_obstacles
-from cell.steps.moves import deck_plates, mounted
 from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
 

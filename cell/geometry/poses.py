@@ -140,3 +140,10 @@ def point_covariances(
     j[:, 2, 3], j[:, 2, 4] = arm[:, 1], -arm[:, 0]
     pose_part = j @ np.asarray(pose_covariance, dtype=np.float64) @ j.transpose(0, 2, 1)
     return np.asarray(r @ np.asarray(covariances, dtype=np.float64) @ r.T + pose_part, dtype=np.float64)
+
+
+def angle_apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
+    """Difference in rad between the angles of the flange's and the board's turn."""
+    hand = float(np.linalg.norm(pin.log3(a_flange.rotation.T @ b_flange.rotation)))
+    eye = float(np.linalg.norm(pin.log3(a_board.rotation @ b_board.rotation.T)))
+    return abs(hand - eye)

@@ -18,6 +18,11 @@ from drivers.link_table import LinkTable
 MOST_FACTORY_M, MOST_FACTORY_RAD = 0.02, 0.06
 """How far a factory's table may carry the flange off the maker's. Three published ones carry it by up to 8 mm, 23 mrad;
 the nearest two models, UR3 and UR3e, are 29 mm apart."""
+HOME: Joints = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
+"""Where `cell home` brings the arm, and where jobs and calibrations begin: folded above the deck, tool down.
+
+Postures are chosen nearest to the present one, so a fixed beginning keeps the arm in one of its configurations.
+"""
 _POSTURES: Joints = np.random.default_rng(1).uniform(-2.8, 2.8, (24, 6))
 
 

@@ -19,9 +19,9 @@ from cell.new_job.questions import Asker, checked, choice, pose, pose_words, thr
 from cell.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
 from cell.new_job.text import deg, mm
 from cell.new_job.units import METRES, possible_units, size_words, told_by_size
-from cell.steps.camera_poses import centre_of
 from cell.units import parse_quantity, shown
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 from drivers.errors import ConfigError
 
 LISTED = 9

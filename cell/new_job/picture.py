@@ -21,6 +21,7 @@ from cell.config import CellConfig
 from cell.geometry.poses import transform
 from cell.inversion import NominalSurface
 from cell.job import SwathSection
+from cell.motion.arm_models import HOME
 from cell.motion.bodies import Body
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import Unreachable
@@ -28,7 +29,6 @@ from cell.new_job.proposal import SEEN_WITHIN, Proposal
 from cell.new_job.rays import Array
 from cell.new_job.sweeps import Seen
 from cell.steps.camera_poses import base_from_place_at_target, scan_plans
-from cell.steps.moves import HOME
 
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:olive", "tab:cyan", "tab:pink")
 PLACES = 6000

@@ -13,9 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from cell.check.depths import CALIBRATION_DEPTHS
 from cell.check.fit import RAMP_MARGIN
-from cell.config import CellConfig
+from cell.config import CALIBRATION_DEPTHS, CellConfig
 from cell.inversion import NominalSurface
 from cell.job import Job, ScanSection, SwathSection
 from cell.new_job.knowledge import verdict

@@ -12,10 +12,10 @@ from cell.config import CellConfig
 from cell.geometry.poses import transform
 from cell.job import Job
 from cell.motion.bodies import Body, tool_bodies
+from cell.mounting import mounted
 from cell.new_job.rays import Array
 from cell.new_job.sweeps import Seen
 from cell.steps.camera_poses import base_from_place_at_target, look_pose, photo_pose
-from cell.steps.moves import mounted
 from cell.vision import parse_board
 
 MOST_HIDDEN = 0.02

@@ -21,6 +21,7 @@ from cell.config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from cell.devices.interlocks import Command
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
+from cell.mounting import deck_plates, mounted
 from cell.record.channels import CAMERAS, COMMANDED
 from cell.record.file import FILE, RecordFile, missing
 from cell.record.seen import Lines, RailPath
@@ -29,7 +30,6 @@ from cell.record.times import Times
 from cell.record.words import as_json, rtde, wire
 from cell.run.frames import Picture
 from cell.run.run import Run
-from cell.steps.moves import deck_plates, mounted
 from drivers.interfaces import ArmState, Frame, RailState
 from statemachine.step import Event
 

@@ -33,10 +33,9 @@ from cell.run.frames import FrameStore
 from cell.run.logs import run_log
 from cell.run.pace import Pace
 from cell.run.run import Run
-from cell.run.sweeping import Sweeping
 from cell.steps.kinds import Kind
 from cell.steps.stored_sweep import StoredSweep
-from cell.steps.swath import Collector
+from cell.steps.swath import Collector, Sweeping
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from cell.storage import write_json

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from cell.run.frames import FrameStore
-    from cell.run.sweeping import Sweeping
+    from cell.steps.swath import Sweeping
 
 Result = TypeVar("Result")
 

@@ -17,8 +17,8 @@ from cell.config import CellConfig
 from cell.geometry.poses import from_parts, transform
 from cell.job import Job
 from cell.vision import BoardSpec
+from cell.vision.board.spec import centre_of
 from drivers.errors import CalibrationStale, RefusedError
-from drivers.interfaces import Vector
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,6 @@ def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
     """Nominal pose of the place frame in the arm's base once the vehicle stands at its target."""
     place_from_base = job.approach.target.se3() * config.arm.vehicle_from_base.se3()
     return place_from_base.inverse()
-
-
-def centre_of(board: BoardSpec) -> Vector:
-    """The middle (3,) of the board's points in its own frame, m."""
-    points = board.points()
-    return np.asarray(0.5 * (points.min(axis=0) + points.max(axis=0)), dtype=np.float64)
 
 
 def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:

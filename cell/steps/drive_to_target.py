@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from cell.job import Job
+from cell.motion.arm_models import HOME
 from cell.motion.bodies import Body
 from cell.run.pace import Pace
 from cell.steps.approach import Planar, drive_line, turn_to, wrap
 from cell.steps.camera_poses import look_pose
-from cell.steps.moves import HOME
 from cell.steps.photograph import BoardFix
 from cell.steps.step import JobStep
 from cell.steps.way import BACK_UP, Way

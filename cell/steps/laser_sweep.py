@@ -12,7 +12,8 @@ from cell.calibration import ScanCalibration
 from cell.calibration.collect.edge import require_edge
 from cell.calibration.collect.witness import require_witness
 from cell.calibration.slip import Slip, slip_since
-from cell.calibration.timing import Timing, changed, link_of
+from cell.calibration.timing import Timing
+from cell.calibration.timing_link import changed, doubt_of, link_of
 from cell.calibration.witness import Pointing, Witness
 from cell.calibration.witness import pointing as pointing_since
 from cell.config import CellConfig
@@ -199,7 +200,7 @@ def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | Non
     """How late the camera's stamps come, if that was measured with the settings of now; and for people what of the
     camera's times is not known."""
     timing, doubts = head.timing, list(head.unread)
-    if timing is not None and (doubt := timing.doubt(config)):
+    if timing is not None and (doubt := doubt_of(timing, config)):
         doubts.append(
             f"how late the scan camera's time stamps come is kept since {timing.date}, but {doubt}; the sweep goes on "
             "with scan_camera.late. Run `cell calibrate timing`"

@@ -16,7 +16,6 @@ from cell.motion.bodies import (
     BASE,
     PLACED,
     Body,
-    Mounted,
     arm_bodies,
     box,
     station_bodies,
@@ -27,23 +26,18 @@ from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
+from cell.mounting import deck_plates, mounted
 from cell.obstacles import station_obstacles, vehicle_obstacles
 from cell.run.pace import Pace
-from cell.steps.camera_poses import centre_of
-from cell.vision import BoardSpec, parse_board
+from cell.vision import BoardSpec
+from cell.vision.board.spec import centre_of
 from drivers.clock import Clock
 from drivers.interfaces import Arm, ArmMotion, Vector
 
-PLATE_THICKNESS = 0.01
 ROOM_ABOVE = 0.005
 """How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
 GRACE_WALL_S = 10.0
 """How much longer than planned a motion may take before it is stopped, in seconds on the wall."""
-HOME = np.deg2rad([90.0, -100.0, 100.0, -90.0, -90.0, 0.0])
-"""Where `cell home` brings the arm, and where jobs and calibrations begin: folded above the deck, tool down.
-
-Postures are chosen nearest to the present one, so a fixed beginning keeps the arm in one of its configurations.
-"""
 
 
 class Mover:
@@ -185,20 +179,3 @@ def _joint_limits(config: ArmConfig) -> JointLimits:
         acceleration=(config.max_joint_acceleration,) * 6,
         jerk=(config.max_joint_jerk,) * 6,
     )
-
-
-def mounted(config: CellConfig) -> Mounted:
-    """What the flange carries beside the claw, where the configuration has it."""
-    scan, target = (camera.flange_from_camera.se3() for camera in (config.scan_camera, config.target_camera))
-    return Mounted(scan, target, config.laser.baseline, config.rail.travel)
-
-
-def deck_plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:
-    """The calibration boards on the deck: name, base_from_centre and size, m."""
-    plates = []
-    for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
-        board = parse_board(plate.board)
-        width, height = np.ptp(board.points()[:, :2], axis=0) + 2 * board.pitch
-        below = from_parts(centre_of(board) + np.array([0.0, 0.0, PLATE_THICKNESS / 2]))
-        plates.append((name, plate.base_from_board.se3() * below, (width, height, PLATE_THICKNESS)))
-    return plates

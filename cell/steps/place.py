@@ -13,10 +13,11 @@ from cell.inversion import PlacePose
 from cell.inversion.creep import Creep
 from cell.inversion.standing import highest_standing, require_bare
 from cell.job import Job
+from cell.motion.arm_models import HOME
 from cell.motion.bodies import TOUCHES
 from cell.reconstruction.cloud import Indices
 from cell.steps.invert_pose import inverted
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.photograph import BoardFix
 from cell.steps.reconstruct import Reconstruction

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cell.calibration.timing import Timing
 from cell.geometry.poses import from_matrix
+from cell.inversion import NominalSurface
 from cell.job import ScanSection
 from cell.reconstruction import ProfileBuilder, ScanGeometry
 from cell.steps.frame_times import require_one_clock
@@ -205,3 +206,12 @@ class Collector:
         """Raise `DeviceFault` where the camera's clock stepped meanwhile."""
         allowed = STEP_SHARE * errors.shift
         require_one_clock(camera, self.frame_ids, self.times, self.received, self.scan.speed, allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweeping:
+    """Who takes its frames, where the surface is by the board before anything was registered, and the surface."""
+
+    collector: Collector
+    base_from_surface: pin.SE3
+    nominal: NominalSurface

@@ -19,9 +19,9 @@ from cell.job import Job
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
 from cell.obstacles import station_obstacles
 from cell.steps.approach import Planar, line_command, wrap
-from cell.steps.camera_poses import centre_of
 from cell.steps.whereabouts import Whereabouts
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 

@@ -24,7 +24,7 @@ from drivers.arm.messages import (
     Setup,
     Snapshot,
 )
-from drivers.arm.trajectory import Trajectory, pose_difference
+from drivers.arm.motion import Trajectory, pose_difference
 from drivers.arm.ur_program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.ur_streaming import Streaming
 from drivers.clock import Clock

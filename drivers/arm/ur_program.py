@@ -12,7 +12,7 @@ from typing import Any
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import LATE_S, late_words
 from drivers.arm.messages import MODE_RUNNING, PLAYING, STOPPED, Setup, Six, Snapshot, safety_code
-from drivers.arm.trajectory import largest_difference
+from drivers.arm.motion import largest_difference
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 from drivers.arm.messages import Pace, Setup, Six, Snapshot
-from drivers.arm.trajectory import Trajectory
+from drivers.arm.motion import Trajectory
 from drivers.arm.ur_program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.clock import Clock
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.arm.faults import fault
 from drivers.arm.messages import Six, Snapshot
-from drivers.arm.trajectory import pose_difference
+from drivers.arm.motion import pose_difference
 from drivers.interfaces import Vector
 
 Forward = Callable[[Vector], Vector]

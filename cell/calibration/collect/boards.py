@@ -12,8 +12,9 @@ from cell.calibration.store import nominal_camera
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
+from cell.motion.arm_models import HOME
 from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.vision import BoardSpec, BoardView, extract, find_board, parse_board
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
 from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing, link_of, most_late
+from cell.calibration.timing import Timing
 from cell.calibration.timing_fit import (
     TimedFrame,
     TimedSweep,
@@ -20,11 +20,13 @@ from cell.calibration.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
+from cell.calibration.timing_link import link_of, most_late
 from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
+from cell.motion.arm_models import HOME
 from cell.steps.camera_poses import rail_ends, verification_views
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.vision import BoardSpec, find_board, parse_board
 from drivers.errors import DeviceFault, LimitError, RefusedError
 

@@ -204,10 +204,3 @@ def _turns(poses: Sequence[pin.SE3]) -> Array:
     rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
     traces = np.einsum("aij,bij->ab", rotations, rotations)
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1), -1.0, 1.0)))
-
-
-def angle_apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
-    """Difference in rad between the angles of the flange's and the board's turn."""
-    hand = float(np.linalg.norm(pin.log3(a_flange.rotation.T @ b_flange.rotation)))
-    eye = float(np.linalg.norm(pin.log3(a_board.rotation @ b_board.rotation.T)))
-    return abs(hand - eye)

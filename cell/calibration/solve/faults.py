@@ -16,9 +16,8 @@ import scipy
 from cell.calibration.solve.adjustment import Adjusted
 from cell.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
 from cell.calibration.solve.board_shape import surface_shapes
-from cell.calibration.solve.consistency import angle_apart
 from cell.geometry.camera import Array
-from cell.geometry.poses import difference, from_parts, perturbed
+from cell.geometry.poses import angle_apart, difference, from_parts, perturbed
 from drivers.errors import RefusedError
 
 LARGEST_TURN = float(np.deg2rad(0.5))

@@ -21,8 +21,8 @@ from cell.geometry.camera import Array
 from cell.geometry.poses import from_parts
 from cell.job import Job
 from cell.report.html import table
-from cell.steps.camera_poses import centre_of
 from cell.vision import parse_board
+from cell.vision.board.spec import centre_of
 
 SHARE = 0.3
 """Of the place's tolerance: what moves the place by less is told and not called bad. A third, with room for an estimate

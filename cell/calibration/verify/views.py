@@ -23,9 +23,10 @@ from cell.config import CellConfig
 from cell.devices.devices import Devices
 from cell.geometry.poses import from_ur
 from cell.job import ScanSection
+from cell.motion.arm_models import HOME
 from cell.reconstruction import ScanGeometry
 from cell.steps.camera_poses import ScanPlan, View, rail_ends, verification_views
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import Mover
 from cell.steps.rail_sweep import rail_sweep
 from cell.steps.swath import Collector, SweepErrors, rehearse
 from cell.vision import BoardSpec, BoardView, StripeProfile, parse_board

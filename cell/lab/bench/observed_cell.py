@@ -17,10 +17,9 @@ from cell.calibration import ScanObservation, TargetObservation
 from cell.calibration.collect.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from cell.config import CellConfig
 from cell.geometry.poses import from_matrix
-from cell.motion.arm_models import arm_kinematics
+from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.kinematics import Joints
 from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
-from cell.steps.moves import HOME
 from cell.vision import BoardSpec, BoardView, parse_board
 from cell.vision.stripe.extract import StripeProfile
 from drivers.link_table import LinkTable

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from cell.geometry.camera import Array
 from cell.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
 from cell.vision.board.corner_fit import fit_corners
-from cell.vision.board.counts import propose_counts
 from cell.vision.board.ends import check_hidden_sides, smoothed
 from cell.vision.board.plane_map import PlaneMap
-from cell.vision.board.spec import BoardSpec
+from cell.vision.board.spec import BoardSpec, propose_counts
 from cell.vision.board.view import BoardView
 from cell.vision.pictures import Image, PictureRefused, Reason
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
 from drivers.errors import ConfigError
@@ -27,6 +28,11 @@ MARKED: tuple[Kind, ...] = ("charuco", "aprilgrid")
 MARKER_SHARE = {"charuco": 0.7, "aprilgrid": 1 / 1.3}
 FAMILIES = ("16h5", "25h9", "36h10", "36h11")
 DEFAULT_DICTIONARY = {"charuco": "DICT_5X5_100", "aprilgrid": "DICT_APRILTAG_36h11"}
+MOST_COLUMNS = 30
+LEAST_FIT, FIT_SHARE = 6, 0.8
+"""So many markers, and this share of all, have to lie as on the board that is proposed."""
+NEAR = 0.25
+"""… to this share of their side."""
 
 
 @dataclass(frozen=True)
@@ -170,3 +176,38 @@ def _length(board: str, text: str, what: str) -> float:
     if not 1e-4 <= metres <= 10.0:
         raise ConfigError(f"board {board!r}: the {what} {text!r} is outside 0.1 mm to 10 m")
     return metres
+
+
+def centre_of(board: BoardSpec) -> Array:
+    """The middle (3,) of the board's points in its own frame, m."""
+    points = board.points()
+    return np.asarray(0.5 * (points.min(axis=0) + points.max(axis=0)), dtype=np.float64)
+
+
+def propose_counts(spec: BoardSpec, corners: Array, ids: NDArray[np.intp]) -> str:
+    """A sentence with the counts that markers with corners (n, 4, 2) in px and ids (n,) have; empty where unknown."""
+    if len(ids) < LEAST_FIT:
+        return ""
+    pixels = corners.mean(axis=1)
+    side = float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2)))
+    found: list[tuple[int, int, int]] = []
+    for cols in range(2, MOST_COLUMNS):
+        for places in _places(spec, cols, int(ids.max()) + 1):
+            at = places[ids].astype(np.float64)
+            homography, inliers = cv2.findHomography(at, pixels, cv2.RANSAC, max(1.0, NEAR * side))
+            if homography is not None:
+                found.append((int(inliers.sum()), cols, int(places[:, 1].max()) + 1))
+    fit, cols, rows = max(found, default=(0, 0, 0), key=lambda f: f[0])
+    if fit < max(LEAST_FIT, FIT_SHARE * len(ids)):
+        return ""
+    return f" By the markers read it has {cols}x{rows}: name those counts (more rows where the last are not in view)"
+
+
+def _places(spec: BoardSpec, cols: int, count: int) -> list[NDArray[np.intp]]:
+    """Column and row (count, 2) of each marker: all fields of a grid of tags, the white ones of a ChArUco board."""
+    number = np.arange(2 * count + 2 * cols)
+    row, column = np.divmod(number, cols)
+    every = np.column_stack([column, row])
+    if spec.kind == "aprilgrid":
+        return [every[:count]]
+    return [every[(column + row) % 2 == parity][:count] for parity in (1, 0)]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cell.geometry.camera import Array
 from cell.vision.board.charuco import best_dictionary
-from cell.vision.board.counts import propose_counts
-from cell.vision.board.spec import BoardSpec
+from cell.vision.board.spec import BoardSpec, propose_counts
 from cell.vision.board.view import BoardView
 from cell.vision.pictures import Image, PictureRefused, Reason
 
