@@ -1,0 +1,1 @@
+"""`cell calibrate` and its subcommands."""

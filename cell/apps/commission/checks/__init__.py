@@ -1,0 +1,1 @@
+"""The checks of the commissioning, a file for each device."""

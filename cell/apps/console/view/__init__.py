@@ -1,0 +1,1 @@
+"""What the page shows of the cell: scene, pictures, readings, runs."""

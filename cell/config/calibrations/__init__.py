@@ -1,0 +1,1 @@
+"""Stored calibrations: written, read, checked against the configuration, and found for the devices of now."""

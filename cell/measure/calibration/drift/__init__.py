@@ -1,0 +1,1 @@
+"""What has changed since the calibration: reference plate, slip, roll, timing, verification."""

@@ -1,0 +1,1 @@
+"""What is done with devices: the six steps, and drives, sweeps and calibrations that they are made of."""

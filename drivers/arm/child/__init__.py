@@ -1,0 +1,1 @@
+"""The process in which the vendor library lives, since it can crash or hang."""

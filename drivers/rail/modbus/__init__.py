@@ -1,0 +1,1 @@
+"""The rail on a drive that speaks Modbus RTU."""

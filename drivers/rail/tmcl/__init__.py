@@ -1,0 +1,1 @@
+"""The rail on a TMCL stepper module."""

@@ -1,0 +1,1 @@
+"""Calibration and its verification beside their bounds."""

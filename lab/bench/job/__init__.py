@@ -1,0 +1,1 @@
+"""The whole job: accuracy beside its bound, effects of the workshop."""

@@ -1,0 +1,1 @@
+"""Reconstruction: outliers and holes."""

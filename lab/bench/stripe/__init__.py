@@ -1,0 +1,1 @@
+"""The stripe's centres beside their bound."""

@@ -1,0 +1,1 @@
+"""Streams, endings and long runs over the wires."""

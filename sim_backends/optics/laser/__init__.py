@@ -1,0 +1,1 @@
+"""The laser in pictures: its sheet, the stripe, its profile, speckle and shadows."""

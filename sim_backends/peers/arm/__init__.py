@@ -1,0 +1,1 @@
+"""The arm's controller on the network."""

@@ -1,0 +1,1 @@
+"""RTDE version 2, server side."""

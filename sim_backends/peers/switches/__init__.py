@@ -1,0 +1,1 @@
+"""Relay boards on a serial line."""
