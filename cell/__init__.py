@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cell.run.job_run import RunOutcome as RunOutcome
-    from cell.supervisor import Cell as Cell
+    from cell.run.session.supervisor import Cell as Cell
     from drivers.errors import (
         Aborted,
         CalibrationStale,
@@ -55,7 +55,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'cell' has no attribute {name!r}")
     match name:
         case "Cell":
-            from cell.supervisor import Cell
+            from cell.run.session.supervisor import Cell
 
             return Cell
         case "RunOutcome":

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sim_backends.peers.agilex import FAULTS as VEHICLE_FAULTS
-from sim_backends.peers.frames import FAULTS as CAMERA_FAULTS
-from sim_backends.peers.rtde import FAULTS as CONTROLLER_FAULTS
-from sim_backends.peers.tmcl import FAULTS as RAIL_FAULTS
+from sim_backends.peers.arm.rtde.server import FAULTS as CONTROLLER_FAULTS
+from sim_backends.peers.camera.frames import FAULTS as CAMERA_FAULTS
+from sim_backends.peers.rail.tmcl import FAULTS as RAIL_FAULTS
+from sim_backends.peers.vehicle.agilex import FAULTS as VEHICLE_FAULTS
 
 __all__ = [
     "ARM_FAULTS", "CAMERA_FAULTS", "CONTROLLER_FAULTS", "FAULT_NAMES", "RAIL_FAULTS", "TARGET_CAMERA_FAULTS",

@@ -31,18 +31,18 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.models.arm_kinematics import TABLES
+from sim_backends.peers.arm.rtde.server import PERIOD, RtdePeer
+from sim_backends.peers.camera.frames import FramePeer
+from sim_backends.peers.camera.gige import GigePeer
 from sim_backends.peers.following import FollowingPeer
-from sim_backends.peers.frames import FramePeer
-from sim_backends.peers.gige import GigePeer
-from sim_backends.peers.rtde import PERIOD, RtdePeer
 from sim_backends.peers.truth import TruthPeer
+from sim_backends.peers.vehicle.wired_vehicle import vehicle_peer
 from sim_backends.peers.wired import rail_peer, switch_peers
-from sim_backends.peers.wired_vehicle import vehicle_peer
+from sim_backends.world.bodies.surfaces import SURFACES
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.following import FOLLOWED, Following
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
-from sim_backends.world.surfaces import SURFACES
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
 

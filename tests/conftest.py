@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 
 GROUPS = (

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from cell.config import default_toml
-from cell.job import job_path
+from cell.config.cell_config import default_toml
+from cell.config.job import job_path
 
 Changes = Mapping[str, Mapping[str, str]]
 """Table, key: the value as TOML text. A key that the table lacks is added."""

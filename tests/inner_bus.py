@@ -11,7 +11,7 @@ import can
 
 from drivers.clock import Clock
 from sim_backends.clock import WorldClock
-from sim_backends.peers.slcan import CanFrame
+from sim_backends.peers.vehicle.slcan import CanFrame
 
 
 class Hand(Clock):

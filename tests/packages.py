@@ -10,9 +10,9 @@ RAIL = '''
 
 from typing import Annotated, ClassVar, Literal
 
-from cell.device_config import RailConfig
-from cell.devices.make import Make
-from cell.units import quantity
+from cell.makes.records import RailConfig
+from cell.makes.make import Make
+from cell.base.units import quantity
 from drivers.errors import InterlockError, LimitError
 from drivers.interfaces import Identity, LinkStatistics, RailState
 

@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.recorded.frames import RecordedFrame
-from cell.vision.board.spec import parse_board
-from cell.vision.board.view import BoardView
-from cell.vision.stripe.extract import StripeProfile
+from cell.apps.recordings.frames import RecordedFrame
+from cell.measure.vision.board.spec import parse_board
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
 
 SIZE = (1280, 1024)
 MATRIX = np.array([[1400.0, 0.0, 655.0], [0.0, 1405.0, 500.0], [0.0, 0.0, 1.0]])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.geometry.light_plane import LightPlane
-from cell.lab.bench import artefacts, form_errors
-from cell.lab.bench.acceptance import NOISE_FACTOR, _flatness, _probing, _spacing
-from cell.lab.paper.rig import Noise, RigSpec, draw_head
-from cell.reconstruction import ScanGeometry
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.reconstruction import ScanGeometry
 from drivers.errors import RefusedError
+from lab.bench.acceptance import artefacts, form_errors
+from lab.bench.acceptance.campaign import NOISE_FACTOR, _flatness, _probing, _spacing
+from lab.paper.rig import Noise, RigSpec, draw_head
 from sim_backends.world.levels import LEVELS
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.collect.aiming import SEARCH_M, Aim
-from cell.calibration.store import nominal_camera
-from cell.config import load_config
-from cell.geometry.poses import difference, from_parts, perturbed
-from cell.steps.camera_poses import View, scan_calibration_views
-from cell.vision import BoardView, parse_board
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import load_config
+from cell.measure.geometry.poses import difference, from_parts, perturbed
+from cell.measure.vision import BoardView, parse_board
+from cell.procedures.arm.camera_poses import View, scan_calibration_views
+from cell.procedures.calibrate.aiming import SEARCH_M, Aim
 
 CONFIG = load_config(None)
 CAMERA = nominal_camera(CONFIG.scan_camera)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.steps.approach import Planar, RelativeOdometry, drive_line, line_command, turn_to, wrap
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line, line_command, turn_to, wrap
 from drivers.errors import DeviceFault
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-import drivers.arm.ur_program as program
 from cell.run.faults import classify
+from drivers.arm.child import program
+from drivers.arm.child.program import ControlProgram, joints_off
 from drivers.arm.messages import Setup, Snapshot
-from drivers.arm.ur_program import ControlProgram, joints_off
 from drivers.errors import (
     Aborted,
     CalibrationStale,

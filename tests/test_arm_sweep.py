@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 from test_rail_sweep import CONFIG, ERRORS, GEOMETRY, SCAN
 
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_parts, from_ur
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.arm_models import HOME
-from cell.steps.arm_sweep import LATENCY_S, arm_sweep
-from cell.steps.camera_poses import ScanPlan
-from cell.steps.moves import Mover
-from cell.steps.swath import Collector, Swath
+from cell.procedures.arm.camera_poses import ScanPlan
+from cell.procedures.arm.moves import Mover
+from cell.procedures.sweep.arm_sweep import LATENCY_S, arm_sweep
+from cell.procedures.sweep.swath import Collector, Swath
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
 from sim_backends.direct.arm import DirectArm

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.calibration import sessions
-from cell.cli import main
-from cell.console.desk import Desk
-from cell.console.run_view import RunView
-from cell.devices.direct import VirtualCell
-from cell.devices.jogging import Jog, jog
+from cell.apps.cli import main
+from cell.apps.console.host.controller import Desk
+from cell.apps.console.view.run_view import RunView
+from cell.devices.simulated.direct import VirtualCell
 from cell.motion.arm_models import HOME
+from cell.run import calibration as sessions
+from cell.run.jogging import Jog, jog
 from cell.run.run import Run
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.geometry.camera import CameraModel
-from cell.geometry.circles import seen_centres
-from cell.geometry.poses import difference, transform
-from cell.vision import PictureRefused, Reason, board_pose, find_board, parse_board, read_picture
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.circles import seen_centres
+from cell.measure.geometry.poses import difference, transform
+from cell.measure.vision import PictureRefused, Reason, board_pose, find_board, parse_board, read_picture
 from drivers.errors import ConfigError
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.render import render

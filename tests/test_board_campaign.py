@@ -11,14 +11,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.geometry.poses import difference
-from cell.lab.bench.board import Tally as BoardTally
-from cell.lab.bench.board import camera_of, judge
-from cell.lab.bench.board_conditions import CONDITIONS, LENSES, draw_pose, draw_spec, draw_view
-from cell.lab.bench.board_render import Placed, true_pixels
-from cell.vision import PictureRefused, Reason, board_pose, find_board
-from cell.vision.board.spec import KINDS
-from cell.vision.board.view import BoardView
+from cell.measure.geometry.poses import difference
+from cell.measure.vision import PictureRefused, Reason, board_pose, find_board
+from cell.measure.vision.board.spec import KINDS
+from cell.measure.vision.board.view import BoardView
+from lab.bench.board.campaign import Tally as BoardTally
+from lab.bench.board.campaign import camera_of, judge
+from lab.bench.board.conditions import CONDITIONS, LENSES, draw_pose, draw_spec, draw_view
+from lab.bench.board.render import Placed, true_pixels
 
 BY_NAME = {condition.name: condition for condition in CONDITIONS}
 DOTS = ("marked_dots", "asymmetric_dots", "dots")

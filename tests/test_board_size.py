@@ -8,10 +8,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration import TargetObservation
-from cell.calibration.solve.cameras import adjust_target
-from cell.calibration.solve.joint import Joint
-from cell.geometry.poses import from_parts
+from cell.measure.calibration import TargetObservation
+from cell.measure.calibration.solve.cameras import adjust_target
+from cell.measure.calibration.solve.joint import Joint
+from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError
 from tests.test_calibration import BOARD, FLANGE_FROM_CAMERA, NOMINAL, PRIORS, RAIL, observe
 

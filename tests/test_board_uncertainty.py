@@ -11,16 +11,16 @@ import pinocchio as pin
 import pytest
 from scipy.special import erf, ndtr
 
-from cell.geometry.poses import difference
-from cell.lab.bench.board import camera_of
-from cell.lab.bench.board_conditions import LENSES, draw_pose, draw_spec
-from cell.lab.bench.board_render import Placed, true_pixels
-from cell.vision import board_pose
-from cell.vision.board.corner_fit import fit_corners
-from cell.vision.board.dots import measure_dots
-from cell.vision.board.lattice import Blobs
-from cell.vision.board.outliers import without_outliers
-from cell.vision.board.view import BoardView
+from cell.measure.geometry.poses import difference
+from cell.measure.vision import board_pose
+from cell.measure.vision.board.corner_fit import fit_corners
+from cell.measure.vision.board.dots import measure_dots
+from cell.measure.vision.board.lattice import Blobs
+from cell.measure.vision.board.outliers import without_outliers
+from cell.measure.vision.board.view import BoardView
+from lab.bench.board.campaign import camera_of
+from lab.bench.board.conditions import LENSES, draw_pose, draw_spec
+from lab.bench.board.render import Placed, true_pixels
 
 BRIGHT, DARK, PSF = 170.0, 14.0, 0.7
 # A fifth of what levels taken beside the edges and light that is only added would do.

@@ -10,17 +10,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration import Priors, ScanObservation, TargetObservation, calibrate_scan, calibrate_target
-from cell.calibration.solve.adjustment import Adjustment, shared_mask
-from cell.calibration.solve.blocks import COLUMNS, OWN, SHARED, State, dots_block, stripe_block
-from cell.calibration.solve.hand_eye import refine_hand_eye, solve_hand_eye
-from cell.calibration.solve.joint import solve_joint, solve_staged, start_state, view_data
-from cell.calibration.solve.results import PARAMETERS, ScanCalibration
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import difference, from_axes, from_parts, perturbed
-from cell.vision import BoardView, parse_board
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.calibration import Priors, ScanObservation, TargetObservation, calibrate_scan, calibrate_target
+from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
+from cell.measure.calibration.solve.blocks import COLUMNS, OWN, SHARED, State, dots_block, stripe_block
+from cell.measure.calibration.solve.hand_eye import refine_hand_eye, solve_hand_eye
+from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state, view_data
+from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import difference, from_axes, from_parts, perturbed
+from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
 BOARD = parse_board("marked_dots:11x9:3mm")

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.calibration import Priors, TargetObservation, calibrate_scan
-from cell.calibration.archive import Observations, read_archive, write_archive
-from cell.calibration.solve.advice import advice
-from cell.calibration.solve.coverage import Coverage
-from cell.calibration.solve.influence import Places, derivatives, influences, place_rms
-from cell.calibration.solve.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
-from cell.calibration.store import nominal_camera, solve_observations
-from cell.config import load_config
-from cell.geometry.camera import CameraModel
-from cell.geometry.poses import from_matrix, from_parts
-from cell.lab.bench.calibration import observe, one_trial
-from cell.lab.bench.calibration_bound import cramer_rao
-from cell.lab.bench.calibration_world import Noise, draw_head
-from cell.vision.board.view import BoardView
+from cell.config.calibrations.store import nominal_camera, solve_observations
+from cell.config.cell_config import load_config
+from cell.measure.calibration import Priors, TargetObservation, calibrate_scan
+from cell.measure.calibration.archive import Observations, read_archive, write_archive
+from cell.measure.calibration.judge.advice import advice
+from cell.measure.calibration.judge.coverage import Coverage
+from cell.measure.calibration.judge.influence import Places, derivatives, influences, place_rms
+from cell.measure.calibration.solve.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.vision.board.view import BoardView
 from drivers.errors import ConfigError
+from lab.bench.calibration.bound import cramer_rao
+from lab.bench.calibration.campaign import observe, one_trial
+from lab.bench.calibration.world import Noise, draw_head
 
 NOISE = Noise()
 

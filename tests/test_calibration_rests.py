@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.adjustment import Priors, shared_mask
-from cell.calibration.solve.blocks import OWN, SHARED, rests_of
-from cell.calibration.solve.joint import Joint, solve_joint, solve_staged
-from cell.calibration.solve.normal import Normal
-from cell.calibration.store import nominal_camera
-from cell.config import load_config
-from cell.geometry.poses import from_matrix
-from cell.lab.bench.calibration import observe
-from cell.lab.bench.calibration_world import HeadWorld, Noise, draw_head, turned
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import load_config
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Priors, shared_mask
+from cell.measure.calibration.solve.blocks import OWN, SHARED, rests_of
+from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
+from cell.measure.calibration.solve.normal import Normal
+from cell.measure.geometry.poses import from_matrix
+from lab.bench.calibration.campaign import observe
+from lab.bench.calibration.world import HeadWorld, Noise, draw_head, turned
 
 NOISE = Noise(arm=2e-4, arm_angle=4e-4)
 PRIORS = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import default_toml, load_config
-from cell.devices.makes import make_of
-from cell.devices.vehicle_makes import CanopenVehicleConfig
+from cell.config.cell_config import default_toml, load_config
+from cell.makes.table import make_of
+from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.emergencies import meaning

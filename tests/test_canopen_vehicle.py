@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.cia402.last_words import last_words
 from sim_backends.models.wheel_drive import State
-from sim_backends.peers.canopen_node import WRONG_VALUE, Abort
+from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort
 from tests.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 
 RAMP_WALL_S = 0.3

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.inversion.causes import Cause, find_causes, likeliest
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from cell.reconstruction import Cloud
-from cell.steps.invert_pose import Lines
-from cell.steps.invert_pose import invert_pose as step
+from cell.measure.inversion.effects.causes import Cause, find_causes, likeliest
+from cell.measure.reconstruction import Cloud
+from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.report_runs import CONFIG, pot
 
 VEHICLE = CONFIG.arm.vehicle_from_base.se3().inverse()

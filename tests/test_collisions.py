@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import load_config
-from cell.devices.described import Described
-from cell.job import load_job
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.devices.simulated.described import Described
 from cell.motion.bodies import BASE, FLANGE, Body, arm_bodies, tool_bodies
 from cell.motion.kinematics import ArmKinematics
 from sim_backends.clock import SteppedClock
@@ -19,8 +19,8 @@ from sim_backends.models.arm import Safety
 from sim_backends.models.arm_motion import JointMove, LinearMove
 from sim_backends.models.vehicle import MOTOR_FAULT, Mode, State
 from sim_backends.world import nominal
-from sim_backends.world.arm_points import BODIES
-from sim_backends.world.collisions import DECK, Collisions
+from sim_backends.world.bodies.arm_points import BODIES
+from sim_backends.world.bodies.collisions import DECK, Collisions
 from sim_backends.world.drawing import read
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from cell.commission.begin import begin
-from cell.commission.check import Check, Result
-from cell.commission.person import PersonAtTheConsole, SimulatedPerson
-from cell.commission.protocol import write_protocol
-from cell.commission.sequence import CHECKS, Commissioning, by_name, chosen
-from cell.commission.vehicle_checks import judge_board
-from cell.config import default_toml, load_config
-from cell.devices.described import Described
-from cell.devices.direct import VirtualCell
-from cell.job import load_job
-from cell.vision import parse_board
+from cell.apps.commission.begin import begin
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.checks.vehicle import judge_board
+from cell.apps.commission.person import PersonAtTheConsole, SimulatedPerson
+from cell.apps.commission.protocol import write_protocol
+from cell.apps.commission.sequence import CHECKS, Commissioning, by_name, chosen
+from cell.config.cell_config import default_toml, load_config
+from cell.config.job import load_job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.vision import parse_board
 from drivers.errors import DeviceFault
 from tests.described_cells import described
 

@@ -12,18 +12,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.commission.arm_checks import GRAVITY, weigh
-from cell.commission.check import Check, Result
-from cell.commission.mounting import against_drawing, axes_from_shifts, solve_mounting
-from cell.commission.output_checks import bright_rows
-from cell.commission.progress import Progress
-from cell.commission.rail_checks import judge
-from cell.commission.sequence import CHECKS, table
-from cell.commission.toml_edit import edited, write_changes
-from cell.config import default_toml, load_config
-from cell.device_config import CameraConfig
-from cell.geometry.poses import from_parts
-from cell.job import load_job
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.checks.arm import GRAVITY, weigh
+from cell.apps.commission.checks.outputs import bright_rows
+from cell.apps.commission.checks.rail import judge
+from cell.apps.commission.mounting import against_drawing, axes_from_shifts, solve_mounting
+from cell.apps.commission.progress import Progress
+from cell.apps.commission.sequence import CHECKS, table
+from cell.apps.commission.toml_edit import edited, write_changes
+from cell.config.cell_config import default_toml, load_config
+from cell.config.job import load_job
+from cell.makes.records import CameraConfig
+from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError, RefusedError
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import ArmModel, ArmParams

@@ -20,9 +20,9 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
-    import cell.supervisor
-    from cell.vision import extract
-    from cell.lab.bench.stripe_truth import Cell, draw
+    import cell.run.session.supervisor
+    from cell.measure.vision import extract
+    from lab.bench.stripe.truth import Cell, draw
 
 image, centres = draw(Cell(2, 100), (64, 320), 1)
 error = abs(extract(image).centres - centres).max()
@@ -38,14 +38,15 @@ def test_without_numba_the_cell_says_so_once_and_still_finds_stripes() -> None:
 
 REHEARSED = """
 import importlib, pkgutil
-from cell.vision import stripe
-from cell.lab.bench.stripe_truth import Cell, draw
-from cell.steps.swath import rehearse
-from cell.vision import StripeStream
+from cell.measure.vision import stripe
+from lab.bench.stripe.truth import Cell, draw
+from cell.procedures.sweep.swath import rehearse
+from cell.measure.vision import StripeStream
 from test_reconstruction import GEOMETRY
 
 def loaded():
-    modules = [importlib.import_module(f"{stripe.__name__}.{m.name}") for m in pkgutil.iter_modules(stripe.__path__)]
+    found = pkgutil.walk_packages(stripe.__path__, f"{stripe.__name__}.")
+    modules = [importlib.import_module(m.name) for m in found]
     return {name: len(f.signatures) for m in modules for name, f in vars(m).items() if hasattr(f, "signatures")}
 
 before = loaded()
@@ -73,10 +74,12 @@ def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path: Path) -> None:
     def ours() -> set[str]:
         return {path.name for path in (tmp_path / "kept").rglob("*.nbi") if "optics" not in path.parent.name}
 
-    with subprocess.Popen([sys.executable, "-m", "cell.ahead"], stdin=subprocess.PIPE, env=environment) as ahead:
+    with subprocess.Popen(
+        [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment
+    ) as ahead:
         assert ahead.wait(200) == 0
     before = ours()
-    command = [sys.executable, "-c", "from cell.cli import main; main()", "dry-run", "--clock", "virtual"]
+    command = [sys.executable, "-c", "from cell.apps.cli import main; main()", "dry-run", "--clock", "virtual"]
     subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, timeout=300, env=environment)
     assert len(before) > 40
     # Only a line that is hard to follow needs this one.
@@ -85,7 +88,9 @@ def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path: Path) -> None:
 
 def test_who_compiles_ahead_ends_with_the_other(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    with subprocess.Popen([sys.executable, "-m", "cell.ahead"], stdin=subprocess.PIPE, env=environment) as ahead:
+    with subprocess.Popen(
+        [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment
+    ) as ahead:
         assert ahead.stdin is not None
         ahead.stdin.close()
         assert ahead.wait(60) == 0

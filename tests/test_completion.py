@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cell.cli import completing
-from cell.config import DEVICES
-from cell.job import shipped_jobs
+from cell.apps.cli import completion as completing
+from cell.config.cell_config import DEVICES
+from cell.config.job import shipped_jobs
 from sim_backends.world.effects import Effects
 
 ASK = """
@@ -34,7 +34,7 @@ def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text('[cell]\nruns = "elsewhere"\n')
     command = tmp_path / "bin" / "cell"
     command.parent.mkdir()
-    command.write_text(f"#!{sys.executable}\nfrom cell.cli import main\nmain()\n")
+    command.write_text(f"#!{sys.executable}\nfrom cell.apps.cli import main\nmain()\n")
     command.chmod(0o755)
     environment = {"PATH": f"{command.parent}:/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parent.parent)}
     told = subprocess.run(

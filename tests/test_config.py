@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell import units
+from cell.base import units
+from cell.base.units import parse_quantity
 from cell.check.fit import require_fit
-from cell.config import CellConfig, default_toml, load_config, validate
-from cell.job import job_path, load_job, shipped_jobs
-from cell.units import parse_quantity
+from cell.config.cell_config import CellConfig, default_toml, load_config, validate
+from cell.config.job import job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from cell.cli import main
-from cell.cli.progress import ProgressDisplay
-from cell.run.folder import new_run
+from cell.apps.cli import main
+from cell.apps.cli.progress import ProgressDisplay
+from cell.run.files.folder import new_run
 from statemachine.journal import Journal, Request
 from statemachine.step import Event
 

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cell.calibration.store import CellCalibration, read_calibration, save_calibration
-from cell.calibration.verify.confirm import keep_confirmed
-from cell.calibration.verify.verdict import Verification
-from cell.calibration.verify.views import collect_verification
-from cell.calibration.witness import ConfirmedTurn, Pointing
-from cell.cli.app import app
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from cell.apps.cli.app import app
+from cell.config.calibrations.store import CellCalibration, read_calibration, save_calibration
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
+from cell.measure.inversion import NominalSurface
+from cell.procedures.arm.moves import Mover
+from cell.procedures.verify.confirm import keep_confirmed
+from cell.procedures.verify.verdict import Verification
+from cell.procedures.verify.views import collect_verification
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.steps.moves import Mover
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import effects
 from sim_backends.world.scene import draw
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from cell.base.toml_file import read_toml, validate
 from cell.check.contact import contact_notes, contact_problems, under_part
-from cell.config import CellConfig, load_config
-from cell.job import Job, load_job, shipped_jobs
-from cell.toml_file import read_toml, validate
+from cell.config.cell_config import CellConfig, load_config
+from cell.config.job import Job, load_job, shipped_jobs
 
 POT = load_job("pot")[1].with_suffix(".toml")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.geometry.covariance import covariance_root
+from cell.measure.geometry.covariance import covariance_root
 
 
 def test_the_columns_make_the_covariance_whatever_the_units():

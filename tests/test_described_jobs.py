@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from cell import Cell
-from cell.calibration.store import save_calibration
-from cell.lab.bench.whole_job import JobRecord
+from cell.config.calibrations.store import save_calibration
+from lab.bench.job.whole_job import JobRecord
 from tests.described_cells import Changes, described, pose, write_saddle
 
 FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}

@@ -13,24 +13,24 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
-from cell.calibration.solve.blocks import BOARD, HAND, SHARED, State
-from cell.calibration.solve.reference import Reference
-from cell.calibration.solve.results import ScanCalibration, TargetCalibration
-from cell.calibration.store import CellCalibration
-from cell.calibration.verify.decision import verdict
-from cell.calibration.verify.detectability import detectable
-from cell.calibration.verify.evidence import Evidence, evidence
-from cell.calibration.verify.hypotheses import SHIFT, hypotheses, log_factor
-from cell.calibration.verify.looks import scan_looks, target_looks, verify
-from cell.calibration.verify.verdict import Verification
-from cell.config import load_config
-from cell.geometry.camera import CameraModel
-from cell.geometry.covariance import covariance_root
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_matrix
-from cell.job import load_job
-from cell.lab.bench.observed_cell import ObservedCell
-from cell.lab.bench.verification import KINDS_OF_CHANGE, changed, look_again
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.measure.calibration.drift.decision import verdict
+from cell.measure.calibration.drift.detectability import detectable
+from cell.measure.calibration.drift.evidence import Evidence, evidence
+from cell.measure.calibration.drift.hypotheses import SHIFT, hypotheses, log_factor
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.solve.blocks import BOARD, HAND, SHARED, State
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.covariance import covariance_root
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_matrix
+from cell.procedures.verify.looks import scan_looks, target_looks, verify
+from cell.procedures.verify.verdict import Verification
+from lab.bench.calibration.observed_cell import ObservedCell
+from lab.bench.calibration.verification import KINDS_OF_CHANGE, changed, look_again
 from sim_backends.world.scene import draw
 
 CONFIG = load_config(None)

@@ -9,12 +9,12 @@ import can
 import numpy as np
 import pytest
 
-from cell.devices.diagnosis import Diagnosis
-from cell.devices.examination import stream_figures
+from cell.devices.diagnosis.diagnosis import Diagnosis
+from cell.devices.diagnosis.examination import stream_figures
 from drivers.arm.health import Watched
 from drivers.arm.health import readings as arm_readings
 from drivers.interfaces import Reading
-from drivers.rail.health import readings as rail_readings
+from drivers.rail.tmcl.health import readings as rail_readings
 from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.can_interface import CanInterface, parse_interface
 from drivers.vehicle.health import most_bits

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from cell.config import load_config
+from cell.config.cell_config import load_config
 from cell.devices.contracts import Bench
 from cell.devices.contracts.arm import ArmContract
 from cell.devices.contracts.camera import CameraContract
 from cell.devices.contracts.rail import RailContract
 from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
-from cell.devices.direct import VirtualCell
+from cell.devices.simulated.direct import VirtualCell
 
 CONFIG = load_config(None)
 

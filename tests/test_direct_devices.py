@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.lab.bench.accuracy import LIMITS, figures, summed_up
-from cell.lab.bench.expected import mean_distance
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.inversion import NominalSurface
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import ArmSafety
+from lab.bench.job.accuracy import LIMITS, figures, summed_up
+from lab.bench.job.expected import mean_distance
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from tests.report_runs import pot

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from cell.cli.app import app
-from cell.config import DEVICES, default_toml, load_config
-from cell.doctor import computer
-from cell.doctor.links import can_check, link_checks
-from cell.doctor.packages import OWN, package_checks, shadow_check
+from cell.apps.cli.app import app
+from cell.apps.doctor import computer
+from cell.apps.doctor.links import can_check, link_checks
+from cell.apps.doctor.packages import OWN, package_checks, shadow_check
+from cell.config.cell_config import DEVICES, default_toml, load_config
 from drivers.vehicle.can_interface import CanInterface
 
 

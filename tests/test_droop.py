@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.geometry.poses import difference
-from cell.inversion import PlacePose
-from cell.inversion.droop import Droop, Head
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction.cloud import Cloud
-from cell.steps.invert_pose import Lines
-from cell.steps.invert_pose import invert_pose as step
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.effects.droop import Droop, Head
+from cell.measure.reconstruction.cloud import Cloud
+from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import NotObservable
+from lab.bench.job.whole_job import JobRecord
 from tests.report_runs import CONFIG, pot
 
 

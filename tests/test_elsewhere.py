@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.geometry.poses import perturbed
-from cell.inversion import Prior, invert_pose
+from cell.measure.geometry.poses import perturbed
+from cell.measure.inversion import Prior, invert_pose
 from drivers.errors import RefusedError
 from tests.test_inversion import JOB, TRUE, freeform, nominal, scanned
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from cell.cli import main
-from cell.cli.display import print_report
-from cell.cli.end_screen import HEIGHT, duration, end_screen
-from cell.run.folder import new_run, write_json
-from cell.run.reading import read_report, run_row
+from cell.apps.cli import main
+from cell.apps.cli.display import print_report
+from cell.apps.cli.end_screen import HEIGHT, duration, end_screen
+from cell.run.files.folder import new_run, write_json
+from cell.run.files.reading import read_report, run_row
 from drivers.errors import CellError
 from statemachine.journal import Journal
 from tests import report_runs

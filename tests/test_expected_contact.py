@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.lab.bench.contact import mean_after_contact
+from cell.config.job import load_job
+from cell.measure.inversion import NominalSurface
+from lab.bench.job.contact import mean_after_contact
 
 JOB, MESH = load_job("pot")
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)

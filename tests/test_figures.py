@@ -13,15 +13,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.slip import Slip
-from cell.calibration.timing import Shutter, Timing
-from cell.calibration.verify.decision import Figure, Suspect
-from cell.calibration.verify.pointing import WitnessCheck
-from cell.calibration.witness import ConfirmedTurn, Pointing
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction.seams import Seam
-from cell.steps.drive_to_target import Arrival
-from cell.steps.touch import Touch, TouchCheck
+from cell.measure.calibration.drift.decision import Figure, Suspect
+from cell.measure.calibration.drift.pointing import WitnessCheck
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
+from cell.measure.calibration.drift.slip import Slip
+from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.reconstruction.seams import Seam
+from cell.procedures.arm.touch import Touch, TouchCheck
+from cell.procedures.steps.drive_to_target import Arrival
+from lab.bench.job.whole_job import JobRecord
 
 SPREAD = np.diag(np.square([0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.5e-3, 0.6e-3]))
 SIGMAS = {"sigma_mm": [0.1, 0.2, 0.3], "sigma_mrad": [0.4, 0.5, 0.6]}

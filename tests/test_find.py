@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
-from cell.cli import main
-from cell.config import CellConfig, default_toml, load_config
-from cell.devices.finding import ask_module, configured, find, gige_camera
-from cell.devices.local_devices import Found, barred, cameras, can_interfaces, opened_by, serial_ports
-from cell.run.lock import CellLock, who_holds
+from cell.apps.cli import main
+from cell.config.cell_config import CellConfig, default_toml, load_config
+from cell.devices.diagnosis.finding import ask_module, configured, find, gige_camera
+from cell.devices.diagnosis.local_devices import Found, barred, cameras, can_interfaces, opened_by, serial_ports
+from cell.devices.lock import CellLock, who_holds
 from tests.wire.other_module import OtherModule
 
 

@@ -10,27 +10,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cell.job as job_module
 from cell import Cell
-from cell.calibration.store import save_calibration
 from cell.check.fit import require_fit
 from cell.check.place import way_problems
-from cell.config import default_toml, load_config
+from cell.config import job as job_module
+from cell.config.calibrations.store import save_calibration
+from cell.config.cell_config import default_toml, load_config
+from cell.config.job import load_job
 from cell.devices.assembly import connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import DeviceContract
-from cell.devices.described import Described
-from cell.devices.diagnosis import _vehicle_state
-from cell.devices.direct import VirtualCell
-from cell.job import load_job
-from cell.lab.bench.whole_job import JobRecord
-from cell.steps.drive_to_target import stand_at_target
-from cell.steps.photograph import BoardFix
-from cell.steps.whereabouts import Whereabouts
+from cell.devices.diagnosis.diagnosis import _vehicle_state
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.steps.drive_to_target import stand_at_target
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
+from lab.bench.job.whole_job import JobRecord
 
 JOB = load_job("pot")[0]
 JOB_FILE = Path(job_module.__file__).parent / "jobs" / "pot.toml"

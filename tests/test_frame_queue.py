@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
 from drivers.camera.frame_queue import FrameQueue
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault

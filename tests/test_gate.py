@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from cell.devices.gate import Gate
-from cell.devices.interlocks import Command, Interlocks, Rule, Situation
+from cell.devices.gate.gate import Gate
+from cell.devices.gate.interlocks import Command, Interlocks, Rule, Situation
 from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken
 

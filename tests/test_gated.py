@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.config import load_config
+from cell.config.cell_config import load_config
 from cell.devices.devices import Devices
-from cell.devices.direct import VirtualCell
-from cell.devices.interlocks import Command, Rule, Situation
+from cell.devices.gate.interlocks import Command, Rule, Situation
+from cell.devices.simulated.direct import VirtualCell
 from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken

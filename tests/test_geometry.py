@@ -7,11 +7,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.geometry import poses
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane, closed_form, triangulate
-from cell.geometry.poses import from_parts, perturbed, transform
-from cell.geometry.seen import pose_equations, seen_points
+from cell.measure.geometry import poses
+from cell.measure.geometry.board_projection import pose_equations, seen_points
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane, closed_form, triangulate
+from cell.measure.geometry.poses import from_parts, perturbed, transform
 
 CAMERA = CameraModel(640, 480, 1666.0, 1670.0, 322.0, 236.0, (-0.12, 0.21, 1.1e-3, -0.7e-3, -0.05))
 THETA = np.arctan(3.5)

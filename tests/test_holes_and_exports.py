@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell.lab.bench.reconstruction_scenes import KINDS, Scene, cut_holes, scene
-from cell.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
-from cell.reconstruction.e57 import write_e57
-from cell.reconstruction.mesh import triangles, write_mesh
-from cell.reconstruction.outliers import find_outliers
-from cell.reconstruction.ply import deviation_colours, read_cloud
+from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
+from cell.measure.reconstruction.e57 import write_e57
+from cell.measure.reconstruction.mesh import triangles, write_mesh
+from cell.measure.reconstruction.outliers import find_outliers
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud
 from drivers.errors import ConfigError
+from lab.bench.reconstruction.scenes import KINDS, Scene, cut_holes, scene
 
 
 def z_of(made: Scene, filled: Filled) -> np.ndarray:

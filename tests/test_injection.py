@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from cell.devices.injection import Injection, Injector
-from cell.steps.kinds import PLACE
+from cell.devices.simulated.injection import Injection, Injector
+from cell.procedures.steps.kinds import PLACE
 from drivers.errors import ConfigError, DeviceFault
 from sim_backends.direct import faults as direct
 from sim_backends.faults import FAULT_NAMES

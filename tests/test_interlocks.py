@@ -14,20 +14,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import load_config
+from cell.config.cell_config import load_config
+from cell.config.job import job_path
 from cell.devices.devices import Devices
-from cell.devices.direct import VirtualCell
-from cell.devices.gated_laser import UNATTENDED_S
-from cell.devices.interlocks import Command
-from cell.devices.jogging import jog, parse_jog
-from cell.devices.rules import RULES, markdown
-from cell.devices.ways import LINE_STEP_RAD, Ways
-from cell.geometry.poses import from_parts, from_ur, to_ur
-from cell.job import job_path
+from cell.devices.gate.interlocks import Command
+from cell.devices.gate.laser import UNATTENDED_S
+from cell.devices.gate.rules import RULES, markdown
+from cell.devices.gate.ways import LINE_STEP_RAD, Ways
+from cell.devices.lock import CellLock
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.motion.arm_models import HOME
 from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
-from cell.run.lock import CellLock
-from cell.supervisor import Cell
+from cell.run.jogging import jog, parse_jog
+from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Laser

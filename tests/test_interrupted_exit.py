@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import typer
 
-from cell.cli.run import _perform
+from cell.apps.cli.commands.run import _perform
 from cell.run.job_run import RunOutcome
 from statemachine.watch import SignalInterrupt
 

@@ -14,18 +14,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.inversion.correspondences import Scan
-from cell.inversion.motions import name as motion_name
-from cell.inversion.motions import sorted_out
-from cell.inversion.registration import register
-from cell.lab.bench.inversion_parts import PARTS
-from cell.lab.bench.inversion_parts import nominal as part_surface
-from cell.lab.bench.inversion_refusals import judge_case
-from cell.lab.bench.inversion_scenes import Setting, scan
-from cell.reconstruction import Cloud, merge
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.motions import name as motion_name
+from cell.measure.inversion.motions import sorted_out
+from cell.measure.inversion.registration import register
+from cell.measure.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
+from lab.bench.inversion.parts import PARTS
+from lab.bench.inversion.parts import nominal as part_surface
+from lab.bench.inversion.refusals import judge_case
+from lab.bench.inversion.scenes import Setting, scan
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

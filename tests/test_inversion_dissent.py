@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.geometry.poses import difference
-from cell.inversion import Prior, invert_pose
-from cell.inversion.correspondences import Scan
-from cell.inversion.dissent import Dissent, dissent
-from cell.inversion.registration import register
-from cell.lab.bench.inversion import task
-from cell.lab.bench.inversion_parts import PARTS, nominal
-from cell.lab.bench.inversion_refusals import BOARD, TOLERANCE, judge_case
-from cell.lab.bench.inversion_scenes import TRUE, Setting, scan
-from cell.reconstruction import Cloud
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import Prior, invert_pose
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.disagreement import Dissent, dissent
+from cell.measure.inversion.registration import register
+from cell.measure.reconstruction import Cloud
+from lab.bench.inversion.campaign import task
+from lab.bench.inversion.parts import PARTS, nominal
+from lab.bench.inversion.refusals import BOARD, TOLERANCE, judge_case
+from lab.bench.inversion.scenes import TRUE, Setting, scan
 
 Array = NDArray[np.float64]
 POT = PARTS["pot"].height

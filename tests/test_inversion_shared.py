@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.geometry.poses import difference
-from cell.inversion import Prior, invert_pose
-from cell.inversion.correspondences import SIGMA_FLOOR, Scan
-from cell.inversion.registration import register
-from cell.inversion.shared import PATCH_M, shared_by_patches
-from cell.reconstruction import Cloud
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import Prior, invert_pose
+from cell.measure.inversion.correlated_errors import PATCH_M, shared_by_patches
+from cell.measure.inversion.correspondences import SIGMA_FLOOR, Scan
+from cell.measure.inversion.registration import register
+from cell.measure.reconstruction import Cloud
 from tests.test_inversion import BOARD, JOB, TRUE, ledges, nominal, scanned
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ def test_what_a_patch_shares_is_found_and_counts_for_what_few_patches_tell(size:
 
 def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch: pytest.MonkeyPatch) -> None:
     # Believed to the last point: the rule that leaves what few points tell to the board is another one.
-    monkeypatch.setattr("cell.inversion.observability.FEW", 0.0)
+    monkeypatch.setattr("cell.measure.inversion.observability.FEW", 0.0)
     found = invert_pose(uneven(15e-6), nominal(ledges), Prior(TRUE, BOARD), JOB)
     off = difference(found.base_from_surface, TRUE)
     assert (np.abs(off) < 3.0 * found.sigma).all()

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cell.devices.jogging import Jog, begin_program, needed_for, parse_jog
+from cell.run.jogging import Jog, begin_program, needed_for, parse_jog
 from drivers.errors import ConfigError, DeviceFault
 from drivers.interfaces import ArmSafety
 

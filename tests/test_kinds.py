@@ -11,12 +11,12 @@ from typing import Any, cast
 
 import pytest
 
-from cell.steps import kinds
-from cell.steps.kinds import PLACE, Kind, find_kind
-from cell.steps.photograph import BoardFix
-from cell.steps.place import PlaceResult
-from cell.steps.step import JobStep
-from cell.steps.workplace import Workplace
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.steps import kinds
+from cell.procedures.steps.kinds import PLACE, Kind, find_kind
+from cell.procedures.steps.place import PlaceResult
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from statemachine.journal import Journal, read

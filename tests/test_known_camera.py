@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.calibration.recorded.known_camera import read_camera
-from cell.calibration.recorded.solution import camera_of
-from cell.calibration.solve.intrinsics import choose_lens
-from cell.geometry.camera import CameraModel
-from cell.storage import sealed, write_json
+from cell.apps.recordings.known_camera import read_camera
+from cell.apps.recordings.solution import camera_of
+from cell.base.storage import sealed, write_json
+from cell.measure.calibration.solve.intrinsics import choose_lens
+from cell.measure.geometry.camera import CameraModel
 from drivers.errors import ConfigError, RefusedError
 from tests import recorded_scenes
 from tests.recorded_scenes import LENS, MATRIX, SIZE, scene

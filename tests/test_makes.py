@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import CellConfig, default_toml, load_config
+from cell.config.cell_config import CellConfig, default_toml, load_config
 from cell.devices.assembly import connect_one, safe_off_outputs
-from cell.devices.built_in import BUILT_IN, TmclRailConfig
-from cell.devices.make import KINDS
-from cell.devices.makes import installed
-from cell.devices.simulated import with_endpoints
+from cell.devices.simulated.process import with_endpoints
+from cell.makes.built_in import BUILT_IN, TmclRailConfig
+from cell.makes.make import KINDS
+from cell.makes.table import installed
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Rail
@@ -24,8 +24,8 @@ from tests.packages import RAIL, install, with_acme_rail
 
 TWIN = """
 from typing import Literal
-from cell.devices.built_in import BUILT_IN, TmclRailConfig
-from cell.devices.make import Make
+from cell.makes.built_in import BUILT_IN, TmclRailConfig
+from cell.makes.make import Make
 
 class TwinConfig(TmclRailConfig):
     driver: Literal["twin"] = "twin"
@@ -94,8 +94,8 @@ def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(sit
 
 BEAM = """
 from typing import Literal
-from cell.devices.built_in import BUILT_IN, ArmOutputLaserConfig
-from cell.devices.make import Make
+from cell.makes.built_in import BUILT_IN, ArmOutputLaserConfig
+from cell.makes.make import Make
 
 class BeamConfig(ArmOutputLaserConfig):
     driver: Literal["beam"] = "beam"
@@ -192,7 +192,7 @@ def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_pat
     install(site, "lost", "0.0.1", "camera = lost:MAKE\nsonar.ping = lost:MAKE", lost="")
     path = os.pathsep.join((str(site), *sys.path))
     done = subprocess.run(
-        [sys.executable, "-c", "from cell.cli import main; main()", "devices", "--json"],
+        [sys.executable, "-c", "from cell.apps.cli import main; main()", "devices", "--json"],
         env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -204,9 +204,9 @@ def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_pat
 
 ARM = """
 from typing import Annotated, Literal
-from cell.device_config import ArmConfig
-from cell.devices.built_in import UrArmConfig
-from cell.devices.make import Make
+from cell.makes.records import ArmConfig
+from cell.makes.built_in import UrArmConfig
+from cell.makes.make import Make
 from drivers.interfaces import LinkStatistics
 
 

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from test_reconstruction import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
 
-from cell.geometry.poses import from_ur, to_ur
-from cell.motion.track import FlangeTrack
-from cell.reconstruction import (
+from cell.measure.geometry.poses import from_ur, to_ur
+from cell.measure.reconstruction import (
     Cloud,
     ProfileBuilder,
     calibration_motions,
@@ -21,7 +20,8 @@ from cell.reconstruction import (
     lean_motions,
     merge,
 )
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.extract import StripeProfile
+from cell.motion.track import FlangeTrack
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState

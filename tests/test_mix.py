@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from cell import Cell
-from cell.config import DEVICES, default_toml, load_config
-from cell.devices.mix import beware, followed, named, require_possible
-from cell.report.figures import following_words
+from cell.config.cell_config import DEVICES, default_toml, load_config
+from cell.devices.simulated.mix import beware, followed, named, require_possible
+from cell.run.report.figures import following_words
 from drivers.errors import ConfigError
 
 CONFIG = load_config(None)
@@ -100,7 +100,7 @@ def test_an_unknown_device_in_the_configuration_is_refused(tmp_path) -> None:
 
 
 def test_real_devices_of_any_make_can_be_drawn_beside_simulated_ones() -> None:
-    from cell.devices.described import Described
+    from cell.devices.simulated.described import Described
 
     camera = CONFIG.target_camera.model_copy(update={"driver": "v4l2"})
     bought, pot = CONFIG.model_copy(update={"target_camera": camera}), Described.of("pot")

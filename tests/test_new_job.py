@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+from cell.apps.new_job.answers import laid_mesh
+from cell.apps.new_job.make import Made, make_job
+from cell.apps.new_job.mesh_file import read_drawing
+from cell.apps.new_job.questions import Asker, checked
+from cell.apps.new_job.surface import lay, open_side
+from cell.apps.new_job.units import told_by_size
 from cell.check.fit import require_fit
-from cell.config import load_config
-from cell.job import SurfaceSection, load_job
-from cell.new_job.answers import laid_mesh
-from cell.new_job.make import Made, make_job
-from cell.new_job.mesh_file import read_drawing
-from cell.new_job.questions import Asker, checked
-from cell.new_job.surface import lay, open_side
-from cell.new_job.units import told_by_size
+from cell.config.cell_config import load_config
+from cell.config.job import SurfaceSection, load_job
 from drivers.errors import ConfigError, NotObservable, RefusedError
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ def test_a_surface_that_repeats_itself_is_refused_by_its_pitch(tmp_path: Path) -
 
 
 def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cell.new_job.questions.PROGRESS_S", 0.0)
+    monkeypatch.setattr("cell.apps.new_job.questions.PROGRESS_S", 0.0)
     told: list[str] = []
     mesh = str(relief(tmp_path / "wave.stl", lambda x, y: 6 + 2 * np.sin(x / 6)))
     with pytest.raises(NotObservable):

@@ -13,19 +13,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.recorded.frames import RecordedFrame
-from cell.calibration.recorded.result import empty_result
-from cell.calibration.recorded.solution import agreeing, camera_of, solve_frames
-from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import HAND
-from cell.calibration.solve.board_shape import moved_by_bend
-from cell.calibration.solve.camera_checks import camera_checks
-from cell.calibration.solve.choice import choose_solution, with_doubt_of_camera
-from cell.calibration.solve.foreign import foreign_view, own_cameras
-from cell.calibration.solve.intrinsics import choose_lens
-from cell.calibration.solve.joint import solve_staged, start_state, view_data
-from cell.geometry.camera import CameraModel
+from cell.apps.recordings.frames import RecordedFrame
+from cell.apps.recordings.result import empty_result
+from cell.apps.recordings.solution import agreeing, camera_of, solve_frames
+from cell.measure.calibration.judge.board_shape import moved_by_bend
+from cell.measure.calibration.judge.camera_checks import camera_checks
+from cell.measure.calibration.judge.foreign_pictures import foreign_view, own_cameras
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.blocks import HAND
+from cell.measure.calibration.solve.choice import choose_solution, with_doubt_of_camera
+from cell.measure.calibration.solve.intrinsics import choose_lens
+from cell.measure.calibration.solve.joint import solve_staged, start_state, view_data
+from cell.measure.geometry.camera import CameraModel
 from drivers.errors import RefusedError
 from tests.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
 

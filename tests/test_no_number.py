@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.inversion import Demands, Tolerance
-from cell.inversion.demands import require_agreement, require_board, require_fit
-from cell.inversion.moved import SurfaceMotion
-from cell.inversion.rocking import require_firm
-from cell.job import load_job
-from cell.steps.photograph import _require
-from cell.steps.second_look import require_unmoved
-from cell.steps.swath import SweepErrors, TimeBound, shift_by_times
+from cell.config.job import load_job
+from cell.measure.inversion import Demands, Tolerance
+from cell.measure.inversion.demands import require_agreement, require_board, require_fit
+from cell.measure.inversion.effects.moved import SurfaceMotion
+from cell.measure.inversion.effects.rocking import require_firm
+from cell.procedures.arm.photograph import _require
+from cell.procedures.sweep.second_look import require_unmoved
+from cell.procedures.sweep.swath import SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault, RefusedError
 
 ONE, ALLOWED = np.eye(6), Demands()

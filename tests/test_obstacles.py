@@ -8,21 +8,21 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import CellConfig, default_toml, load_config
-from cell.device_config import Pose
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_parts, from_ur
-from cell.inversion import NominalSurface
-from cell.job import Job, load_job
+from cell.config.cell_config import CellConfig, default_toml, load_config
+from cell.config.job import Job, load_job
+from cell.config.obstacles import StationObstacle
+from cell.devices.simulated.direct import VirtualCell
+from cell.makes.records import Pose
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.inversion import NominalSurface
+from cell.measure.vision import parse_board
 from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
 from cell.motion.trajectory import Trajectory
-from cell.obstacles import StationObstacle
-from cell.steps.approach import Planar
-from cell.steps.moves import Mover
-from cell.steps.way import Upright, Way
-from cell.steps.whereabouts import Whereabouts
-from cell.vision import parse_board
+from cell.procedures.arm.moves import Mover
+from cell.procedures.drive.approach import Planar
+from cell.procedures.drive.way import Upright, Way
+from cell.procedures.drive.whereabouts import Whereabouts
 from drivers.errors import ConfigError, InterlockError, RefusedError
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 

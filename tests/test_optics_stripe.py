@@ -22,7 +22,7 @@ from sim_backends.optics import (
     expected_image,
     render,
 )
-from sim_backends.optics.stripe import crossings
+from sim_backends.optics.laser.stripe import crossings
 
 FOCAL_PX = 8e-3 / 4.8e-6
 LENS = (-0.08, 0.03, 4e-4, -3e-4, 0.01)

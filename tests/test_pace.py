@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_parts, from_ur
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.arm_models import HOME
-from cell.run.pace import LEAST, Pace
-from cell.steps.drive_to_target import drive_to_target
-from cell.steps.moves import Mover
+from cell.procedures.arm.moves import Mover
+from cell.procedures.pace import LEAST, Pace
+from cell.procedures.steps.drive_to_target import drive_to_target
 from drivers.errors import ConfigError
 from tests.test_whereabouts import JOB, VEHICLE_FROM_BASE, Site
 

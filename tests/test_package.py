@@ -12,7 +12,7 @@ import pytest
 import typer
 
 import cell
-from cell.cli import main
+from cell.apps.cli import main
 from drivers import errors
 
 
@@ -27,7 +27,7 @@ def test_every_error_of_the_tree_is_in_the_package() -> None:
 
 
 def test_an_error_is_imported_without_the_devices() -> None:
-    code = "import sys; from cell import RefusedError; assert 'cell.supervisor' not in sys.modules"
+    code = "import sys; from cell import RefusedError; assert 'cell.run.session.supervisor' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -38,7 +38,7 @@ import atexit, sys
 heavy = {"numpy", "cv2", "pinocchio", "scipy", "numba", "transitions"}
 atexit.register(lambda: print("loaded:", *sorted(heavy & set(sys.modules))))
 sys.argv = ["cell", *sys.argv[1:]]
-from cell.cli import main
+from cell.apps.cli import main
 main()
 """
     run = tmp_path / "runs" / "20260101T000000-abcd"
@@ -84,7 +84,7 @@ def test_commands_of_a_broken_package_do_not_take_the_others_with_them(tmp_path:
     if (text := MODULES[module]) is not None:
         (tmp_path / f"{module}.py").write_text(text)
     done = subprocess.run(
-        [sys.executable, "-c", "from cell.cli import main; main()", "abort", "--help"],
+        [sys.executable, "-c", "from cell.apps.cli import main; main()", "abort", "--help"],
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])},

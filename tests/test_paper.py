@@ -6,17 +6,18 @@ import json
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
-from cell.cli.app import app
-from cell.geometry.light_plane import closed_form
-from cell.lab.paper import equations as eq
-from cell.lab.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
-from cell.lab.paper.equation_table import equation_table
-from cell.lab.paper.figure2 import figure2, smallest_baseline
-from cell.lab.paper.traced import light_point, oblique_image
+from cell.measure.geometry.light_plane import closed_form
+from lab.cli import register
+from lab.paper import equations as eq
+from lab.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
+from lab.paper.equation_table import equation_table
+from lab.paper.figure2 import figure2, smallest_baseline
+from lab.paper.traced import light_point, oblique_image
 from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
-from sim_backends.optics.stripe import crossings
+from sim_backends.optics.laser.stripe import crossings
 
 # --- Figure 2 ---
 
@@ -140,6 +141,9 @@ def test_the_tilt_in_focus_images_the_beam_sharply() -> None:
 
 
 # --- commands ---
+
+app = typer.Typer()
+register(app)
 
 
 def test_commands_print_json_alone_and_keep_numbers_and_pictures(tmp_path) -> None:

@@ -6,12 +6,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.geometry.poses import from_parts
-from cell.lab.bench.over_cores import run_all
-from cell.lab.paper import solved
-from cell.lab.paper.rig import RigSpec, dot_centres, draw_head
-from cell.lab.paper.spoiled import spoil
-from cell.lab.paper.table1 import SPEC, one_seed
+from cell.measure.geometry.poses import from_parts
+from lab.bench.over_cores import run_all
+from lab.paper import solved
+from lab.paper.rig import RigSpec, dot_centres, draw_head
+from lab.paper.spoiled import spoil
+from lab.paper.table1 import SPEC, one_seed
 from sim_backends.optics import Board
 
 
@@ -45,7 +45,7 @@ def test_outliers_of_every_kind_are_found(run) -> None:
 
 
 def test_outliers_are_put_in_at_the_share_asked_for() -> None:
-    from cell.lab.paper.rig import Sweep
+    from lab.paper.rig import Sweep
 
     centres = np.full((60, 480), 300.0)
     sweep = Sweep(centres, np.zeros(60), np.zeros((60, 480, 3)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world.contact import PartContact
-from sim_backends.world.surfaces import Surface
+from sim_backends.world.bodies.contact import PartContact
+from sim_backends.world.bodies.surfaces import Surface
 
 Floats = NDArray[np.float64]
 

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration.store import TargetCalibration
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_matrix, from_parts
-from cell.job import PhotoSection, load_job
+from cell.config.calibrations.store import TargetCalibration
+from cell.config.cell_config import load_config
+from cell.config.job import PhotoSection, load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.vision import parse_board
 from cell.motion.arm_models import HOME
-from cell.steps.camera_poses import look_pose
-from cell.steps.moves import Mover
-from cell.steps.photograph import BoardFix, photograph
-from cell.steps.workplace import PHOTO_RATE_HZ
-from cell.vision import parse_board
+from cell.procedures.arm.camera_poses import look_pose
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import BoardFix, photograph
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
 from sim_backends.world.nominal import inverse
 from tests.test_stored_calibration import made

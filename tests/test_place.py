@@ -9,26 +9,26 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_matrix, from_parts, from_ur
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.lab.bench.whole_job import NoFrames
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix, from_parts, from_ur
+from cell.measure.inversion import NominalSurface
+from cell.measure.vision import parse_board
 from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.part import PartProgress, PartState
+from cell.procedures.arm.touch import Touch
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.steps import drive_to_target
+from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.place import PlaceResult, place
+from cell.procedures.steps.workplace import Workplace
 from cell.run.resumption import UnfinishedRun
-from cell.steps import drive_to_target
-from cell.steps.kinds import PLACE
-from cell.steps.moves import Mover
-from cell.steps.part import PartProgress, PartState
-from cell.steps.place import PlaceResult, place
-from cell.steps.touch import Touch
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
-from cell.vision import parse_board
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
+from lab.bench.job.whole_job import NoFrames
 from sim_backends.world.nominal import inverse
 from statemachine.journal import Journal
 from statemachine.policy import OnFailure

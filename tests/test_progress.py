@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.cli.progress import ProgressDisplay, kept_loops
+from cell.apps.cli.progress import ProgressDisplay, kept_loops
 from statemachine.step import Event
 
 LONG = "arm: it stopped [C153] because points came 15 ms late: this computer is too busy"
@@ -53,7 +53,7 @@ def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("cell.cli.progress.LOOK_S", 0.01)
+    monkeypatch.setattr("cell.apps.cli.progress.LOOK_S", 0.01)
     told: list[str] = []
     monkeypatch.setattr(ProgressDisplay, "_show", lambda self, step, fraction, text: told.append(f"{step} {text}"))
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
@@ -80,7 +80,7 @@ def said(text, err=False):
     raise SystemExit
 typer.echo = said
 sys.argv = ["cell", "dry-run"]
-from cell.cli import main
+from cell.apps.cli import main
 main()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

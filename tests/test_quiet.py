@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.lab.bench.whole_job import JobRecord
-from cell.steps.board_photo import WAIT_S, WAITS, until_quiet
-from cell.steps.photograph import BoardFix
-from cell.steps.quiet import APART_S, swing
-from cell.vision import BoardView, parse_board
+from cell.measure.vision import BoardView, parse_board
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.settled import APART_S, swing
+from cell.procedures.steps.board_photo import WAIT_S, WAITS, until_quiet
 from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord
 
 BOARD = parse_board("chessboard:9x7:20mm")
 FOCAL, AWAY, NOISE = 1667.0, 0.9, 0.05

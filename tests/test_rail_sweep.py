@@ -12,27 +12,27 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.store import nominal_camera
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.devices.gated_laser import UNATTENDED_S
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_ur
-from cell.job import ScanSection, load_job
-from cell.lab.bench.whole_job import NoFrames
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import load_config
+from cell.config.job import ScanSection, load_job
+from cell.devices.gate.laser import UNATTENDED_S
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_ur
+from cell.measure.reconstruction import ScanGeometry
 from cell.motion.arm_models import HOME
-from cell.reconstruction import ScanGeometry
-from cell.steps.camera_poses import ScanPlan
-from cell.steps.frame_times import step_of_clock
-from cell.steps.laser_sweep import UNCHECKED, _home, laser_sweep
-from cell.steps.moves import Mover
-from cell.steps.rail_sweep import rail_sweep
-from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
+from cell.procedures.arm.camera_poses import ScanPlan
+from cell.procedures.arm.moves import Mover
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.steps.laser_sweep import UNCHECKED, _home, laser_sweep
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.frame_times import step_of_clock
+from cell.procedures.sweep.rail_sweep import rail_sweep
+from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame, Motion, Rail, RailState
+from lab.bench.job.whole_job import NoFrames
 
 CONFIG = load_config(None)
 SCAN = load_job("pot")[0].scan.model_copy(update={"length": 0.02, "speed": 0.02, "frame_rate": 20.0})

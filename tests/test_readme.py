@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import typer
 
-from cell.cli.app import app
-from cell.steps.kinds import PLACE
+from cell.apps.cli.app import app
+from cell.procedures.steps.kinds import PLACE
 from statemachine.sequence import mermaid
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")

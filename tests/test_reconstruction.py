@@ -11,9 +11,9 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.reconstruction import (
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.reconstruction import (
     Cloud,
     ProfileBuilder,
     ScanGeometry,
@@ -22,8 +22,8 @@ from cell.reconstruction import (
     outliers,
     write_ply,
 )
-from cell.reconstruction.outliers import find_outliers
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.reconstruction.outliers import find_outliers
+from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
 Array = NDArray[np.float64]

@@ -23,26 +23,26 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from cell.cli import main
-from cell.cli import record as record_command
-from cell.devices.direct import VirtualCell
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction.ply import read_cloud
-from cell.record import file as record_file
-from cell.record import recorder
-from cell.record.channels import BY_TOPIC, CHANNELS
-from cell.record.export import as_candump, as_text
-from cell.record.file import RecordFile
-from cell.record.information import information
-from cell.record.perception import FILE as PERCEPTION
-from cell.record.reading import messages
-from cell.record.repair import repair
-from cell.record.replay import replay
-from cell.record.words import as_json, rtde, wire
+from cell.apps.cli import main
+from cell.apps.cli.commands import record as record_command
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.reconstruction.ply import read_cloud
+from cell.run.record import file as record_file
+from cell.run.record import recorder
+from cell.run.record.channels import BY_TOPIC, CHANNELS
+from cell.run.record.export import as_candump, as_text
+from cell.run.record.file import RecordFile
+from cell.run.record.information import information
+from cell.run.record.perception import FILE as PERCEPTION
+from cell.run.record.reading import messages
+from cell.run.record.repair import repair
+from cell.run.record.replay import replay
+from cell.run.record.words import as_json, rtde, wire
 from cell.run.run import Run
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink
+from lab.bench.job.whole_job import JobRecord
 from tests.report_runs import CONFIG
 
 Messages = dict[str, list[tuple[int, Any]]]
@@ -324,7 +324,7 @@ def test_what_is_no_record_is_left_as_it_is(tmp_path: Path) -> None:
 KILLED = """
 import sys, time
 from pathlib import Path
-from cell.record.file import RecordFile
+from cell.run.record.file import RecordFile
 out = RecordFile(Path(sys.argv[1]), {"run": "r"}, lossless=False)
 for k in range(10_000):
     out.put("/sequence/event", k, lambda: b"{}")
@@ -517,7 +517,7 @@ def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(
 
 def test_a_picture_of_the_record_that_is_not_the_file_is_found(folder: Path, tmp_path: Path) -> None:
     """Without the rest of perception: the run's folder has no pictures here."""
-    from cell.record.replay import _pictures
+    from cell.run.record.replay import _pictures
 
     (tmp_path / "frames").mkdir()
     shutil.copy(folder / "record.mcap", tmp_path)
@@ -557,7 +557,7 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
 
 
 def test_the_documentation_lists_the_channels() -> None:
-    from cell.record.channels import table
+    from cell.run.record.channels import table
 
     text = (Path(__file__).parents[1] / "docs" / "record.md").read_text(encoding="utf-8")
     assert table() in text

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.calibration.collect.boards import collect_scan, look_for
-from cell.config import load_config
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
 from cell.devices.devices import Devices
-from cell.devices.direct import VirtualCell
-from cell.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.vision import parse_board
 from cell.motion.arm_models import HOME
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.boards import collect_scan, look_for
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.steps.moves import Mover
-from cell.vision import parse_board
 from drivers.camera.folder import read_image
 from drivers.errors import RefusedError
 

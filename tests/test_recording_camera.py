@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.config import default_toml, load_config
+from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect, connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.camera import CameraContract
-from cell.devices.make import Surroundings
-from cell.devices.makes import installed, make_of
+from cell.makes.make import Surroundings
+from cell.makes.table import installed, make_of
 from drivers.camera.genicam import aravis
 from drivers.camera.recording import RecordedCamera
 from drivers.camera.v4l2_pictures import Timing, to_grey

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cell.calibration.recorded import frames as recorded_frames
-from cell.calibration.recorded.attach import Options, attach_poses
-from cell.calibration.recorded.command import calibrate_folder
-from cell.calibration.recorded.conventions import TRIED, check_reading
-from cell.calibration.recorded.frames import RecordedFrame, read_frames
-from cell.calibration.recorded.series import in_order_of_views, list_folder, match_series, read_series
-from cell.calibration.recorded.solution import agreeing
-from cell.geometry.camera import CameraModel
-from cell.vision import Laser, parse_board, read_colours
-from cell.vision.board.board import find_board
-from cell.vision.pictures import read_picture
+from cell.apps.recordings import frames as recorded_frames
+from cell.apps.recordings.attach import Options, attach_poses
+from cell.apps.recordings.command import calibrate_folder
+from cell.apps.recordings.conventions import TRIED, check_reading
+from cell.apps.recordings.frames import RecordedFrame, read_frames
+from cell.apps.recordings.series import in_order_of_views, list_folder, match_series, read_series
+from cell.apps.recordings.solution import agreeing
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.vision import Laser, parse_board, read_colours
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.pictures import read_picture
 from drivers.errors import ConfigError
 
 BOARD = parse_board("chessboard:7x5:20mm")

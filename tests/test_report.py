@@ -15,18 +15,18 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
-from cell.job import SwathSection
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from cell.reconstruction.ply import read_cloud
-from cell.report.bound import stated_bound
-from cell.report.panels import SurfacePanel, draw_surface
-from cell.report.report import strict
-from cell.run.folder import write_json
-from cell.run.frames import FrameStore
+from cell.config.job import SwathSection
+from cell.measure.reconstruction.ply import read_cloud
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.part_error import stated_bound
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.run.files.folder import write_json
 from cell.run.job_run import RunOutcome
-from cell.steps.reconstruct import Reconstruction
+from cell.run.report.panels import SurfacePanel, draw_surface
+from cell.run.report.report import strict
 from drivers.errors import CellError, Measured, RefusedError
 from drivers.interfaces import Frame
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests import report_runs
 from tests.report_runs import CONFIG, Ended, Ends, Make, pot
 

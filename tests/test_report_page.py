@@ -15,16 +15,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cell.cli.app import app
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction.ply import write_cloud
-from cell.report.page.make import MOST_BYTES, make_page, write_page
-from cell.report.page.maps import MOST_POINTS
-from cell.report.page.timeline import timeline, timeline_svg
-from cell.report.page.trend import past_runs
-from cell.run.folder import write_json
-from cell.steps.reconstruct import Reconstruction
+from cell.apps.cli.app import app
+from cell.measure.reconstruction.ply import write_cloud
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.run.files.folder import write_json
+from cell.run.report.page.make import MOST_BYTES, make_page, write_page
+from cell.run.report.page.maps import MOST_POINTS
+from cell.run.report.page.timeline import timeline, timeline_svg
+from cell.run.report.page.trend import past_runs
 from drivers.errors import CellError
+from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import Journal
 from tests import report_runs
 from tests.report_runs import Ended, Ends, pot

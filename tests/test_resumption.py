@@ -17,24 +17,24 @@ import pytest
 from test_rail_sweep import CONFIG, sweep
 from test_stored_calibration import made
 
-from cell.calibration.slip import Slip
-from cell.calibration.witness import Pointing
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_parts
-from cell.job import load_job
-from cell.lab.bench.whole_job import NoFrames
-from cell.run.folder import is_going
-from cell.run.frames import FrameStore
-from cell.run.reading import run_row
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.calibration.drift.slip import Slip
+from cell.measure.geometry.poses import from_parts
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps.laser_sweep import STEP, SweepRecord
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep import stored_sweep
+from cell.procedures.sweep.stored_sweep import FILE, StoredSweep, save_sweep
+from cell.run.files.folder import is_going
+from cell.run.files.reading import run_row
 from cell.run.resumption import UnfinishedRun, job_hash
-from cell.steps import stored_sweep
-from cell.steps.laser_sweep import STEP, SweepRecord
-from cell.steps.photograph import BoardFix
-from cell.steps.stored_sweep import FILE, StoredSweep, save_sweep
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
 from drivers.errors import CalibrationStale, ConfigError, InterlockError, RefusedError
 from drivers.interfaces import Frame
+from lab.bench.job.whole_job import NoFrames
 from statemachine.journal import FILE_NAME, Journal
 from statemachine.step import Event, StepContext
 

@@ -9,15 +9,21 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.geometry.poses import difference
-from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.inversion.rocking import LARGEST_RAD, Rocking, find_rocking, rocking_covariance, rocking_motions
-from cell.job import load_job
-from cell.reconstruction.cloud import Cloud, merge
-from cell.steps.invert_pose import Lines
-from cell.steps.invert_pose import invert_pose as step
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction
+from cell.config.job import load_job
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.measure.inversion.effects.rocking import (
+    LARGEST_RAD,
+    Rocking,
+    find_rocking,
+    rocking_covariance,
+    rocking_motions,
+)
+from cell.measure.reconstruction.cloud import Cloud, merge
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import invert_pose as step
+from cell.procedures.steps.reconstruct import Reconstruction
 from drivers.errors import RefusedError
 
 JOB, MESH = load_job("pot")

@@ -13,9 +13,9 @@ import pinocchio as pin
 import pytest
 
 from cell.devices.contact import GuardedMotion
-from cell.devices.interlocks import Command, Interlocks, Situation
-from cell.devices.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
-from cell.geometry.poses import to_ur
+from cell.devices.gate.interlocks import Command, Interlocks, Situation
+from cell.devices.gate.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
+from cell.measure.geometry.poses import to_ur
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, VehicleState

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.cli.runs import abort
-from cell.config import CellConfig, default_toml, load_config
-from cell.run.folder import find_going, find_run, is_going, list_runs, new_run, write_json
-from cell.run.lock import CellLock, _name
-from cell.run.reading import Question, awaited_word, read_report, run_row
-from cell.storage import sealed
+from cell.apps.cli.commands.runs import abort
+from cell.base.storage import sealed
+from cell.config.cell_config import CellConfig, default_toml, load_config
+from cell.devices.lock import CellLock, _name
+from cell.run.files.folder import find_going, find_run, is_going, list_runs, new_run, write_json
+from cell.run.files.reading import Question, awaited_word, read_report, run_row
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.journal import Journal
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
 from cell.devices.stopping import require_healthy, require_no_emergency_stop, stop_cell
 from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, DeviceFault

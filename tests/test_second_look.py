@@ -14,21 +14,21 @@ import pinocchio as pin
 import pytest
 from scipy.stats import chi2
 
-import cell.steps.place as place_step
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import difference
-from cell.inversion import NominalSurface, PlacePose
-from cell.inversion.moved import SurfaceMotion, surface_motion
-from cell.job import Job
-from cell.lab.bench.scan_errors import own_base
-from cell.lab.bench.whole_job import JobRecord, NoFrames, run_whole_job
-from cell.reconstruction import Cloud, flange_motions, merge
-from cell.reconstruction.cloud import Filled
-from cell.steps.kinds import PLACE
-from cell.steps.second_look import LINES, SecondLook, require_in_place, require_points, sparse
-from cell.steps.swath import MAX_LOST_FRACTION
-from cell.steps.touch import felt_touch
+from cell.config.job import Job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion.effects.moved import SurfaceMotion, surface_motion
+from cell.measure.reconstruction import Cloud, flange_motions, merge
+from cell.measure.reconstruction.cloud import Filled
+from cell.procedures.arm.touch import felt_touch
+from cell.procedures.steps import place as place_step
+from cell.procedures.steps.kinds import PLACE
+from cell.procedures.sweep.second_look import LINES, SecondLook, require_in_place, require_points, sparse
+from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
+from lab.bench.job.scan_errors import own_base
+from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
 from sim_backends.world.world import World
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext

@@ -12,16 +12,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cell.calibration.solve.adjustment import Adjustment, Priors
-from cell.calibration.solve.blocks import PLANE
-from cell.calibration.solve.joint import Joint, solve_joint, solve_staged
-from cell.calibration.solve.one_more import one_more
-from cell.calibration.solve.results import ScanCalibration
-from cell.calibration.store import nominal_camera
-from cell.config import load_config
-from cell.geometry.light_plane import LightPlane
-from cell.lab.bench.calibration import observe
-from cell.lab.bench.calibration_world import HeadWorld, Noise, draw_head
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import load_config
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors
+from cell.measure.calibration.solve.blocks import PLANE
+from cell.measure.calibration.solve.extra_parameter import one_more
+from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
+from cell.measure.calibration.solve.results import ScanCalibration
+from cell.measure.geometry.light_plane import LightPlane
+from lab.bench.calibration.campaign import observe
+from lab.bench.calibration.world import HeadWorld, Noise, draw_head
 
 NOISE = Noise()
 BESIDE, DEPTH = 0.018, 0.130

@@ -10,9 +10,9 @@ import pytest
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.rtde_registers import Registers
-from sim_backends.peers.script import ControlProgram, RuntimeState
-from sim_backends.peers.script_port import robot_mode, robot_state, version_message
+from sim_backends.peers.arm.rtde.registers import Registers
+from sim_backends.peers.arm.script.port import robot_mode, robot_state, version_message
+from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
 
 TICK = 0.002
 GOAL = [1.0, -1.57, -1.57, -1.57, 1.57, 0.0]

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration.collect.edge import SPEED, look_at_edge, require_edge
-from cell.calibration.collect.witness import require_witness
-from cell.calibration.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
-from cell.calibration.witness import Witness
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.steps.laser_sweep import unwatched
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.drift.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.procedures.calibrate.edge import SPEED, look_at_edge, require_edge
+from cell.procedures.calibrate.reference_plate import require_witness
+from cell.procedures.steps.laser_sweep import unwatched
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame
 

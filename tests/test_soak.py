@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from cell.lab.bench.soak import MOST_GROWTH, counted, growth_of, verdict
-from drivers.arm.ur_streaming import pace_of
+from drivers.arm.child.streaming import pace_of
+from lab.bench.wires.soak import MOST_GROWTH, counted, growth_of, verdict
 
 
 def rows(memory: list[float], handles: list[float]) -> list[dict[str, object]]:

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_parts
-from cell.inversion.standing import Standing, highest_standing, require_bare
-from cell.lab.bench.whole_job import JobRecord, NoFrames
-from cell.reconstruction import Cloud
-from cell.steps.kinds import PLACE
-from cell.steps.place import STEP
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion.obstruction import Standing, highest_standing, require_bare
+from cell.measure.reconstruction import Cloud
+from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.place import STEP
 from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.runner import StepContext
 from tests.report_runs import CONFIG, at_station, pot, work_of
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell.new_job.mesh_file import read_drawing
+from cell.apps.new_job.mesh_file import read_drawing
 
 
 def step_of(box: trimesh.Trimesh, unit: str) -> str:

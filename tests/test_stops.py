@@ -10,14 +10,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration.recorded.agreement import decide
-from cell.calibration.recorded.frames import RecordedFrame
-from cell.calibration.recorded.pairs import calibrate_pairs, read_pose_pairs
-from cell.calibration.recorded.series import Series
-from cell.calibration.recorded.texts import Record
-from cell.calibration.solve.consistency import odd_turns
-from cell.geometry.camera import CameraModel
-from cell.vision.board.board import board_pose
+from cell.apps.recordings.agreement import decide
+from cell.apps.recordings.consistency import odd_turns
+from cell.apps.recordings.frames import RecordedFrame
+from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
+from cell.apps.recordings.series import Series
+from cell.apps.recordings.texts import Record
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.vision.board.board import board_pose
 from drivers.errors import ConfigError
 from tests.recorded_scenes import BOARD, DOTS_PX, FLANGE_FROM_CAMERA, LENS, MATRIX, SIZE, scene
 from tests.test_no_confident_wrong_answer import right, solved

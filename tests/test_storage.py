@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from cell.cli import LEAST_MEMORY_B
-from cell.storage import read_json, replacing, sealed, write_json
+from cell.apps.cli import LEAST_MEMORY_B
+from cell.base.storage import read_json, replacing, sealed, write_json
 from drivers.errors import CellError
 
 FULL = """
 import resource, signal, sys
 from pathlib import Path
-from cell.storage import write_json
+from cell.base.storage import write_json
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
 try:
@@ -56,7 +56,7 @@ def test_a_digest_is_of_what_is_said_and_not_of_the_names_and_dates_of_a_run() -
 
 
 def cell(*arguments: str, folder: Path, how: str = "exec", **limits: int) -> subprocess.CompletedProcess[str]:
-    line = f'{how} {sys.executable} -c "from cell.cli import main; main()" {" ".join(arguments)}'
+    line = f'{how} {sys.executable} -c "from cell.apps.cli import main; main()" {" ".join(arguments)}'
 
     def limit() -> None:
         for name, value in limits.items():
@@ -82,7 +82,7 @@ RUN = """
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from cell.cli.run import _perform
+from cell.apps.cli.commands.run import _perform
 from cell.run.job_run import RunOutcome
 _perform(lambda: nullcontext(), lambda cell, display: RunOutcome("placed", "", Path("r1"), {"x": 1}), True, False)
 """

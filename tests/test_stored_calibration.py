@@ -11,12 +11,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration import ScanCalibration, TargetCalibration
-from cell.calibration.archive import _pose
-from cell.calibration.finding import find_calibration
-from cell.calibration.sessions import marked, serial_numbers
-from cell.calibration.solve.results import KEPT, Quality
-from cell.calibration.store import (
+from cell.config.calibrations.finding import find_calibration
+from cell.config.calibrations.store import (
     CalibrationEdited,
     CellCalibration,
     accept_calibration,
@@ -24,11 +20,15 @@ from cell.calibration.store import (
     read_calibration,
     save_calibration,
 )
-from cell.calibration.validation import require_as_configured
-from cell.calibration.witness import ConfirmedTurn, Witness
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.light_plane import LightPlane
+from cell.config.calibrations.validation import require_as_configured
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration import ScanCalibration, TargetCalibration
+from cell.measure.calibration.archive import _pose
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Witness
+from cell.measure.calibration.solve.results import KEPT, Quality
+from cell.measure.geometry.light_plane import LightPlane
+from cell.run.calibration import marked, serial_numbers
 from drivers.errors import CalibrationStale, ConfigError, NotConnectedError
 
 DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.lab.bench.stripe_truth import Cell
-from cell.lab.bench.stripe_truth import draw as drawn
-from cell.vision.stripe.extract import StripeSettings, extract
+from cell.measure.vision.stripe.extract import StripeSettings, extract
+from lab.bench.stripe.truth import Cell
+from lab.bench.stripe.truth import draw as drawn
 
 RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HEIGHT, WIDTH = 480, 640

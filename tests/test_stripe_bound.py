@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.lab.bench.stripe_accuracy import measure
-from cell.lab.bench.stripe_truth import Cell, bound, draw
-from cell.vision.pictures import PictureRefused
-from cell.vision.stripe.extract import StripeSettings, extract
-from cell.vision.stripe.neighbours import widen_what_departs
-from cell.vision.stripe.stream import BLOCK, StripeStream
+from cell.measure.vision.pictures import PictureRefused
+from cell.measure.vision.stripe.careful.neighbours import widen_what_departs
+from cell.measure.vision.stripe.extract import StripeSettings, extract
+from cell.measure.vision.stripe.stream import BLOCK, StripeStream
+from lab.bench.stripe.accuracy import measure
+from lab.bench.stripe.truth import Cell, bound, draw
 
 SMALL = (256, 384)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.lab.bench.stripe_truth import Cell, draw
-from cell.vision.stripe.extract import extract
-from cell.vision.stripe.find import CANDIDATES, CUT, ENERGY, NOWHERE, START, find_line
-from cell.vision.stripe.search import find_lines
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.ordinary.find import CANDIDATES, CUT, ENERGY, NOWHERE, START, find_line
+from cell.measure.vision.stripe.ordinary.search import find_lines
+from lab.bench.stripe.truth import Cell, draw
 
 SHAPE = (200, 333)
 LEAST_PEAK, SATURATION = 8.0, 255

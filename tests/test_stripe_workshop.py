@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from cell.lab.bench.stripe_profiles import measure, within_limits
-from cell.lab.bench.stripe_workshop import Scene, draw
-from cell.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
-from cell.vision.stripe.careful import Careful
-from cell.vision.stripe.extract import extract
-from cell.vision.stripe.pieces import fill_gaps
-from cell.vision.stripe.planes import as_picture, range_of
-from cell.vision.stripe.stream import StripeStream
+from cell.measure.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
+from cell.measure.vision.stripe.careful.careful import Careful
+from cell.measure.vision.stripe.careful.segments import fill_gaps
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.planes import as_picture, range_of
+from cell.measure.vision.stripe.stream import StripeStream
+from lab.bench.stripe.profiles import measure, within_limits
+from lab.bench.stripe.workshop import Scene, draw
 
 SHAPE = (384, 480)
 

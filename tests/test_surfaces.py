@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_backends.world import surfaces
-from sim_backends.world.surfaces import SURFACES, mesh, surface
+from sim_backends.world.bodies import surfaces
+from sim_backends.world.bodies.surfaces import SURFACES, mesh, surface
 
 NAMES = sorted(SURFACES)
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.vision import parse_board
-from cell.vision.board.board import find_board
-from cell.vision.pictures import PictureRefused
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.pictures import PictureRefused
 from drivers.errors import ConfigError
 
 TAG, GAP = 80, 24

@@ -12,15 +12,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.calibration import ScanCalibration
-from cell.calibration.collect.timing import collect_timing, look_at_shutter
-from cell.calibration.finding import find_calibration
-from cell.calibration.sessions import kept_if_refused
-from cell.calibration.solve.reference import Reference
-from cell.calibration.solve.results import KEPT, Quality, TargetCalibration
-from cell.calibration.store import CellCalibration, save_calibration
-from cell.calibration.timing import Shutter, Timing
-from cell.calibration.timing_fit import (
+from cell.config.calibrations.finding import find_calibration
+from cell.config.calibrations.store import CellCalibration, save_calibration
+from cell.config.calibrations.timing_link import changed, link_of
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.timing_fit import (
     TimedFrame,
     TimedSweep,
     TimesRefused,
@@ -30,20 +30,20 @@ from cell.calibration.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
-from cell.calibration.timing_link import changed, link_of
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
+from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
+from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.inversion import NominalSurface
+from cell.measure.vision import BoardView, parse_board
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
+from cell.procedures.steps.laser_sweep import times_known
+from cell.run.calibration import kept_if_refused
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.steps.laser_sweep import times_known
-from cell.steps.moves import Mover
-from cell.vision import BoardView, parse_board
 from drivers.errors import CalibrationStale, RefusedError
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import scene
 from tests.test_rail_sweep import ERRORS, sweep
 

@@ -8,14 +8,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import load_config
-from cell.inversion import NominalSurface, PlacePose
-from cell.inversion.observability import Motion, Verdict
-from cell.job import Job, load_job
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from cell.steps.touch import FELT_M, Touch, TouchCheck, expected_touch, felt_touch
+from cell.config.cell_config import load_config
+from cell.config.job import Job, load_job
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion.observability import Motion, Verdict
+from cell.procedures.arm.touch import FELT_M, Touch, TouchCheck, expected_touch, felt_touch
 from drivers.errors import RefusedError
 from drivers.interfaces import ArmSafety, ArmState
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import effects
 
 JOB, MESH = load_job("pot")

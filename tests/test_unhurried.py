@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from cell.job import load_job
-from cell.steps.laser_sweep import unhurried
+from cell.config.job import load_job
+from cell.procedures.steps.laser_sweep import unhurried
 
 
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.devices.direct import VirtualCell
-from cell.inversion import PlacePose
-from cell.lab.bench.whole_job import JobRecord, NoFrames
-from cell.steps.kinds import PLACE
-from cell.steps.place import STEP
-from cell.steps.unmoved import require_unmoved
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.inversion import PlacePose
+from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.place import STEP
 from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.runner import StepContext
 from tests.report_runs import CONFIG, at_station, pot, work_of
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
-from sim_backends.peers.rtde_registers import Registers
-from sim_backends.peers.script import ControlProgram, RuntimeState
-from sim_backends.peers.urscript.words import Collector
+from sim_backends.peers.arm.rtde.registers import Registers
+from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
+from sim_backends.peers.arm.urscript.words import Collector
 
 TICK = 0.002
 

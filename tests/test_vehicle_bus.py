@@ -11,8 +11,8 @@ import can
 import numpy as np
 import pytest
 
-from cell.devices.interlocks import Command, Interlocks, Situation
-from cell.devices.rules import RULES
+from cell.devices.gate.interlocks import Command, Interlocks, Situation
+from cell.devices.gate.rules import RULES
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
@@ -20,7 +20,7 @@ from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
-from sim_backends.peers.agilex import AgilexPeer
+from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.inner_bus import Driven, InnerBus
 
 RATE = 4.0

@@ -8,24 +8,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration import Priors
-from cell.calibration.solve.faults import SCALE_RANGE, refuse_bent, refuse_exchanged, refuse_slipped, refuse_wrong_lead
-from cell.calibration.solve.joint import solve_joint, solve_staged
-from cell.calibration.solve.reference import Reference
-from cell.calibration.solve.results import Quality, ScanCalibration, TargetCalibration
-from cell.calibration.store import CellCalibration, nominal_camera, read_calibration, save_calibration
-from cell.calibration.verify.looks import verify
-from cell.calibration.verify.verdict import Verification
-from cell.calibration.witness import Pointing, turned
-from cell.config import load_config
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_matrix
-from cell.job import load_job
-from cell.lab.bench.observed_cell import ObservedCell, shifted
-from cell.lab.bench.verification import disturbances, look_again
-from cell.steps.camera_poses import rail_ends, verification_views
-from cell.vision.board.board import board_pose
+from cell.config.calibrations.store import CellCalibration, nominal_camera, read_calibration, save_calibration
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.measure.calibration import Priors
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.reference_plate import Pointing, turned
+from cell.measure.calibration.judge.faults import (
+    SCALE_RANGE,
+    refuse_bent,
+    refuse_exchanged,
+    refuse_slipped,
+    refuse_wrong_lead,
+)
+from cell.measure.calibration.solve.joint import solve_joint, solve_staged
+from cell.measure.calibration.solve.results import Quality, ScanCalibration, TargetCalibration
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_matrix
+from cell.measure.vision.board.board import board_pose
+from cell.procedures.arm.camera_poses import rail_ends, verification_views
+from cell.procedures.verify.looks import verify
+from cell.procedures.verify.verdict import Verification
 from drivers.errors import CalibrationStale, RefusedError
+from lab.bench.calibration.observed_cell import ObservedCell, shifted
+from lab.bench.calibration.verification import disturbances, look_again
 from sim_backends.world.scene import draw
 
 CONFIG = load_config(None)

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.calibration.store import accept_calibration, save_calibration
-from cell.lab.bench.whole_job import JobRecord
+from cell.config.calibrations.store import accept_calibration, save_calibration
 from drivers.errors import CalibrationStale
+from lab.bench.job.whole_job import JobRecord
 
 
 def test_verify_tells_a_disturbed_calibration_from_a_good_one(

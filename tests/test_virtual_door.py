@@ -16,16 +16,16 @@ import cv2
 import pytest
 
 from cell import Cell
-from cell.calibration.store import save_calibration
-from cell.cli import main
-from cell.devices.direct import VirtualCell
-from cell.job import job_path
-from cell.lab.bench.whole_job import JobRecord
-from cell.record.reading import Parts, said
+from cell.apps.cli import main
+from cell.config.calibrations.store import save_calibration
+from cell.config.job import job_path
+from cell.devices.simulated.direct import VirtualCell
 from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
+from cell.run.record.reading import Parts, said
 from cell.run.run import Run
 from drivers.errors import Aborted, ConfigError, InterlockError
+from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
 from statemachine.script import Script
 from statemachine.step import Event

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
 from cell.devices.stopping import stop_cell
 from cell.motion.arm_models import HOME
 from cell.run.faults import classify

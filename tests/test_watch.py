@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cell.cli.app import app
-from cell.config import CellConfig, load_config
-from cell.terminal.positions import arm_lines, rail_lines, vehicle_lines
-from cell.terminal.watch import run_lines, shared
+from cell.apps.cli.app import app
+from cell.apps.watch.positions import arm_lines, rail_lines, vehicle_lines
+from cell.apps.watch.watch import run_lines, shared
+from cell.config.cell_config import CellConfig, load_config
 from drivers.interfaces import ArmSafety, ArmState, RailState, VehicleState
 from statemachine.journal import Journal
 

@@ -10,15 +10,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config import load_config
-from cell.devices.direct import VirtualCell
-from cell.geometry.poses import from_matrix
-from cell.job import Job, load_job
-from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to, wrap
-from cell.steps.drive_to_target import Arrival, drive_to_target
-from cell.steps.photograph import BoardFix
-from cell.steps.way import TURN_DRIFT, Way, distance
-from cell.steps.whereabouts import Whereabouts
+from cell.config.cell_config import load_config
+from cell.config.job import Job, load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line, turn_to, wrap
+from cell.procedures.drive.way import TURN_DRIFT, Way, distance
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.steps.drive_to_target import Arrival, drive_to_target
 from drivers.errors import RefusedError
 from drivers.interfaces import VehicleState
 from sim_backends.world.nominal import inverse

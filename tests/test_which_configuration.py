@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from cell import Cell, ConfigError
-from cell.cli import main
-from cell.config import (
+from cell.apps.cli import main
+from cell.config.cell_config import (
     config_to_open,
     default_toml,
     find_config,
@@ -20,8 +20,8 @@ from cell.config import (
     require_real_addresses,
     runs_folder,
 )
-from cell.devices.simulated import with_endpoints
-from cell.job import job_path
+from cell.config.job import job_path
+from cell.devices.simulated.process import with_endpoints
 
 MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
 ENDPOINTS = {

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.calibration.roll import rolled
-from cell.calibration.witness import LARGEST_RAD, Pointing, Witness, pointing, turned
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane, triangulate
+from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, Pointing, Witness, pointing, turned
+from cell.measure.calibration.drift.roll import rolled
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import RefusedError
 from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.laser.stripe import crossings
 from sim_backends.optics.scene import LaserOptics, PlaneInstance
-from sim_backends.optics.stripe import crossings
 
 OPTICS = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)

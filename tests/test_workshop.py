@@ -7,16 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cell.inversion.causes import Cause, likeliest
-from cell.lab.bench.realism import verdict
+from cell.measure.inversion.effects.causes import Cause, likeliest
+from lab.bench.job.realism import verdict
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.models.arm_truth import TruePose
 from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.laser.stripe import crossings
 from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain, LaserOptics, PlaneInstance
-from sim_backends.optics.stripe import crossings
 from sim_backends.world import nominal
 from sim_backends.world.effects import ALONE, Effects, only
 from sim_backends.world.levels import LEVELS, assumed_noise, deviations, effects_of, number_of

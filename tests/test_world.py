@@ -12,11 +12,11 @@ from sim_backends import serve
 from sim_backends.clock import SteppedClock, WorldClock
 from sim_backends.history import History, interpolate
 from sim_backends.world import nominal
-from sim_backends.world.contact import STIFFNESS, PartContact
+from sim_backends.world.bodies.contact import STIFFNESS, PartContact
+from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, surface
 from sim_backends.world.drawing import STOCK
 from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
 from sim_backends.world.scene import draw, rotation, stream
-from sim_backends.world.surfaces import HALF_X, HALF_Y, surface
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
 

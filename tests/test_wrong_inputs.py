@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import typer.main
 
-from cell.cli import main
-from cell.config import default_toml
-from cell.job import job_path
+from cell.apps.cli import main
+from cell.config.cell_config import default_toml
+from cell.config.job import job_path
 
 JARGON = (
     "Traceback", "pydantic", "Input should be", "type=", "input_value", "valid string", "valid dictionary",

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cell.units import KEPT, shown
+from cell.base.units import KEPT, shown
 from drivers.errors import CellError, ConfigError
 
 T = TypeVar("T", bound=BaseModel)

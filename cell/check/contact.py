@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from cell.config import CellConfig
-from cell.device_config import MOST_PAYLOAD
-from cell.inversion.nominal import read_mesh
-from cell.job import Job
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.makes.records import MOST_PAYLOAD
+from cell.measure.inversion.nominal import read_mesh
 
 G = 9.81
 REACTION_S = 0.05

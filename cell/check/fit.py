@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.calibration.store import nominal_camera
 from cell.check.contact import contact_problems
 from cell.check.place import mesh_box, place_problems, surface_problems, way_problems
 from cell.check.reach import reach_problems
-from cell.config import CALIBRATION_DEPTHS, CellConfig
-from cell.device_config import CameraConfig
-from cell.geometry.poses import transform
-from cell.job import Job
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
+from cell.config.job import Job
+from cell.makes.records import CameraConfig
+from cell.measure.geometry.poses import transform
+from cell.measure.vision import BoardSpec, parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.bodies import tool_bodies, vehicle_bodies
-from cell.steps.camera_poses import look_pose
-from cell.steps.kinds import find_kind
-from cell.vision import BoardSpec, parse_board
-from cell.vision.board.spec import centre_of
+from cell.procedures.arm.camera_poses import look_pose
+from cell.procedures.steps.kinds import find_kind
 from drivers.errors import ConfigError
 
 RAMP_MARGIN = 0.0005

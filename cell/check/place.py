@@ -11,14 +11,14 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from cell.config import CellConfig
-from cell.geometry.poses import from_parts, transform
-from cell.inversion.nominal import read_mesh
-from cell.job import Job
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.geometry.poses import from_parts, transform
+from cell.measure.inversion.nominal import read_mesh
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
-from cell.steps.approach import MAX_HEADING, Planar, wrap
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.procedures.drive.approach import MAX_HEADING, Planar, wrap
 from drivers.interfaces import Vector
 
 Box = tuple[Vector, Vector]

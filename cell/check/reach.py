@@ -7,22 +7,23 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration
-from cell.calibration.solve.results import PARAMETERS, Quality
-from cell.calibration.store import nominal_camera
-from cell.config import CellConfig
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_parts
-from cell.job import Job
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.config.mounting import deck_plates, mounted
+from cell.config.obstacles import station_obstacles, vehicle_obstacles
+from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.solve.results import PARAMETERS, Quality
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import Unreachable
 from cell.motion.planning import Planner
-from cell.mounting import deck_plates, mounted
-from cell.obstacles import station_obstacles, vehicle_obstacles
-from cell.steps.arm_sweep import RUN_UP_S
-from cell.steps.camera_poses import (
+from cell.procedures.arm.camera_poses import (
     base_from_place_at_target,
     look_pose,
     photo_pose,
@@ -30,9 +31,8 @@ from cell.steps.camera_poses import (
     scan_plans,
     target_calibration_views,
 )
-from cell.steps.moves import ROOM_ABOVE
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.procedures.arm.moves import ROOM_ABOVE
+from cell.procedures.sweep.arm_sweep import RUN_UP_S
 from drivers.interfaces import Vector
 
 Goal = tuple[str, pin.SE3, tuple[Pair, ...]]

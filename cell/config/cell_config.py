@@ -16,8 +16,14 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
 
-from cell.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
-from cell.device_config import (
+from cell.base.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
+from cell.base.toml_file import Table, read_toml, validate
+from cell.base.units import number, shown
+from cell.config.files import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
+from cell.config.obstacles import VehicleObstacle, once_each
+from cell.makes.built_in import BUILT_IN
+from cell.makes.make import AnyMake
+from cell.makes.records import (
     ArmConfig,
     CalibrationConfig,
     CameraConfig,
@@ -27,14 +33,8 @@ from cell.device_config import (
     RailConfig,
     VehicleConfig,
 )
-from cell.devices.built_in import BUILT_IN
-from cell.devices.make import AnyMake
-from cell.devices.makes import make_of, record_of
-from cell.devices.switch_makes import line_problems
-from cell.obstacles import VehicleObstacle, once_each
-from cell.toml_file import Table, read_toml, validate
-from cell.units import number, shown
-from cell.which_config import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
+from cell.makes.switches import line_problems
+from cell.makes.table import make_of, record_of
 from drivers.errors import ConfigError
 
 __all__ = [

@@ -15,11 +15,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from cell.addresses import Name
-from cell.device_config import Exposure, Mounting, Pose, checked_board
-from cell.obstacles import StationObstacle, once_each
-from cell.toml_file import Table, below, read_toml, validate
-from cell.units import number, quantity, shown, whole
+from cell.base.addresses import Name
+from cell.base.toml_file import Table, below, read_toml, validate
+from cell.base.units import number, quantity, shown, whole
+from cell.config.obstacles import StationObstacle, once_each
+from cell.makes.records import Exposure, Mounting, Pose, checked_board
 from drivers.errors import ConfigError
 
 LEAST_LINES, MOST_LINES = 10, 20_000
@@ -31,7 +31,7 @@ Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 
 
 class JobSection(Table):
-    """The job as a whole; `kind` says which steps it has (`cell.steps.kinds`)."""
+    """The job as a whole; `kind` says which steps it has (`cell.procedures.steps.kinds`)."""
 
     name: Annotated[str, Name]
     kind: Annotated[str, Name] = "place"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from cell.config import CellConfig
-from cell.geometry.poses import from_parts
+from cell.config.cell_config import CellConfig
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.bodies import Mounted
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
 
 PLATE_THICKNESS = 0.01
 """Of a calibration board, m."""

@@ -10,11 +10,11 @@ from typing import Annotated
 
 import pinocchio as pin
 
-from cell.addresses import Name
-from cell.device_config import Pose
+from cell.base.addresses import Name
+from cell.base.toml_file import Table
+from cell.base.units import quantity
+from cell.makes.records import Pose
 from cell.motion.bodies import BASE, Body, box
-from cell.toml_file import Table
-from cell.units import quantity
 
 Side = Annotated[float, quantity("mm", 1, 10_000)]
 

@@ -6,18 +6,18 @@ from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from typing import Any
 
-from cell.config import DEVICES, CellConfig
-from cell.devices.built_in import OnArm
+from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.devices import Devices
-from cell.devices.gate import Gate
-from cell.devices.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
-from cell.devices.gated_camera import GatedCamera
-from cell.devices.gated_laser import GatedLaser
-from cell.devices.interlocks import Interlocks, Situation
-from cell.devices.make import Surroundings
-from cell.devices.rules import RULES
-from cell.devices.ways import Ways
-from cell.geometry.poses import to_ur
+from cell.devices.gate.camera import GatedCamera
+from cell.devices.gate.gate import Gate
+from cell.devices.gate.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
+from cell.devices.gate.interlocks import Interlocks, Situation
+from cell.devices.gate.laser import GatedLaser
+from cell.devices.gate.rules import RULES
+from cell.devices.gate.ways import Ways
+from cell.makes.built_in import OnArm
+from cell.makes.make import Surroundings
+from cell.measure.geometry.poses import to_ur
 from cell.motion.arm_models import HOME, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
-from cell.devices.gate import Gate
-from cell.devices.gated import GatedRail
-from cell.devices.gated_laser import GatedLaser
-from cell.devices.interlocks import Interlocks
+from cell.devices.gate.gate import Gate
+from cell.devices.gate.gated import GatedRail
+from cell.devices.gate.interlocks import Interlocks
+from cell.devices.gate.laser import GatedLaser
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
 from drivers.interfaces import Arm, Camera, Claw, Device, Vehicle
 from statemachine.waiting import waiting_on
 
 if TYPE_CHECKING:
-    from cell.devices.following import Following
+    from cell.devices.simulated.following import Following
 
 SAFE_STOP_TIMEOUT_S = 5.0
 

@@ -15,7 +15,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
-from cell.config import DEVICES, CellConfig
+from cell.config.cell_config import DEVICES, CellConfig
 from drivers.errors import InterlockError
 
 OWN = "CELL_LOCKS"

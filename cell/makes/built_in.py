@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 
 from pydantic import StrictBool, model_validator
 
-from cell.addresses import Endpoint, Host, Port
-from cell.device_config import (
+from cell.base.addresses import Endpoint, Host, Port
+from cell.base.units import quantity, whole
+from cell.makes.cameras import FOLDER, GIGE, OPTICS, USB3, V4L2
+from cell.makes.make import AnyMake, Make, Surroundings
+from cell.makes.rails import MODBUS
+from cell.makes.records import (
     MOST_PAYLOAD,
     ArmConfig,
     CameraConfig,
@@ -21,18 +25,14 @@ from cell.device_config import (
     RailConfig,
     VehicleConfig,
 )
-from cell.devices.camera_makes import FOLDER, GIGE, OPTICS, USB3, V4L2
-from cell.devices.make import AnyMake, Make, Surroundings
-from cell.devices.rail_makes import MODBUS
-from cell.devices.switch_makes import SWITCH_MAKES
-from cell.devices.vehicle_makes import CANOPEN, CanVehicleConfig
-from cell.units import quantity, whole
+from cell.makes.switches import SWITCH_MAKES
+from cell.makes.vehicles import CANOPEN, CanVehicleConfig
 from drivers.packages import lacking
 
 if TYPE_CHECKING:
     from drivers.arm.ur import UrArm
     from drivers.camera.stream import StreamCamera
-    from drivers.rail.tmcl import TmclRail
+    from drivers.rail.tmcl.rail import TmclRail
     from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
     from drivers.vehicle.agilex import AgilexVehicle
     from drivers.vehicle.fixed import FixedVehicle
@@ -149,7 +149,7 @@ class ArmOutputClawConfig(ClawConfig, OnArm):
 
 
 def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
-    from drivers.rail.tmcl import TmclRail
+    from drivers.rail.tmcl.rail import TmclRail
 
     return TmclRail(
         name,

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, StringConstraints
 
-from cell.device_config import CameraConfig
-from cell.devices.make import AnyMake, Make, Surroundings
-from cell.units import number, quantity, whole
+from cell.base.units import number, quantity, whole
+from cell.makes.make import AnyMake, Make, Surroundings
+from cell.makes.records import CameraConfig
 
 if TYPE_CHECKING:
     from drivers.camera.genicam.camera import GenicamCamera

@@ -12,7 +12,7 @@ import time
 
 import can
 
-from cell.devices.vehicle_makes import CanopenVehicleConfig
+from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.errors import CellError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink

@@ -9,15 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from cell.device_config import (
-    ArmConfig,
-    CameraConfig,
-    ClawConfig,
-    DeviceConfig,
-    LaserConfig,
-    RailConfig,
-    VehicleConfig,
-)
+from cell.makes.records import ArmConfig, CameraConfig, ClawConfig, DeviceConfig, LaserConfig, RailConfig, VehicleConfig
 from drivers.clock import Clock
 from drivers.interfaces import Arm, Device, Vector
 from drivers.link_table import LinkTable

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import StringConstraints, model_validator
 
-from cell.addresses import Port
-from cell.device_config import Late, RailConfig
-from cell.devices.make import AnyMake, Make, Surroundings
-from cell.toml_file import Table
-from cell.units import whole
+from cell.base.addresses import Port
+from cell.base.toml_file import Table
+from cell.base.units import whole
+from cell.makes.make import AnyMake, Make, Surroundings
+from cell.makes.records import Late, RailConfig
 
 if TYPE_CHECKING:
-    from drivers.rail.modbus import ModbusRail
-    from drivers.rail.registers import Action, Flag, Number, Rate, RegisterMap
+    from drivers.rail.modbus.rail import ModbusRail
+    from drivers.rail.modbus.registers import Action, Flag, Number, Rate, RegisterMap
 
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400)
 COUNTS = 2**31 - 1
@@ -71,7 +71,7 @@ class SetupConfig(Table):
 
 
 class RegistersConfig(Table):
-    """What stands where in the drive; names as in `drivers.rail.registers`."""
+    """What stands where in the drive; names as in `drivers.rail.modbus.registers`."""
 
     word_order: Literal["high first", "low first"] = "high first"
     position: NumberConfig
@@ -143,13 +143,13 @@ class ModbusRailConfig(RailConfig):
 
 def register_map(config: RegistersConfig) -> RegisterMap:
     """The record as the driver takes it."""
-    from drivers.rail.registers import RegisterMap
+    from drivers.rail.modbus.registers import RegisterMap
 
     return RegisterMap(**dict(_parts(config)))
 
 
 def _parts(config: RegistersConfig) -> Iterator[tuple[str, Any]]:
-    from drivers.rail.registers import Action, Flag, Number, Rate
+    from drivers.rail.modbus.registers import Action, Flag, Number, Rate
 
     high_first = config.word_order == "high first"
 
@@ -173,7 +173,7 @@ def _parts(config: RegistersConfig) -> Iterator[tuple[str, Any]]:
 
 
 def _modbus(name: str, config: ModbusRailConfig, around: Surroundings) -> ModbusRail:
-    from drivers.rail.modbus import ModbusRail
+    from drivers.rail.modbus.rail import ModbusRail
 
     return ModbusRail(
         name,

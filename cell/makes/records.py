@@ -1,6 +1,6 @@
 """What the cell has to know of each kind of device, whatever its make: how it is mounted and what it may do.
 
-A make's record adds where the device is and how it is set up: `cell.devices.built_in` has those of the makes that come
+A make's record adds where the device is and how it is set up: `cell.makes.built_in` has those of the makes that come
 with the cell. Ranges are those of the devices, so that what passes here can be asked of them.
 """
 
@@ -15,8 +15,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, ValidationInfo, field_validator, model_validator
 
-from cell.toml_file import Table
-from cell.units import number, quantity, whole
+from cell.base.toml_file import Table
+from cell.base.units import number, quantity, whole
 from drivers.errors import ConfigError
 
 Length = Annotated[float, quantity("mm", -20_000, 20_000)]
@@ -241,7 +241,7 @@ class CalibrationConfig(Table):
 
 def checked_board(text: str) -> str:
     """A board's name, once it is known to be well formed."""
-    from cell.vision.board.spec import parse_board
+    from cell.measure.vision.board.spec import parse_board
 
     try:
         parse_board(text)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from cell.addresses import Endpoint, Port
-from cell.device_config import ClawConfig, DeviceConfig, LaserConfig, real_path
-from cell.devices.make import AnyMake, Make, Surroundings
-from cell.units import whole
+from cell.base.addresses import Endpoint, Port
+from cell.base.units import whole
+from cell.makes.make import AnyMake, Make, Surroundings
+from cell.makes.records import ClawConfig, DeviceConfig, LaserConfig, real_path
 
 if TYPE_CHECKING:
     from drivers.claw.robotiq import RobotiqClaw

@@ -14,9 +14,9 @@ from typing import Any
 from pydantic import ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
-from cell.device_config import DeviceConfig
-from cell.devices.built_in import BUILT_IN, OnArm
-from cell.devices.make import KINDS, AnyMake, Make
+from cell.makes.built_in import BUILT_IN, OnArm
+from cell.makes.make import KINDS, AnyMake, Make
+from cell.makes.records import DeviceConfig
 from drivers.errors import ConfigError
 
 GROUP = "assembly_cell.devices"

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import model_validator
 
-from cell.addresses import checked_can
-from cell.device_config import VehicleConfig, real_path
-from cell.devices.make import Make, Surroundings
-from cell.units import number, quantity, whole
+from cell.base.addresses import checked_can
+from cell.base.units import number, quantity, whole
+from cell.makes.make import Make, Surroundings
+from cell.makes.records import VehicleConfig, real_path
 
 if TYPE_CHECKING:
     from drivers.vehicle.cia402.geometry import WheelDrives

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionError, CollisionModel, Pair
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.path_search import Effort, limits, search
 from cell.motion.point_speed import PointSpeed, carried_points
-from cell.motion.search import Effort, limits, search
 from cell.motion.trajectory import LineLimits, Trajectory, join, plan_joint, plan_line
 
 EFFORTS = (

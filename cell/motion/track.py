@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import from_ur
+from cell.measure.geometry.poses import from_ur
 from drivers.clock_map import ClockMap
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmState, Vector

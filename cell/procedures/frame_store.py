@@ -13,7 +13,7 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from cell.storage import sync_files
+from cell.base.storage import sync_files
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 

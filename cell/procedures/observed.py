@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cell.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.interfaces import Vector
 
 

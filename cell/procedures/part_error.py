@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 import scipy
 
-from cell.geometry.poses import composition_jacobians, transform
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
+from cell.config.job import Job
+from cell.measure.geometry.poses import composition_jacobians, transform
+from cell.measure.inversion import NominalSurface, PlacePose
 from drivers.interfaces import Vector
 
 SEGMENTS, POINTS_PER_SEGMENT = 5, 9

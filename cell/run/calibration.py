@@ -8,14 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cell import ahead
-from cell.calibration.archive import Observations
-from cell.calibration.collect.boards import collect_scan, collect_target
-from cell.calibration.collect.edge import with_edge
-from cell.calibration.collect.timing import collect_timing, look_at_shutter
-from cell.calibration.collect.witness import look_at_witness
-from cell.calibration.finding import find_calibration
-from cell.calibration.store import (
+from cell.config.calibrations.finding import find_calibration
+from cell.config.calibrations.store import (
     CellCalibration,
     gathered,
     read_calibration,
@@ -23,18 +17,24 @@ from cell.calibration.store import (
     save_with_observations,
     solve_observations,
 )
-from cell.calibration.timing_fit import TimesRefused
-from cell.calibration.validation import require_as_configured
-from cell.calibration.verify.confirm import keep_confirmed
-from cell.calibration.verify.verdict import Verification
-from cell.calibration.verify.views import collect_verification
-from cell.config import CellConfig
+from cell.config.calibrations.validation import require_as_configured
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
-from cell.job import Job, load_job
+from cell.measure.calibration.archive import Observations
+from cell.measure.calibration.drift.timing_fit import TimesRefused
 from cell.motion.arm_models import kinematics_name
-from cell.opened import Opened
+from cell.procedures.calibrate.boards import collect_scan, collect_target
+from cell.procedures.calibrate.edge import with_edge
+from cell.procedures.calibrate.reference_plate import look_at_witness
+from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
+from cell.procedures.verify.confirm import keep_confirmed
+from cell.procedures.verify.verdict import Verification
+from cell.procedures.verify.views import collect_verification
 from cell.run.recorded_work import Hands
 from cell.run.run import Run
+from cell.run.session import warm_up as ahead
+from cell.run.session.session import Opened
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Device, why_untold
 from statemachine.step import Event

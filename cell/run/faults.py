@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from cell.base.lateness import LATENESS, MOST_S
 from cell.devices.devices import Devices
-from cell.devices.following import Following
-from cell.run.lateness import LATENESS, MOST_S
+from cell.devices.simulated.following import Following
 from drivers.errors import (
     Aborted,
     CalibrationStale,

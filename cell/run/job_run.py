@@ -13,32 +13,32 @@ from typing import Any
 
 import pinocchio as pin
 
-from cell.calibration.store import CellCalibration, save_calibration
-from cell.config import CellConfig
+from cell.base.notebook import table
+from cell.base.storage import write_json
+from cell.config.calibrations.store import CellCalibration, save_calibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
 from cell.devices.devices import Devices
-from cell.devices.following import Following
-from cell.devices.injection import Injector
+from cell.devices.simulated.following import Following
+from cell.devices.simulated.injection import Injector
 from cell.devices.stopping import require_healthy, stop_cell
-from cell.inversion import NominalSurface
-from cell.job import Job
-from cell.record.perception import save as save_perception
-from cell.record.recorder import Recorder, recorded
-from cell.report.figures import told
-from cell.report.html import table
-from cell.report.report import make_report
-from cell.report.truth import Witness
+from cell.measure.inversion import NominalSurface
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.pace import Pace
+from cell.procedures.steps.kinds import Kind
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.stored_sweep import StoredSweep
+from cell.procedures.sweep.swath import Collector, Sweeping
 from cell.run.faults import classify, clear
-from cell.run.folder import new_run
-from cell.run.frames import FrameStore
-from cell.run.logs import run_log
-from cell.run.pace import Pace
+from cell.run.files.folder import new_run
+from cell.run.files.logs import run_log
+from cell.run.record.perception import save as save_perception
+from cell.run.record.recorder import Recorder, recorded
+from cell.run.report.figures import told
+from cell.run.report.report import make_report
+from cell.run.report.truth import Witness
 from cell.run.run import Run
-from cell.steps.kinds import Kind
-from cell.steps.stored_sweep import StoredSweep
-from cell.steps.swath import Collector, Sweeping
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
-from cell.storage import write_json
 from drivers.errors import CellError
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cell.calibration import sessions
-from cell.calibration.store import CellCalibration
-from cell.config import DEVICES
-from cell.devices.mix import beware
-from cell.devices.simulated import is_whole
-from cell.opened import Opened
-from cell.report.figures import following_words
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import DEVICES
+from cell.devices.simulated.mix import beware
+from cell.devices.simulated.process import is_whole
+from cell.run import calibration as sessions
+from cell.run.files.reading import read_report
 from cell.run.job_run import JobRun, Observer, RunOutcome
-from cell.run.reading import read_report
 from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import outcome_of
+from cell.run.report.figures import following_words
 from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
+from cell.run.session.session import Opened
 from statemachine.runner import Event
 
 

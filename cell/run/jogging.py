@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import from_parts, from_ur
-from cell.job import Job, load_job
+from cell.base.units import parse_quantity
+from cell.config.job import Job, load_job
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.vision import parse_board
+from cell.procedures.arm.camera_poses import look_pose
+from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line, turn_to
 from cell.run.recorded_work import Hands
-from cell.steps.approach import Planar, RelativeOdometry, drive_line, turn_to
-from cell.steps.camera_poses import look_pose
-from cell.units import parse_quantity
-from cell.vision import parse_board
 from drivers.errors import ConfigError, DeviceFault, LimitError
 from drivers.interfaces import Arm, ArmSafety, Vector
 from statemachine.step import Observer
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 MAX_LENGTH_MM = 500.0
 MAX_ANGLE_DEG = 90.0

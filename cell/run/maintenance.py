@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cell.run.folder import REPORT, new_run, when
-from cell.run.logs import run_log
-from cell.storage import sealed, write_json
-from cell.version import release
+from cell.base.storage import sealed, write_json
+from cell.base.version import release
+from cell.run.files.folder import REPORT, new_run, when
+from cell.run.files.logs import run_log
 from drivers.errors import CellError
 from statemachine.journal import Journal, JournalError
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cell.check.fit import require_fit
-from cell.config import CellConfig
-from cell.inversion import NominalSurface
-from cell.job import Job, load_job
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, load_job
+from cell.measure.inversion import NominalSurface
+from cell.procedures.steps.kinds import Kind, find_kind
 from cell.run.resumption import job_source
-from cell.steps.kinds import Kind, find_kind
 from statemachine.script import Script
 
 

@@ -15,17 +15,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cell.config import CellConfig
+from cell.base.storage import sealed, write_json
+from cell.base.version import release
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.stopping import require_healthy, stop_not_confirmed
-from cell.record.recorder import begin_record
+from cell.procedures.frame_store import FrameStore
 from cell.run.faults import classify, clear
-from cell.run.folder import REPORT, new_run, timeless, when
-from cell.run.frames import FrameStore
-from cell.run.logs import run_log
+from cell.run.files.folder import REPORT, new_run, timeless, when
+from cell.run.files.logs import run_log
+from cell.run.record.recorder import begin_record
 from cell.run.run import Run
-from cell.storage import sealed, write_json
-from cell.version import release
 from drivers.errors import Aborted, CellError, Interrupted, RefusedError
 from drivers.interfaces import Frame
 from statemachine.attempts import Attempts

@@ -8,12 +8,12 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from cell.calibration.store import CellCalibration
-from cell.config import CellConfig
-from cell.job import Job, job_path, load_job
-from cell.steps import laser_sweep
-from cell.steps.part import PartState
-from cell.steps.stored_sweep import FILE, StoredSweep
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, job_path, load_job
+from cell.procedures.arm.part import PartState
+from cell.procedures.steps import laser_sweep
+from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from drivers.errors import ConfigError, RefusedError
 from statemachine.journal import JournalError, Record, read
 

@@ -26,8 +26,8 @@ from statemachine.watch import SignalInterrupt, SignalWatch, begin
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from cell.run.frames import FrameStore
-    from cell.steps.swath import Sweeping
+    from cell.procedures.frame_store import FrameStore
+    from cell.procedures.sweep.swath import Sweeping
 
 Result = TypeVar("Result")
 

@@ -156,7 +156,7 @@ class ArmLink:
         environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
         with theirs:
             process = subprocess.Popen(
-                [sys.executable, "-m", "drivers.arm.ur_child", str(theirs.fileno())],
+                [sys.executable, "-m", "drivers.arm.child.main", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -256,7 +256,7 @@ def see_safe(address: str, outputs: tuple[int, ...], deadline: float) -> bool:
 
     True once the arm itself has shown that they are off and that it stands, False if it did not within `deadline` s.
     """
-    command = [sys.executable, "-m", "drivers.arm.ur_child", "--safe", address, ",".join(map(str, outputs))]
+    command = [sys.executable, "-m", "drivers.arm.child.main", "--safe", address, ",".join(map(str, outputs))]
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
     try:
         done = subprocess.run(

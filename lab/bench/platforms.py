@@ -1,6 +1,6 @@
 """Which platform and Python has wheels of what the cell needs, asked of the package index; writes docs/platforms.md.
 
-    python -m cell.lab.bench.platforms docs/platforms.md
+    python -m lab.bench.platforms docs/platforms.md
 
 The questions are those of an installation, put by `uv pip compile`: nothing is downloaded but what wheels say of
 themselves. What a platform has is what can be installed there; only where the docs say so was it run as well.
@@ -29,7 +29,7 @@ OPTIONAL = ("ur-rtde", "ompl", "embreex")
 HEAD = """# Platforms
 
 What `pip install -e .` finds on the package index: wheels of each package and of what it needs in turn. Asked on {date}
-by `python -m cell.lab.bench.platforms docs/platforms.md`, which needs `uv` and writes this page.
+by `python -m lab.bench.platforms docs/platforms.md`, which needs `uv` and writes this page.
 
 - Tested is Linux x86-64: Python 3.11 by the whole test suite, and the newest other Python that `.ci/run` finds by a dry
   run. The other rows say what can be installed, and were not run. The devices' drivers are for Linux.
@@ -80,7 +80,7 @@ def works(no_wheel: set[str], nothing: set[str]) -> tuple[str, str, str, str, st
 
 def main(path: Path) -> None:
     """Ask for every platform and write the page."""
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     asked = {one.name: f"{one.name}{one.specifier}" for one in map(Requirement, project["dependencies"])}
     rows = []
     for name, platform in PLATFORMS.items():

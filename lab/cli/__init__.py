@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import typer
 
-from cell.lab.cli.bench_acceptance import acceptance
-from cell.lab.cli.bench_accuracy import accuracy
-from cell.lab.cli.bench_board import board
-from cell.lab.cli.bench_calibration import calibration
-from cell.lab.cli.bench_endings import endings
-from cell.lab.cli.bench_inversion import inversion
-from cell.lab.cli.bench_realism import realism
-from cell.lab.cli.bench_reconstruction import reconstruction
-from cell.lab.cli.bench_streams import pages, servo, soak
-from cell.lab.cli.bench_stripe import stripe
-from cell.lab.cli.bench_verify import verify
-from cell.lab.cli.paper import paper
+from lab.cli.bench_acceptance import acceptance
+from lab.cli.bench_accuracy import accuracy
+from lab.cli.bench_board import board
+from lab.cli.bench_calibration import calibration
+from lab.cli.bench_endings import endings
+from lab.cli.bench_inversion import inversion
+from lab.cli.bench_realism import realism
+from lab.cli.bench_reconstruction import reconstruction
+from lab.cli.bench_streams import pages, servo, soak
+from lab.cli.bench_stripe import stripe
+from lab.cli.bench_verify import verify
+from lab.cli.paper import paper
 
 BENCH = (
     acceptance, accuracy, board, calibration, endings, inversion, pages, realism, reconstruction, servo, soak, stripe,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cell.cli.options import JsonOption, Level, LevelOption, SeedOption
-from cell.lab.cli.shown import bar, show
+from cell.apps.cli.options import JsonOption, Level, LevelOption, SeedOption
+from lab.cli.shown import bar, show
 
 
 def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False) -> None:
@@ -11,8 +11,8 @@ def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: J
 
     A ball at ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts.
     """
-    from cell.lab.bench.acceptance import acceptance as campaign
-    from cell.lab.cli.paper_tables import print_acceptance
+    from lab.bench.acceptance.campaign import acceptance as campaign
+    from lab.cli.paper_tables import print_acceptance
 
     with bar() as told:
         result = campaign(seed, level.value, lambda done, total: told(done, "places", total))

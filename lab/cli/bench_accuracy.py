@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import JobOption, JsonOption, Level
-from cell.lab.cli.shown import bar, counted, show
+from cell.apps.cli.options import JobOption, JsonOption, Level
+from lab.cli.shown import bar, counted, show
 
 
 def accuracy(
@@ -25,8 +25,8 @@ def accuracy(
 
     Exit code 1 when a part was placed outside the job's tolerance, or a limit of level nominal is not kept.
     """
-    from cell.lab.bench.accuracy import campaign
-    from cell.lab.cli.bench_tables import print_accuracy
+    from lab.bench.job.accuracy import campaign
+    from lab.cli.bench_tables import print_accuracy
 
     levels = list(dict.fromkeys(entry.value for entry in level or [Level.nominal]))
     with bar() as told:

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, wide_console
-from cell.lab.cli.shown import bar, counted, formed, show
+from cell.apps.cli.options import JsonOption, wide_console
+from lab.cli.shown import bar, counted, formed, show
 
 
 def board(
@@ -23,10 +23,10 @@ def board(
 
     Exit code 1 when a board, or the order of its points, was taken for another.
     """
-    from cell.lab.bench.board import campaign
-    from cell.lab.bench.board_conditions import CONDITIONS
-    from cell.vision.board.spec import KINDS
+    from cell.measure.vision.board.spec import KINDS
     from drivers.errors import ConfigError
+    from lab.bench.board.campaign import campaign
+    from lab.bench.board.conditions import CONDITIONS
 
     kinds = [k for k in KINDS if not kind or k in kind]
     if kind and len(kinds) != len(set(kind)):

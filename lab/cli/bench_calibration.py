@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, wide_console
-from cell.lab.cli.shown import bar, show, table
+from cell.apps.cli.options import JsonOption, wide_console
+from lab.cli.shown import bar, show, table
 
 FRAMES = {
     "camera": "camera frame, 1000 points",
@@ -27,8 +27,8 @@ def calibration(
 
     The observations are drawn by code that shares nothing with the estimator; all figures are of simulation.
     """
-    from cell.lab.bench.calibration import campaign
-    from cell.lab.bench.calibration_world import Noise
+    from lab.bench.calibration.campaign import campaign
+    from lab.bench.calibration.world import Noise
 
     with bar() as told:
         result = campaign(range(1, seeds + 1), Noise(), lambda done: told(done, f"{done} of {seeds} heads", seeds))

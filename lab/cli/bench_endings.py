@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, SeedOption
-from cell.lab.cli.shown import bar, show, table
+from cell.apps.cli.options import JsonOption, SeedOption
+from lab.cli.shown import bar, show, table
 
 
 def endings(
@@ -20,7 +20,7 @@ def endings(
     import tempfile
     from pathlib import Path
 
-    from cell.lab.bench.endings import campaign, summary
+    from lab.bench.wires.endings import campaign, summary
 
     with tempfile.TemporaryDirectory(prefix="cell-endings-") as folder, bar() as told:
         found = campaign(Path(folder), count, seed, speed, lambda done, text: told(done, text, 2 * count))

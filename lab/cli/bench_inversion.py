@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, wide_console
-from cell.lab.cli.shown import bar, show, table
+from cell.apps.cli.options import JsonOption, wide_console
+from lab.cli.shown import bar, show, table
 
 
 def inversion(
@@ -16,7 +16,7 @@ def inversion(
     json: JsonOption = False,
 ) -> None:
     """Find the pose of five parts from near and far, with clutter and 40 % missing, and refuse what must be refused."""
-    from cell.lab.bench.inversion_report import campaign
+    from lab.bench.inversion.report import campaign
 
     with bar() as told:
         report = campaign(starts, cases, lambda done, total: told(done, "", total))

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli import completing
-from cell.cli.options import JobOption, JsonOption
-from cell.lab.cli.shown import bar, counted, show, table
+from cell.apps.cli import completion as completing
+from cell.apps.cli.options import JobOption, JsonOption
+from lab.cli.shown import bar, counted, show, table
 
 SHOWN = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "s": (1e3, "ms"), "rad/K": (1e6, "µrad/K")}
 
@@ -34,8 +34,8 @@ def realism(
     that a true share of 90 % explains: 15 of 20 (95 % confidence). Exit code 1 when one is not, or a part was placed
     outside the job's tolerance.
     """
-    from cell.lab.bench.realism import ALONE, TOGETHER, campaign, is_well
     from drivers.errors import ConfigError
+    from lab.bench.job.realism import ALONE, TOGETHER, campaign, is_well
     from sim_backends.world.effects import Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
@@ -54,7 +54,7 @@ def realism(
 def _print(result: Mapping[str, Any]) -> None:
     from rich.console import Console
 
-    from cell.lab.bench.coverage import words
+    from lab.bench.coverage import words
 
     rows = []
     for name, entry in result["effects"].items():

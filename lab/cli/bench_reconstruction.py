@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.cli.options import JsonOption, SeedOption, wide_console
-from cell.lab.cli.shown import bar, formed, show
+from cell.apps.cli.options import JsonOption, SeedOption, wide_console
+from lab.cli.shown import bar, formed, show
 
 
 def reconstruction(seed: SeedOption = 1, json: JsonOption = False) -> None:
     """Outliers found, holes filled and milliseconds after the last frame, on synthetic clouds of known truth."""
-    from cell.lab.bench.reconstruction import run
+    from lab.bench.reconstruction.campaign import run
 
     with bar() as told:
         report = run(seed, told)

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JobOption, JsonOption, SeedOption, wide_console
-from cell.lab.cli.shown import bar, show, table
+from cell.apps.cli.options import JobOption, JsonOption, SeedOption, wide_console
+from lab.cli.shown import bar, show, table
 
 
 def servo(
@@ -19,7 +19,7 @@ def servo(
 
     On a machine where a loop that only sleeps is late as well, there is no verdict: the figures say so.
     """
-    from cell.lab.bench.servo import measure
+    from lab.bench.wires.servo import measure
 
     with bar() as told:
         found = measure(seconds, seed, told)
@@ -52,7 +52,7 @@ def pages(
     json: JsonOption = False,
 ) -> None:
     """Stream to a simulated arm and from its camera: without a console, with one, and with five pages that look."""
-    from cell.lab.bench.pages import measure
+    from lab.bench.wires.pages import measure
 
     with bar() as told:
         found = measure(seconds, rounds, seed, told)
@@ -80,7 +80,7 @@ def soak(
     json: JsonOption = False,
 ) -> None:
     """Repeat a job over the wires of a simulated cell; exit 1 if memory, threads or handles grow from job to job."""
-    from cell.lab.bench.soak import soak as run
+    from lab.bench.wires.soak import soak as run
 
     with bar() as told:
         found = run(minutes, seed, job, told, speed=speed)

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, wide_console
-from cell.lab.cli.shown import bar, formed, show
+from cell.apps.cli.options import JsonOption, wide_console
+from lab.cli.shown import bar, formed, show
 
 ACCURACY = {
     "width px": "{width_px:.1f}",
@@ -48,7 +48,9 @@ def stripe(
     json: JsonOption = False,
 ) -> None:
     """Stripe centres: RMS error, bias and stated deviation beside the bound, and speed."""
-    from cell.lab.bench import stripe_accuracy, stripe_profiles, stripe_speed
+    from lab.bench.stripe import accuracy as stripe_accuracy
+    from lab.bench.stripe import profiles as stripe_profiles
+    from lab.bench.stripe import speed as stripe_speed
 
     result: dict[str, Any] = {}
     with bar() as told:

@@ -7,10 +7,10 @@ from typing import Any
 
 from rich.console import Console
 
-from cell.lab.cli.paper_tables import print_acceptance
-from cell.lab.cli.shown import empty, table
-from cell.report.figures import noise_rows
-from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from cell.run.report.figures import noise_rows
+from cell.run.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from lab.cli.paper_tables import print_acceptance
+from lab.cli.shown import empty, table
 
 _ROWS = (
     ("sensor, scan frame, mean", "mm", "sensor_scan_mm", "mean"),

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption, Level, LevelOption, wide_console
-from cell.lab.cli.shown import bar, counted, show, table
+from cell.apps.cli.options import JsonOption, Level, LevelOption, wide_console
+from lab.cli.shown import bar, counted, show, table
 
 
 def verify(
@@ -16,7 +16,7 @@ def verify(
     json: JsonOption = False,
 ) -> None:
     """Find 0.2 mm or 0.05° in every part of the chain, over many simulated worlds (no pictures are rendered)."""
-    from cell.lab.bench.verification import KINDS_OF_CHANGE, campaign, disturbances
+    from lab.bench.calibration.verification import KINDS_OF_CHANGE, campaign, disturbances
 
     chosen = disturbances()
     with bar() as told:
@@ -26,7 +26,7 @@ def verify(
 
 
 def _print(summary: dict[str, Any]) -> None:
-    from cell.lab.bench.verification import CHECKS_OF_A_GOOD_ONE
+    from lab.bench.calibration.verification import CHECKS_OF_A_GOOD_ONE
 
     console, seeds = wide_console(150), summary["seeds"]
     keys = ("name", "checks", "found_percent", "detectable_mean", "unit", "named_first_percent",

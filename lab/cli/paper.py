@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import JsonOption
-from cell.lab.cli.shown import bar, show
+from cell.apps.cli.options import JsonOption
+from lab.cli.shown import bar, show
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the pictures and the numbers as JSON; made if it is not there.")
@@ -24,13 +24,13 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
 
     With --out it also draws figure2_errors.png.
     """
-    from cell.lab.cli.paper_tables import print_figure2
-    from cell.lab.paper.figure2 import figure2 as numbers
+    from lab.cli.paper_tables import print_figure2
+    from lab.paper.figure2 import figure2 as numbers
 
     result = numbers()
     _show(result, json, out, "figure2", print_figure2)
     if out is not None:
-        from cell.lab.paper.figure2_pictures import draw
+        from lab.paper.figure2_pictures import draw
 
         path = out / "figure2_errors.png"
         draw(path)
@@ -41,8 +41,8 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
 @paper.command()
 def equations(json: JsonOption = False, out: OutOption = None) -> None:
     """Equations (1) to (6) as printed and as corrected, held against ray-traced truth."""
-    from cell.lab.cli.paper_tables import print_equations
-    from cell.lab.paper.equation_table import equation_table
+    from lab.cli.paper_tables import print_equations
+    from lab.paper.equation_table import equation_table
 
     _show(equation_table(), json, out, "equations", print_equations)
 
@@ -50,8 +50,8 @@ def equations(json: JsonOption = False, out: OutOption = None) -> None:
 @paper.command()
 def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = None) -> None:
     """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's."""
-    from cell.lab.cli.paper_tables import print_table1
-    from cell.lab.paper.table1 import table1 as campaign
+    from lab.cli.paper_tables import print_table1
+    from lab.paper.table1 import table1 as campaign
 
     with bar() as told:
         result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
@@ -62,7 +62,7 @@ def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table
     """Print as JSON or as a table, and keep the numbers in the folder."""
     show(result, json, table)
     if out is not None:
-        from cell.run.folder import write_json
+        from cell.run.files.folder import write_json
 
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / f"{name}.json", result)

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from cell.lab.cli.shown import empty
+from lab.cli.shown import empty
 
 WAYS = {"nominal": "before: drawn", "staged": "after: steps", "joint": "after: joint"}
 """The head as drawn; calibrated by the paper's steps one by one; by the joint adjustment."""

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from itertools import count
 from typing import Any, Protocol
 
-from cell.cli.options import new_table, print_json
+from cell.apps.cli.options import new_table, print_json
 
 
 class Told(Protocol):

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.light_plane import closed_form
-from cell.lab.paper import equations as eq
-from cell.lab.paper.design import HALF_SENSOR, STAND_OFF, TAN_THETA
-from cell.lab.paper.traced import light_point, oblique_image
+from cell.measure.geometry.light_plane import closed_form
+from lab.paper import equations as eq
+from lab.paper.design import HALF_SENSOR, STAND_OFF, TAN_THETA
+from lab.paper.traced import light_point, oblique_image
 
 Array = NDArray[np.float64]
 

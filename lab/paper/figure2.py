@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.paper.design import (
+from lab.paper.design import (
     HALF_SENSOR,
     PIXEL,
     STAND_OFF,

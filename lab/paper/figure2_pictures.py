@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from cell.lab.paper.design import HALF_SENSOR, Head, errors
-from cell.lab.paper.figure2 import BASELINES, DELTA, FOCAL
+from lab.paper.design import HALF_SENSOR, Head, errors
+from lab.paper.figure2 import BASELINES, DELTA, FOCAL
 
 LEVELS_MM = (0.02, 0.05, 0.1, 0.2)
 

@@ -12,16 +12,16 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration import Priors, ScanObservation
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_axes, from_parts, perturbed
-from cell.reconstruction import ScanGeometry
-from cell.vision import BoardView, parse_board
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.calibration import Priors, ScanObservation
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_axes, from_parts, perturbed
+from cell.measure.reconstruction import ScanGeometry
+from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.stripe.extract import StripeProfile
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
-from sim_backends.optics.stripe import crossings
-from sim_backends.optics.visibility import lit
+from sim_backends.optics.laser.stripe import crossings
+from sim_backends.optics.laser.visibility import lit
 from sim_backends.world.levels import deviations
 
 Array = NDArray[np.float64]

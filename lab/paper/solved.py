@@ -11,11 +11,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration import ScanCalibration, ScanObservation
-from cell.calibration.solve.joint import solve_joint, solve_staged
-from cell.calibration.solve.results import KEPT, Quality
-from cell.lab.paper.rig import RigSpec
-from cell.reconstruction import ScanGeometry
+from cell.measure.calibration import ScanCalibration, ScanObservation
+from cell.measure.calibration.solve.joint import solve_joint, solve_staged
+from cell.measure.calibration.solve.results import KEPT, Quality
+from cell.measure.reconstruction import ScanGeometry
+from lab.paper.rig import RigSpec
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.lab.paper.rig import RigSpec, Sweep, profile_of
-from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from lab.paper.rig import RigSpec, Sweep, profile_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,15 +13,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import from_axes, perturbed, transform
-from cell.lab.bench.over_cores import Progress, run_all
-from cell.lab.paper.rig import RigSpec, Sweep, arm_error, draw_head, observe, sweep
-from cell.lab.paper.solved import Solved, aligned, expected_length, in_scan_frame, point_covariances, solve
-from cell.lab.paper.spoiled import found_outliers, reconstruct, spoil
-from cell.reconstruction import ScanGeometry
-from cell.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from cell.measure.geometry.poses import from_axes, perturbed, transform
+from cell.measure.reconstruction import ScanGeometry
+from cell.run.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from lab.bench.over_cores import Progress, run_all
+from lab.paper.rig import RigSpec, Sweep, arm_error, draw_head, observe, sweep
+from lab.paper.solved import Solved, aligned, expected_length, in_scan_frame, point_covariances, solve
+from lab.paper.spoiled import found_outliers, reconstruct, spoil
 from sim_backends.optics import Mesh
-from sim_backends.world.surfaces import mesh as surface_mesh
+from sim_backends.world.bodies.surfaces import mesh as surface_mesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

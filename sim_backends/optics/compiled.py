@@ -18,7 +18,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 def _cache_folder() -> str:
     here = Path(__file__).parent
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))).hexdigest()[:16]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(here.rglob("*.py")))).hexdigest()[:16]
     root = here / "__pycache__" if os.access(here, os.W_OK) else Path.home() / ".cache" / "assembly-cell"
     return str(root / f"kernels-{digest}")
 

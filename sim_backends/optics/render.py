@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from sim_backends.optics.boards import render_rectangle
 from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.laser.speckle import add_speckled
+from sim_backends.optics.laser.stripe import render_stripe
 from sim_backends.optics.lighting import ambient_dn, fill_background, gain_parameters
 from sim_backends.optics.scene import BoardInstance, LaserOptics, Light, MeshInstance, PlaneInstance, SceneObject
 from sim_backends.optics.sensor import sensor
 from sim_backends.optics.shading import render_mesh
-from sim_backends.optics.speckle import add_speckled
-from sim_backends.optics.stripe import render_stripe
 from sim_backends.optics.sunlight import add_sun
 
 Image = NDArray[np.float32]

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from sim_backends.peers.relays import LcusPeer, NumatoPeer, RelayBoard
-from sim_backends.peers.robotiq import RobotiqPeer
-from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.arm.robotiq import RobotiqPeer
+from sim_backends.peers.rail.tmcl import TmclPeer
+from sim_backends.peers.switches.relays import LcusPeer, NumatoPeer, RelayBoard
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
-    from sim_backends.peers.modbus_drive import ModbusPeer
+    from sim_backends.peers.rail.modbus_drive import ModbusPeer
 
 
 class Peer(Protocol):
@@ -39,7 +39,7 @@ def rail_peer(world: World) -> TmclPeer | ModbusPeer:
         return TmclPeer(world.rail, world.clock)
     try:
         # Only who simulates such a drive needs the library.
-        from sim_backends.peers.modbus_drive import ModbusDrive, ModbusPeer
+        from sim_backends.peers.rail.modbus_drive import ModbusDrive, ModbusPeer
     except ImportError as error:
         raise ValueError(
             f"a rail on Modbus is simulated with pymodbus, which is not installed ({error}): pip install "

@@ -25,10 +25,10 @@ from sim_backends.optics.scene import (
     Sun,
 )
 from sim_backends.world import nominal
+from sim_backends.world.bodies.station import Station
 from sim_backends.world.drawing import CameraDrawing
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Lens, Scene, rotation, stream
-from sim_backends.world.station import Station
 
 Pose = NDArray[np.float64]
 Picture = NDArray[np.uint8]

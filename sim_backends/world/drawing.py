@@ -94,7 +94,8 @@ class StationDrawing:
     """What a job describes: the station, and the part in the claw.
 
     The place frame lies `height` m above the floor. `mesh` is the file of the surface, in `mesh_unit` "m" or "mm", or
-    "" for the closed form `surface`, a name of `sim_backends.world.surfaces`. `part_size` (3,) in m, along its axes.
+    "" for the closed form `surface`, a name of `sim_backends.world.bodies.surfaces`. `part_size` (3,) in m, along its
+    axes.
     """
 
     height: float

@@ -20,15 +20,15 @@ from sim_backends.models.followed import FollowedArm, FollowedRail, FollowedVehi
 from sim_backends.models.rail import RailModel
 from sim_backends.models.vehicle import VehicleModel
 from sim_backends.world import hardware
-from sim_backends.world.arm_points import ArmPoints
+from sim_backends.world.bodies.arm_points import ArmPoints
+from sim_backends.world.bodies.collisions import Collision, Collisions
+from sim_backends.world.bodies.contact import PartContact
+from sim_backends.world.bodies.station import Station
 from sim_backends.world.cameras import Cameras
-from sim_backends.world.collisions import Collision, Collisions
-from sim_backends.world.contact import PartContact
 from sim_backends.world.drawing import STOCK, Drawing, StationDrawing
 from sim_backends.world.effects import WARMING_S
 from sim_backends.world.nominal import inverse, pose
 from sim_backends.world.scene import Lens, draw, rotation
-from sim_backends.world.station import Station
 
 Pose = NDArray[np.float64]
 

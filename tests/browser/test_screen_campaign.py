@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright
 
-from cell.lab.bench.soak import counted
+from lab.bench.wires.soak import counted
 from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, kill, press
 from tests.browser.screen import LOCAL, PHONE, Console, Screen, console_of, opened_browser
 from tests.browser.watcher import Watcher

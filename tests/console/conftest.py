@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from cell.supervisor import Cell
+from cell.run.session.supervisor import Cell
 
 
 @pytest.fixture(scope="module")

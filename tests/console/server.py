@@ -15,8 +15,8 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-from cell.console.link import ServerProcess
-from cell.console.messages import Answer, AskCell, Do, Ready, Setup
+from cell.apps.console.host.link import ServerProcess
+from cell.apps.console.messages import Answer, AskCell, Do, Ready, Setup
 
 HOSTS = ("127.0.0.1", "localhost")
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from cell.cli.console import page_teller
-from cell.console.console import Address, Console
-from cell.supervisor import Cell
+from cell.apps.cli.commands.console import page_teller
+from cell.apps.console.host.console import Address, Console
+from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
 from tests.console.server import Browser, until
 

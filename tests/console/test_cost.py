@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.console.messages import CloudPart, Picture, Show
-from cell.lab.bench.pages import cpu, looking
+from cell.apps.console.messages import CloudPart, Picture, Show
+from lab.bench.wires.pages import cpu, looking
 from tests.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.console.desk import SOON_S, Desk
-from cell.console.facts import cell_facts, jobs
-from cell.console.look import _figure
-from cell.console.mailbox import MOST_CLOUDS, Mailbox
-from cell.console.questions import Questions
-from cell.console.run_view import RunView
-from cell.job import job_path, load_job, shipped_jobs
+from cell.apps.console.host.controller import SOON_S, Desk
+from cell.apps.console.host.observer import _figure
+from cell.apps.console.host.questions import Questions
+from cell.apps.console.server.mailbox import MOST_CLOUDS, Mailbox
+from cell.apps.console.view.facts import cell_facts, jobs
+from cell.apps.console.view.run_view import RunView
+from cell.config.job import job_path, load_job, shipped_jobs
 from cell.run.run import Run
-from cell.supervisor import Cell
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, LimitError, Measured, RefusedError
 from statemachine.policy import Failure, Outcome
 from statemachine.script import Again
@@ -130,7 +130,7 @@ def test_what_ends_a_held_button_stops_the_motion(
     told: list[str] = []
     moved: Any = getattr(cell.devices, device)
     monkeypatch.setattr(moved.bare, "attended", lambda: nullcontext(lambda: None), raising=False)
-    monkeypatch.setattr("cell.console.holding.ATTENDED_S", 60.0)
+    monkeypatch.setattr("cell.apps.console.host.holding.ATTENDED_S", 60.0)
     monkeypatch.setattr(desk, "_say", lambda client, words: told.append(words["state"]))
     desk.do("c1", {"do": "hold", "name": "Ann"})
     desk.do("c1", {"do": "manual", "on": True})
@@ -149,7 +149,7 @@ def test_what_ends_a_held_button_stops_the_motion(
     ends: dict[str, Any] = {
         "release": lambda: desk.jog_end("c1"), "page gone": lambda: desk.left("c1"), "another button": lambda: beat(2),
         "manual off": lambda: desk.do("c1", {"do": "manual", "on": False}),
-        "silence": lambda: monkeypatch.setattr("cell.console.holding.ATTENDED_S", 0.0),
+        "silence": lambda: monkeypatch.setattr("cell.apps.console.host.holding.ATTENDED_S", 0.0),
     }  # fmt: skip
     ends[end]()
     assert until(lambda: told == ["moving", "ended"])
@@ -371,7 +371,7 @@ def test_the_mailbox_keeps_the_newest_and_of_the_cloud_as_much_as_it_may() -> No
 
 
 def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None:
-    from cell.console.archive import Archive
+    from cell.apps.console.view.archive import Archive
 
     folder = tmp_path / "20260101T000000-abcd"
     (folder / "frames").mkdir(parents=True)

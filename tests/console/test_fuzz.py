@@ -15,10 +15,10 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection
 
-from cell.console.commands import COMMANDS, MESSAGES
-from cell.console.console import Console
-from cell.console.messages import Answer, Beat, Do, Joined, Left
-from cell.supervisor import Cell
+from cell.apps.console.host.console import Console
+from cell.apps.console.messages import Answer, Beat, Do, Joined, Left
+from cell.apps.console.server.commands import COMMANDS, MESSAGES
+from cell.run.session.supervisor import Cell
 from tests.console.server import Served, serving
 
 ODD: list[Any] = [

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from cell.console.console import Console
-from cell.console.messages import Beat
-from cell.console.rehearsal import Rehearsals
-from cell.supervisor import Cell
+from cell.apps.console.host.console import Console
+from cell.apps.console.host.rehearsal import Rehearsals
+from cell.apps.console.messages import Beat
+from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
 from tests.browser.screen import Console as Going
 from tests.browser.screen import console_of
@@ -61,7 +61,7 @@ def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:
 
 def test_a_dry_run_ends_with_its_input(tmp_path: Path) -> None:
     """The console holds the other end, which closes with it."""
-    command = [sys.executable, "-m", "cell.console.rehearsal", "pot", "3", "nominal", ""]
+    command = [sys.executable, "-m", "cell.apps.console.host.rehearsal", "pot", "3", "nominal", ""]
     process = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stdout is not None and process.stdin is not None
     assert b"loading" in process.stdout.readline()
@@ -98,7 +98,7 @@ def test_a_console_whose_server_is_killed_stops_and_ends(going: Going) -> None:
     browser = Browser(going.link())
     assert browser.token not in " ".join(below(going.process.pid).values())
     left = below(going.process.pid)
-    (server,) = (pid for pid, words in left.items() if "cell.console.serve" in words)
+    (server,) = (pid for pid, words in left.items() if "cell.apps.console.server.serve" in words)
     begun = time.monotonic()
     os.kill(server, signal.SIGKILL)
     assert going.process.wait(20.0) == 1

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from cell.console.archive import Archive
-from cell.run.folder import list_runs
-from cell.supervisor import Cell
+from cell.apps.console.view.archive import Archive
+from cell.run.files.folder import list_runs
+from cell.run.session.supervisor import Cell
 
 
 def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from cell.console.access import Access
-from cell.console.messages import Beat, CloudPart, Joined, Left, Show
-from cell.console.serve import PING_S
+from cell.apps.console.messages import Beat, CloudPart, Joined, Left, Show
+from cell.apps.console.server.access import Access
+from cell.apps.console.server.serve import PING_S
 from tests.console.server import Served, serving, until
 
 TOKEN = "a-token-of-a-file-that-is-long-enough-0123456789"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cell.calibration.store import read_calibration
-from cell.record.reading import Parts, said
-from cell.steps.kinds import PLACE
+from cell.config.calibrations.store import read_calibration
+from cell.procedures.steps.kinds import PLACE
+from cell.run.record.reading import Parts, said
 from statemachine.journal import read
 
 KEPT = Path(__file__).with_name("kept")

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PLACES = ("cell", "drivers", "statemachine", "sim_backends", "tests", "pyproject.toml", "README.md", "docs")
+PLACES = ("cell", "drivers", "statemachine", "sim_backends", "lab", "tests", "pyproject.toml", "README.md", "docs")
 TIMEOUT_S = 240.0
 
 pytestmark = pytest.mark.mutants
@@ -54,7 +54,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     for name in PLACES:
         source = ROOT / name
         if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("runs", "calibrations"))
+            shutil.copytree(source, folder / name)
         else:
             shutil.copy2(source, folder / name)
     yield folder

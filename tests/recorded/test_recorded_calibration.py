@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.calibration.recorded.command import calibrate_folder
-from cell.vision import parse_board
+from cell.apps.recordings.command import calibrate_folder
+from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
 from tests.recorded_scenes import recording
 

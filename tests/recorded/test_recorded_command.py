@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cell.calibration.recorded.command import calibrate_folder
-from cell.cli.app import app
-from cell.cli.recorded_tables import verdicts
-from cell.vision import parse_board
+from cell.apps.cli.app import app
+from cell.apps.cli.calibration.recorded_tables import verdicts
+from cell.apps.recordings.command import calibrate_folder
+from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
 from tests.recorded_scenes import recording
 

@@ -19,7 +19,7 @@ from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.rtde import RtdePeer
+from sim_backends.peers.arm.rtde.server import RtdePeer
 
 STIFFNESS = 2e4
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])

@@ -31,7 +31,7 @@ class Supervised:
 
 def command(*arguments: str) -> list[str]:
     """A `cell` command line that runs this checkout."""
-    return [sys.executable, "-c", "from cell.cli import main; main()", *arguments]
+    return [sys.executable, "-c", "from cell.apps.cli import main; main()", *arguments]
 
 
 def cell(*arguments: str, folder: Path, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.cli import main
-from cell.run.folder import list_runs
-from cell.run.reading import read_report
+from cell.apps.cli import main
+from cell.run.files.folder import list_runs
+from cell.run.files.reading import read_report
 from tests.test_readme import block
 from tests.wire.cells import Supervised
 

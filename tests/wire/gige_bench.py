@@ -19,7 +19,7 @@ from drivers.clock import Clock
 from drivers.interfaces import Frame
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec
-from sim_backends.peers.gige import GigePeer
+from sim_backends.peers.camera.gige import GigePeer
 from tests.wire.clocks import ahead
 
 SPEED = 3.0

@@ -19,8 +19,8 @@ from arm_bench import HOME, ArmBench, soon, stand_at_home
 from cable import Cable
 
 from cell.devices.devices import Devices
-from cell.devices.gate import Gate
-from cell.devices.interlocks import Interlocks
+from cell.devices.gate.gate import Gate
+from cell.devices.gate.interlocks import Interlocks
 from cell.devices.stopping import require_healthy
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock

@@ -13,7 +13,7 @@ import pytest
 from arm_bench import ArmBench, soon
 from cable import Cable
 
-from cell.geometry.poses import to_ur
+from cell.measure.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
 from drivers.arm.faults import fault, require_named
 from drivers.arm.ur import UrArm

@@ -15,7 +15,7 @@ import pytest
 from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
@@ -25,7 +25,7 @@ ATTENDING = """
 import sys, threading
 import numpy as np
 from drivers.arm.ur import UrArm
-from drivers.rail.tmcl import TmclRail
+from drivers.rail.tmcl.rail import TmclRail
 from drivers.clock import Clock
 from drivers.errors import CellError
 clock = Clock()

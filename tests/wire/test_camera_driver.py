@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.devices.examination import examine
+from cell.devices.diagnosis.examination import examine
 from drivers.camera.folder import FolderCamera, image_files, read_image
 from drivers.camera.stream import StreamCamera
 from drivers.clock import Clock
@@ -33,8 +33,8 @@ from drivers.errors import (
 )
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
-from sim_backends.peers.frame_wire import message
-from sim_backends.peers.frames import CameraSpec, FramePeer
+from sim_backends.peers.camera.frame_wire import message
+from sim_backends.peers.camera.frames import CameraSpec, FramePeer
 from tests.wire.clocks import ahead
 
 SPEED = 4.0
@@ -105,7 +105,7 @@ def test_times_of_a_frame_that_cannot_be_true_are_refused_by_name(
                 header = {**header, field: wrong(header[field])}
         return message(header, payload)
 
-    monkeypatch.setattr("sim_backends.peers.frames.message", lying)
+    monkeypatch.setattr("sim_backends.peers.camera.frames.message", lying)
     with bench.camera.stream() as frames:
         got = [frames.next(2.0).frame_id for _ in range(5)]
         with pytest.raises(DeviceFault) as met:

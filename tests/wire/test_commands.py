@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.config import default_toml, load_config
+from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect
-from cell.devices.jogging import jog, needed_for, parse_jog
-from cell.run.lock import CellLock
+from cell.devices.lock import CellLock
+from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.errors import InterlockError, NotConnectedError
 from tests.packages import RAIL, install, with_acme_rail
 from tests.wire.cells import ask, cell, served

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import load_config
+from cell.config.cell_config import load_config
 from tests.described_cells import described, write_saddle
 from tests.test_described_jobs import SADDLE
 from tests.wire.cells import ask, served

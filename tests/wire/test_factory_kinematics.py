@@ -12,8 +12,8 @@ import pytest
 from arm_bench import ArmBench
 from cable import Cable
 
-from cell.devices.diagnosis import _arm_state
-from cell.geometry.poses import to_ur
+from cell.devices.diagnosis.diagnosis import _arm_state
+from cell.measure.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
 from drivers.arm.factory import parse_kinematics_info, read_factory_kinematics
 from drivers.arm.ur import UrArm

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator
 import pytest
 from websockets.sync.client import ClientConnection
 
-from cell.console.console import Console
-from cell.supervisor import Cell
+from cell.apps.console.host.console import Console
+from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
 from tests.console.server import until
 from tests.console.test_console import Browser

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from cell.run.folder import list_runs
-from cell.run.reading import read_report, run_row
+from cell.procedures.sweep.stored_sweep import FILE
+from cell.run.files.folder import list_runs
+from cell.run.files.reading import read_report, run_row
 from cell.run.resumption import UnfinishedRun
-from cell.steps.stored_sweep import FILE
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step

@@ -21,7 +21,7 @@ OPEN = """
 import sys
 from pathlib import Path
 from cell.devices import assembly
-from cell.config import load_config
+from cell.config.cell_config import load_config
 from drivers.clock import Clock
 config = load_config(Path("sim.toml"))
 clock = Clock(config.cell.time_scale)

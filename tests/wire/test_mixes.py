@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.devices.followed_camera import FollowedCamera
-from cell.job import job_path
+from cell.config.job import job_path
+from cell.devices.simulated.followed_camera import FollowedCamera
 from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.described_cells import changed, described, pose
 from tests.wire.cells import SPEED, served
 from tests.wire.cells import cell as command

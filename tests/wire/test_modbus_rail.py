@@ -23,16 +23,16 @@ from pymodbus.framer import FramerRTU
 
 from cell.devices.contracts import Bench, Faults
 from cell.devices.contracts.rail import RailContract
-from cell.devices.rail_makes import ModbusRailConfig, register_map
+from cell.makes.rails import ModbusRailConfig, register_map
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import LinkStatistics, Rail
-from drivers.rail.modbus import ModbusRail
-from drivers.rail.modbus_link import ModbusLink, ModbusRefused
-from drivers.rail.registers import Action
+from drivers.rail.modbus.link import ModbusLink, ModbusRefused
+from drivers.rail.modbus.rail import ModbusRail
+from drivers.rail.modbus.registers import Action
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.modbus_drive import ModbusDrive, ModbusPeer
+from sim_backends.peers.rail.modbus_drive import ModbusDrive, ModbusPeer
 from tests.modbus_maps import EDGES, PATHS, RAIL
 
 pytestmark = pytest.mark.wire
@@ -393,8 +393,8 @@ def test_who_only_looks_writes_nothing(drive: Drive) -> None:
 OWNER = """
 import sys
 from drivers.clock import Clock
-from drivers.rail.modbus import ModbusRail
-from drivers.rail.registers import *
+from drivers.rail.modbus.rail import ModbusRail
+from drivers.rail.modbus.registers import *
 rail = ModbusRail("rail", sys.argv[1], eval(sys.argv[2]), lead=0.002, counts_per_turn=10_000, travel=(0.0, 0.1),
     max_speed=0.04, acceleration=0.2, clock=Clock(5.0), unit=7)
 rail.home().wait(60)

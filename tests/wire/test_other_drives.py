@@ -12,7 +12,7 @@ import can
 import pytest
 from other_drives import OtherDrives
 
-from cell.devices.canopen_nodes import look_at_nodes
+from cell.makes.canopen_nodes import look_at_nodes
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from drivers.vehicle.cia402.geometry import WheelDrives

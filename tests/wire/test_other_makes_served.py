@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import default_toml
+from cell.config.cell_config import default_toml
 from tests.wire.cells import cell, served
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]

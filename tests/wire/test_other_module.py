@@ -10,7 +10,7 @@ from other_module import NAMES, Order, OtherModule
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
-from drivers.rail.tmcl import TmclRail
+from drivers.rail.tmcl.rail import TmclRail
 
 pytestmark = pytest.mark.wire
 ACCELERATION, SPEED = 1.0, 0.05

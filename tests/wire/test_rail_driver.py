@@ -29,12 +29,12 @@ from drivers.errors import (
 from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.motion import move_duration, run_up_distance
 from drivers.rail.timing import fit_line
-from drivers.rail.tmcl import TmclRail
-from drivers.rail.tmcl_codec import Axis
-from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.tmcl.codec import Axis
+from drivers.rail.tmcl.link import TmclLink
+from drivers.rail.tmcl.rail import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.wire.clocks import ahead
 
 SPEED = 5.0

@@ -18,7 +18,7 @@ from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnec
 from drivers.relay.boards import LcusBoard, open_board, open_numato
 from drivers.relay.port import RelayPort
 from drivers.relay.switched import BoardClaw, BoardLaser
-from sim_backends.peers.relays import LcusPeer, NumatoPeer, RelayBoard
+from sim_backends.peers.switches.relays import LcusPeer, NumatoPeer, RelayBoard
 
 pytestmark = pytest.mark.wire
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.config import load_config
+from cell.config.cell_config import load_config
 from cell.devices.assembly import connect
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken

@@ -70,7 +70,7 @@ class SimulatedArm:
     """A simulated arm in a process of its own; standard input brings about faults."""
 
     def __init__(self, *options: str) -> None:
-        command = [sys.executable, "-m", "sim_backends.peers.rtde", "--json", "--until-eof", *options]
+        command = [sys.executable, "-m", "sim_backends.peers.arm.rtde.server", "--json", "--until-eof", *options]
         self._process = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
         )

@@ -280,7 +280,7 @@ def test_the_dashboard_answers_as_the_makers_reference_has_it(address: str) -> N
 
 def test_programs_of_a_folder_are_loaded_played_and_named(tmp_path) -> None:
     (tmp_path / "waiting.script").write_text("def waiting():\n  while True:\n    sync()\n  end\nend\n")
-    command = [sys.executable, "-m", "sim_backends.peers.rtde", "--programs", str(tmp_path), "--until-eof"]
+    command = [sys.executable, "-m", "sim_backends.peers.arm.rtde.server", "--programs", str(tmp_path), "--until-eof"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         address = process.stdout.readline().strip()
         answers = dashboard(address, "load waiting.urp", "get loaded program", "play", "programState", "pause", "stop")

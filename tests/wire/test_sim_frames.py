@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.peers.frames import BACKLOG, CameraSpec, FramePeer
+from sim_backends.peers.camera.frames import BACKLOG, CameraSpec, FramePeer
 from sim_backends.peers.truth import TruthPeer
 
 pytestmark = pytest.mark.wire

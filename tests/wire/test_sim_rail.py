@@ -19,7 +19,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models import ramp
 from sim_backends.models.rail import RailModel, RailParams, RailSettings
 from sim_backends.models.screw import Screw
-from sim_backends.peers.tmcl import TmclPeer
+from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.wire.clocks import until
 
 STEPS = 200 * 256

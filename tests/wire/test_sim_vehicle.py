@@ -19,7 +19,7 @@ import pytest
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, State, VehicleModel, VehicleParams
-from sim_backends.peers.agilex import AgilexPeer
+from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.wire.clocks import until
 
 DBC = Path(__file__).parents[2] / "drivers" / "vehicle" / "agilex_v2.dbc"

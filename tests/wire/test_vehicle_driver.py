@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import serial
 
-from cell.job import load_job
-from cell.steps.whereabouts import Whereabouts
+from cell.config.job import load_job
+from cell.procedures.drive.whereabouts import Whereabouts
 from drivers.clock import Clock
 from drivers.errors import (
     ConfigError,
@@ -31,7 +31,7 @@ from drivers.interfaces import Vehicle
 from drivers.vehicle.agilex import AgilexVehicle
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
-from sim_backends.peers.agilex import AgilexPeer
+from sim_backends.peers.vehicle.agilex import AgilexPeer
 
 pytestmark = pytest.mark.wire
 

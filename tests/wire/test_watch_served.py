@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import load_config
-from cell.terminal.watch import watching
+from cell.apps.watch.watch import watching
+from cell.config.cell_config import load_config
 from drivers.clock import Clock
 from tests.wire.cells import served, started
 

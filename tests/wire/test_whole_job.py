@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from can.io.canutils import CanutilsLogReader
 
-from cell.record.export import as_candump
-from cell.record.information import information
-from cell.run.folder import list_runs
-from cell.run.reading import read_report
+from cell.run.files.folder import list_runs
+from cell.run.files.reading import read_report
+from cell.run.record.export import as_candump
+from cell.run.record.information import information
 from drivers.vehicle.agilex_link import load_database
 from tests.wire.cells import Supervised, assert_safe, served, started, wait_for_step
 from tests.wire.conftest import supervise

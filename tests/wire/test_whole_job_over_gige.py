@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config import default_toml
+from cell.config.cell_config import default_toml
 from tests.wire.cells import cell
 from tests.wire.gige_bench import require_aravis
 

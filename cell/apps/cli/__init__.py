@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    from cell.cli.app import app
+    from cell.apps.cli.app import app
     from drivers.errors import CellError, ConfigError, Interrupted
     from statemachine.journal import JournalError
 
@@ -52,7 +52,7 @@ def _run() -> None:
 
 def _simulated_form(error: Exception) -> str:
     """The command that was typed, for a simulated cell, where there is no configuration of a real one."""
-    from cell.which_config import NoConfiguration
+    from cell.config.files import NoConfiguration
 
     return f": `{shlex.join(['cell', *sys.argv[1:], '--sim', 'all'])}`" if isinstance(error, NoConfiguration) else ""
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import (
-    calibrate,
+from cell.apps.cli.calibration import calibrate
+from cell.apps.cli.commands import (
     commission,
     console,
     devices,
@@ -22,7 +22,7 @@ from cell.cli import (
     sim,
     watch,
 )
-from cell.cli.usage import App
+from cell.apps.cli.usage import App
 
 COMMANDS = "assembly_cell.commands"
 """Entry points that add commands: called with a `typer.Typer`, whose commands and groups come to those of `cell`."""
@@ -39,7 +39,7 @@ app = App(
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from cell.version import release
+        from cell.base.version import release
 
         typer.echo(f"cell {release()}")
         raise typer.Exit
@@ -55,7 +55,7 @@ def _cell(
     ] = 0,
 ) -> None:
     """Options before any command."""
-    from cell.run.logs import console_log
+    from cell.run.files.logs import console_log
 
     console_log(verbose)
 

@@ -45,7 +45,7 @@ def _is_job(path: Path) -> bool:
 
 def devices(incomplete: str) -> list[str]:
     """Devices of a cell."""
-    from cell.which_config import DEVICES
+    from cell.config.files import DEVICES
 
     return [name for name in DEVICES if name.startswith(incomplete)]
 
@@ -69,7 +69,7 @@ def faults(incomplete: str) -> list[str]:
 
 def steps(incomplete: str) -> list[str]:
     """Steps of the jobs that ship."""
-    from cell.steps.kinds import PLACE
+    from cell.procedures.steps.kinds import PLACE
 
     return [name for name in PLACE.names if name.startswith(incomplete)]
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
-from cell.cli.end_screen import duration, end_screen
-from cell.cli.options import new_table
-from cell.report.figures import noise_rows
-from cell.which_config import DEVICES
+from cell.apps.cli.end_screen import duration, end_screen
+from cell.apps.cli.options import new_table
+from cell.config.files import DEVICES
+from cell.run.report.figures import noise_rows
 
 COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cell.report.figures import following_words, shown_limit, shown_value, simulated_words
-from cell.run.reading import wall_seconds
+from cell.run.files.reading import wall_seconds
+from cell.run.report.figures import following_words, shown_limit, shown_value, simulated_words
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -70,7 +70,7 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
 
 def _job(report: Mapping[str, Any]) -> str:
     """The job as one would name it: the shipped ones by their names, others by their files."""
-    from cell.job import job_path, shipped_jobs
+    from cell.config.job import job_path, shipped_jobs
 
     path = Path(str(report.get("job_file", report.get("job"))))
     if path.suffix == ".toml" and path.stem in shipped_jobs() and path == job_path(path.stem):

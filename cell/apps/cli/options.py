@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli import completing
+from cell.apps.cli import completion as completing
 
 
 class Level(StrEnum):

@@ -43,7 +43,7 @@ def tell_question(event: Event, console: Console | None = None) -> None:
 
 def kept_loops() -> list[float]:
     """When each compiled loop was kept for this Python, in whichever process, seconds since the epoch."""
-    here = Path(__file__).parents[2]
+    here = Path(__file__).parents[3]
     roots = [Path(folder)] if (folder := os.environ.get("NUMBA_CACHE_DIR")) else [here / "cell", here / "sim_backends"]
     times = []
     for index in (path for root in roots for path in root.rglob("*.nbi")):

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from cell.cli import EXIT_USAGE
+from cell.apps.cli import EXIT_USAGE
 from drivers.errors import CellError, ConfigError
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -47,5 +47,7 @@ def in_words(error: Any) -> str:
         return ""
     for pattern, word in _WORDS:
         text = re.sub(pattern, word, text)
+    if re.search(r"No such command '(bench|paper)'", text):
+        return f"{text}; the laboratory brings it: `pip install -e lab` in the checkout"
     command = error.ctx.command_path if error.ctx is not None else "cell"
     return f"{text}; `{command} --help` shows what may be given"

@@ -8,14 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cell.commission.check import Check, Result
-from cell.commission.desk import Desk
-from cell.commission.person import Person
-from cell.commission.progress import Progress
-from cell.commission.sequence import Commissioning
-from cell.config import CONFIGURATION, load_config, require_confirm
-from cell.job import job_path
-from cell.supervisor import Cell
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.person import Person
+from cell.apps.commission.progress import Progress
+from cell.apps.commission.sequence import Commissioning
+from cell.apps.commission.workplace import Desk
+from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
+from cell.config.job import job_path
+from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
 
 FOLDER = "commissioning"

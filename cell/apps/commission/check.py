@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.interfaces import Reading
 
 if TYPE_CHECKING:
-    from cell.commission.desk import Desk
+    from cell.apps.commission.workplace import Desk
 
 
 class Verdict(StrEnum):

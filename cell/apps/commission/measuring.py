@@ -11,12 +11,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.commission.check import Result
-from cell.commission.desk import Desk
-from cell.commission.mounting import Axes, RoughMounting, axes_from_shifts, solve_mounting
-from cell.commission.seeing import Eye, Seen, find_view, see
-from cell.geometry.poses import from_parts
-from cell.vision.board.spec import centre_of
+from cell.apps.commission.check import Result
+from cell.apps.commission.mounting import Axes, RoughMounting, axes_from_shifts, solve_mounting
+from cell.apps.commission.seeing import Eye, Seen, find_view, see
+from cell.apps.commission.workplace import Desk
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision.board.spec import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
 
 SMALL_TURN, TURN = math.radians(5.0), math.radians(12.0)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_parts, mean
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_parts, mean
 from drivers.errors import RefusedError
 
 LEAST_SHIFT_SHARE = 0.2

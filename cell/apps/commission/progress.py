@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cell.commission.check import Check, Result, Verdict
-from cell.config import CellConfig
-from cell.job import Job
-from cell.run.folder import write_json
+from cell.apps.commission.check import Check, Result, Verdict
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.run.files.folder import write_json
 from drivers.errors import ConfigError
 
 FILE = "progress.json"

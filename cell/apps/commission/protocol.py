@@ -9,10 +9,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cell.commission.check import Check, bounds
-from cell.commission.progress import Progress
-from cell.config import CellConfig
-from cell.version import release
+from cell.apps.commission.check import Check, bounds
+from cell.apps.commission.progress import Progress
+from cell.base.version import release
+from cell.config.cell_config import CellConfig
 from drivers.interfaces import Reading
 
 FILE = "protocol.html"

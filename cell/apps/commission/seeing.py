@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.store import nominal_camera
-from cell.commission.check import Result
-from cell.commission.desk import Desk
-from cell.config import CameraConfig
-from cell.device_config import PlateConfig
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.poses import from_parts, from_ur
-from cell.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
-from cell.vision.board.spec import centre_of
+from cell.apps.commission.check import Result
+from cell.apps.commission.workplace import Desk
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CameraConfig
+from cell.makes.records import PlateConfig
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
+from cell.measure.vision.board.spec import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame, Image
 

@@ -10,21 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from cell.commission import (
-    arm_checks,
-    camera_checks,
-    closing_checks,
-    link_checks,
-    output_checks,
-    rail_checks,
-    stop_checks,
-    vehicle_checks,
-)
-from cell.commission.check import Check, Result, Verdict
-from cell.commission.desk import Declined, Desk, told
-from cell.commission.progress import Progress, done_well
-from cell.commission.toml_edit import write_changes
-from cell.job import job_path
+from cell.apps.commission.check import Check, Result, Verdict
+from cell.apps.commission.checks import arm as arm_checks
+from cell.apps.commission.checks import cameras as camera_checks
+from cell.apps.commission.checks import closing as closing_checks
+from cell.apps.commission.checks import links as link_checks
+from cell.apps.commission.checks import outputs as output_checks
+from cell.apps.commission.checks import rail as rail_checks
+from cell.apps.commission.checks import stops as stop_checks
+from cell.apps.commission.checks import vehicle as vehicle_checks
+from cell.apps.commission.progress import Progress, done_well
+from cell.apps.commission.toml_edit import write_changes
+from cell.apps.commission.workplace import Declined, Desk, told
+from cell.config.job import job_path
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
 from drivers.interfaces import Frame

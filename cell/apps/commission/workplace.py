@@ -16,23 +16,23 @@ import cv2
 import numpy as np
 import pinocchio as pin
 
-from cell.commission.check import Result
-from cell.commission.person import Person
-from cell.config import load_config
+from cell.apps.commission.check import Result
+from cell.apps.commission.person import Person
+from cell.config.cell_config import load_config
+from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
-from cell.devices.truth_link import cause_fault, make_ready
-from cell.job import Job, load_job
+from cell.devices.simulated.truth_link import cause_fault, make_ready
 from cell.motion.arm_models import HOME
 from cell.motion.kinematics import Joints
+from cell.procedures.arm.moves import Mover
 from cell.run.recorded_work import Hands
-from cell.steps.moves import Mover
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
 if TYPE_CHECKING:
-    from cell.config import CellConfig
-    from cell.supervisor import Cell
+    from cell.config.cell_config import CellConfig
+    from cell.run.session.supervisor import Cell
 
 SLOW_JOINT = math.radians(15.0)
 """Of the leading joint in free moves, rad/s."""
@@ -128,7 +128,7 @@ class Desk:
 
     def fill_claw(self) -> None:
         """At a simulated cell: what a person's hands do, who puts the job's part into the claw."""
-        from cell.devices.described import Described
+        from cell.devices.simulated.described import Described
 
         described = Described.of(self.job_file)
         if self.cell.simulated is not None:

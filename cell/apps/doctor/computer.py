@@ -10,8 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-from cell.doctor.check import Check, judged
-from cell.run.folder import list_runs
+from cell.apps.doctor.check import Check, judged
+from cell.run.files.folder import list_runs
 
 ROOM_BYTES = 2_000_000_000
 RUN_BYTES = 40_000_000

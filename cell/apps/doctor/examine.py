@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cell.config import DEVICES, beside, find_config, load_config, runs_folder
-from cell.devices.local_devices import ROOT
-from cell.doctor.check import Check
-from cell.doctor.computer import (
+from cell.apps.doctor.check import Check
+from cell.apps.doctor.computer import (
     browser_check,
     clock_check,
     clock_synchronised,
@@ -16,8 +14,10 @@ from cell.doctor.computer import (
     python_check,
     scheduling_check,
 )
-from cell.doctor.links import link_checks
-from cell.doctor.packages import package_checks, shadow_check
+from cell.apps.doctor.links import link_checks
+from cell.apps.doctor.packages import package_checks, shadow_check
+from cell.config.cell_config import DEVICES, beside, find_config, load_config, runs_folder
+from cell.devices.diagnosis.local_devices import ROOT
 from drivers.errors import ConfigError
 
 EXTRA_OF_DRIVER = {"canopen": "canopen"}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from cell.config import DEVICES, CellConfig
-from cell.device_config import DeviceConfig
-from cell.devices.local_devices import barred, opened_by
-from cell.doctor.check import Check, judged
+from cell.apps.doctor.check import Check, judged
+from cell.config.cell_config import DEVICES, CellConfig
+from cell.devices.diagnosis.local_devices import barred, opened_by
+from cell.makes.records import DeviceConfig
 from drivers.vehicle.can_interface import CanInterface, can_interface
 
 LEAST_BUFFER = 4_000_000

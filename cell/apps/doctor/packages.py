@@ -10,8 +10,8 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from cell.doctor.check import Check, judged
-from cell.version import DISTRIBUTION
+from cell.apps.doctor.check import Check, judged
+from cell.base.version import DISTRIBUTION
 
 ALWAYS = ""
 """The name of what is asked for without an extra."""
@@ -21,7 +21,7 @@ OWN = ("cell", "drivers", "statemachine", "sim_backends")
 
 
 def shadow_check(
-    installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[2]
+    installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[3]
 ) -> Check:
     """Whether another distribution or another folder has a package of the same name as one of ours.
 
@@ -44,7 +44,7 @@ def shadow_check(
 def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
     """What is asked for always and with each of these extras: by the checkout's pyproject.toml, which is newer than
     what was noted when it was installed, else by the installed distribution. `PackageNotFoundError` without either."""
-    project = Path(__file__).parents[2] / "pyproject.toml"
+    project = Path(__file__).parents[3] / "pyproject.toml"
     if project.is_file():
         table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
         groups = table.get("optional-dependencies", {})

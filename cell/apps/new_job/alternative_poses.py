@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.inversion import NominalSurface
-from cell.inversion.elsewhere import settled, told
-from cell.inversion.search import MOST_SHIFT, candidates
-from cell.job import Job
-from cell.new_job.rays import Array
-from cell.new_job.sweeps import Seen
+from cell.apps.new_job.rays import Array
+from cell.apps.new_job.sweeps import Seen
+from cell.config.job import Job
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.alternative_poses import settled, told
+from cell.measure.inversion.start_poses import MOST_SHIFT, candidates
 
 POINTS = 600
 """Of the sweeps, that are laid onto the surface."""

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.addresses import checked_name
-from cell.device_config import Mounting, Pose
-from cell.geometry.poses import from_parts
-from cell.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
-from cell.new_job.mesh_file import Body, Drawn
-from cell.new_job.overlap import overlapping
-from cell.new_job.questions import Asker, checked, choice, pose, pose_words, three
-from cell.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
-from cell.new_job.text import deg, mm
-from cell.new_job.units import METRES, possible_units, size_words, told_by_size
-from cell.units import parse_quantity, shown
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.apps.new_job.mesh_file import Body, Drawn
+from cell.apps.new_job.overlap import overlapping
+from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
+from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
+from cell.apps.new_job.text import deg, mm
+from cell.apps.new_job.units import METRES, possible_units, size_words, told_by_size
+from cell.base.addresses import checked_name
+from cell.base.units import parse_quantity, shown
+from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
+from cell.makes.records import Mounting, Pose
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from drivers.errors import ConfigError
 
 LISTED = 9

@@ -12,24 +12,24 @@ from pathlib import Path
 
 import numpy as np
 
+from cell.apps.new_job.alternative_poses import FITS, rivals
+from cell.apps.new_job.answers import as_pose, job_name, laid_mesh, station, template
+from cell.apps.new_job.mesh_file import Drawn, read_drawing
+from cell.apps.new_job.observability import known, place_from, told_by_few
+from cell.apps.new_job.picture import draw_proposal
+from cell.apps.new_job.proposal import Proposal, propose
+from cell.apps.new_job.questions import Asker, choice
+from cell.apps.new_job.rays import Array
+from cell.apps.new_job.sight import sight_problems
+from cell.apps.new_job.surface import about, written
+from cell.apps.new_job.text import job_text, pose_text
+from cell.base.units import parse_quantity
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
-from cell.config import CellConfig
-from cell.devices.described import Described
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job, load_job
-from cell.new_job.answers import as_pose, job_name, laid_mesh, station, template
-from cell.new_job.knowledge import known, place_from, told_by_few
-from cell.new_job.mesh_file import Drawn, read_drawing
-from cell.new_job.picture import draw_proposal
-from cell.new_job.proposal import Proposal, propose
-from cell.new_job.questions import Asker, choice
-from cell.new_job.rays import Array
-from cell.new_job.rivals import FITS, rivals
-from cell.new_job.sight import sight_problems
-from cell.new_job.surface import about, written
-from cell.new_job.text import job_text, pose_text
-from cell.units import parse_quantity
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, load_job
+from cell.devices.simulated.described import Described
+from cell.measure.inversion import NominalSurface, PlacePose
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
 STEP_MM = (0.1, 2.0)

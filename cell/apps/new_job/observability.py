@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.config import CellConfig
-from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.inversion.observability import FREE, Verdict, judge
-from cell.job import Job
-from cell.new_job.rays import Array
-from cell.new_job.sweeps import Seen, as_cloud
-from cell.reconstruction import flange_motions
+from cell.apps.new_job.rays import Array
+from cell.apps.new_job.sweeps import Seen, as_cloud
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
+from cell.measure.inversion.observability import FREE, Verdict, judge
+from cell.measure.reconstruction import flange_motions
 
 OVER = 1e-4
 """How far points of the drawing may lie from the surface that was cut out of it, m."""

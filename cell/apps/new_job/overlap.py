@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cell.new_job.mesh_file import Body
-from cell.new_job.rays import ABOVE, Array, Faces, Rays
+from cell.apps.new_job.mesh_file import Body
+from cell.apps.new_job.rays import ABOVE, Array, Faces, Rays
 
 APART = 1e-4
 """Share of a body's size by which another has to reach into it to overlap: bodies that touch do not."""

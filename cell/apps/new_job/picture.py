@@ -16,19 +16,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.spatial import ConvexHull, cKDTree
 
+from cell.apps.new_job.proposal import SEEN_WITHIN, Proposal
+from cell.apps.new_job.rays import Array
+from cell.apps.new_job.sweeps import Seen
 from cell.check.reach import nominal_scan, station_planner
-from cell.config import CellConfig
-from cell.geometry.poses import transform
-from cell.inversion import NominalSurface
-from cell.job import SwathSection
+from cell.config.cell_config import CellConfig
+from cell.config.job import SwathSection
+from cell.measure.geometry.poses import transform
+from cell.measure.inversion import NominalSurface
 from cell.motion.arm_models import HOME
 from cell.motion.bodies import Body
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import Unreachable
-from cell.new_job.proposal import SEEN_WITHIN, Proposal
-from cell.new_job.rays import Array
-from cell.new_job.sweeps import Seen
-from cell.steps.camera_poses import base_from_place_at_target, scan_plans
+from cell.procedures.arm.camera_poses import base_from_place_at_target, scan_plans
 
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:olive", "tab:cyan", "tab:pink")
 PLACES = 6000

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
+from cell.apps.new_job.observability import verdict
+from cell.apps.new_job.rays import ABOVE, Array, Rays
+from cell.apps.new_job.surface import Laid, open_side
+from cell.apps.new_job.sweeps import FARTHEST, NEAREST, Seen, look
 from cell.check.fit import RAMP_MARGIN
-from cell.config import CALIBRATION_DEPTHS, CellConfig
-from cell.inversion import NominalSurface
-from cell.job import Job, ScanSection, SwathSection
-from cell.new_job.knowledge import verdict
-from cell.new_job.rays import ABOVE, Array, Rays
-from cell.new_job.surface import Laid, open_side
-from cell.new_job.sweeps import FARTHEST, NEAREST, Seen, look
+from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
+from cell.config.job import Job, ScanSection, SwathSection
+from cell.measure.inversion import NominalSurface
 from drivers.errors import ConfigError
 
 OVERLAP = 0.008

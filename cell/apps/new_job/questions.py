@@ -14,9 +14,9 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from cell.device_config import Mounting, Pose
-from cell.toml_file import wording
-from cell.units import shown
+from cell.base.toml_file import wording
+from cell.base.units import shown
+from cell.makes.records import Mounting, Pose
 from drivers.errors import ConfigError
 
 PROGRESS_S = 3.0
@@ -122,7 +122,7 @@ def pose(kind: type[P]) -> Callable[[str], P]:
 
 def pose_words(where: Pose | Mounting) -> str:
     """A pose as `pose` reads it."""
-    from cell.new_job.text import deg, mm
+    from cell.apps.new_job.text import deg, mm
 
     there, turn = (", ".join(map(write, each)) for write, each in ((mm, where.translation), (deg, where.rotation)))
     return f"{there}; {turn}".replace('"', "")

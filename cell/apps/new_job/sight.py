@@ -8,15 +8,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.config import CellConfig
-from cell.geometry.poses import transform
-from cell.job import Job
+from cell.apps.new_job.rays import Array
+from cell.apps.new_job.sweeps import Seen
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.config.mounting import mounted
+from cell.measure.geometry.poses import transform
+from cell.measure.vision import parse_board
 from cell.motion.bodies import Body, tool_bodies
-from cell.mounting import mounted
-from cell.new_job.rays import Array
-from cell.new_job.sweeps import Seen
-from cell.steps.camera_poses import base_from_place_at_target, look_pose, photo_pose
-from cell.vision import parse_board
+from cell.procedures.arm.camera_poses import base_from_place_at_target, look_pose, photo_pose
 
 MOST_HIDDEN = 0.02
 """Share of the scanned points that may be hidden behind what the claw holds."""

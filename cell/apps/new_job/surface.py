@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import from_parts
-from cell.new_job.mesh_file import Body
-from cell.new_job.overlap import before
-from cell.new_job.rays import ABOVE, NEAR, Array, Faces, Rays
-from cell.new_job.units import METRES
+from cell.apps.new_job.mesh_file import Body
+from cell.apps.new_job.overlap import before
+from cell.apps.new_job.rays import ABOVE, NEAR, Array, Faces, Rays
+from cell.apps.new_job.units import METRES
+from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError
 
 UP = {"z": (0, 0, 1), "-z": (0, 0, -1), "x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0)}

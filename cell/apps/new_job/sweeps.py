@@ -12,15 +12,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from cell.apps.new_job.rays import SMOOTH, Array, Rays
 from cell.check.reach import nominal_scan
-from cell.config import CellConfig
-from cell.geometry.light_plane import triangulate
-from cell.geometry.poses import from_parts
-from cell.inversion.correspondences import SIGMA_FLOOR
-from cell.job import Job
-from cell.new_job.rays import SMOOTH, Array, Rays
-from cell.reconstruction.cloud import Cloud
-from cell.steps.camera_poses import ScanPlan, scan_plans
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.geometry.light_plane import triangulate
+from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion.correspondences import SIGMA_FLOOR
+from cell.measure.reconstruction.cloud import Cloud
+from cell.procedures.arm.camera_poses import ScanPlan, scan_plans
 
 STRIPE_PX = 0.12
 """One standard deviation of a stripe's centre, px: what speckle leaves on a matt surface."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cell.device_config import Pose
-from cell.job import Job, SwathSection
-from cell.obstacles import StationObstacle
+from cell.config.job import Job, SwathSection
+from cell.config.obstacles import StationObstacle
+from cell.makes.records import Pose
 
 
 def job_text(job: Job, heading: Sequence[str]) -> str:

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.conventions import FORM, TRIED, Reading, readings_of, why_not
-from cell.calibration.recorded.series import Series
-from cell.calibration.solve.consistency import odd_turns, orders, turn_votes, weighted_median
-from cell.calibration.solve.hand_eye import park_martin
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_parts
+from cell.apps.recordings.consistency import odd_turns, orders, turn_votes, weighted_median
+from cell.apps.recordings.conventions import FORM, TRIED, Reading, readings_of, why_not
+from cell.apps.recordings.series import Series
+from cell.measure.calibration.solve.hand_eye import park_martin
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}

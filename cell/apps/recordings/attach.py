@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.agreement import UNITS, Decision, decide, scale_problem
-from cell.calibration.recorded.conventions import why_not
-from cell.calibration.recorded.frames import RecordedFrame
-from cell.calibration.recorded.series import Series
-from cell.geometry.camera import CameraModel
-from cell.geometry.poses import from_parts
-from cell.vision.board.board import board_pose
-from cell.vision.pictures import PictureRefused, Reason
-from cell.vision.stripe.planes import Laser
+from cell.apps.recordings.agreement import UNITS, Decision, decide, scale_problem
+from cell.apps.recordings.conventions import why_not
+from cell.apps.recordings.frames import RecordedFrame
+from cell.apps.recordings.series import Series
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.stripe.planes import Laser
 from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES, FARTHEST_M = 3, 20.0

@@ -15,25 +15,31 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.recorded import result as form
-from cell.calibration.recorded.frames import RecordedFrame
-from cell.calibration.solve.adjustment import Adjustment
-from cell.calibration.solve.blocks import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
-from cell.calibration.solve.board_shape import moved_by_bend
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
-from cell.calibration.solve.closed_form import points_on_boards
-from cell.calibration.solve.flatness import flatness, leave_one_out
-from cell.calibration.solve.hand_eye_checks import hand_eye_checks
-from cell.calibration.solve.intrinsics import Intrinsics
-from cell.calibration.solve.joint import Staged, solve_staged, start_state
-from cell.calibration.solve.plane_checks import PlaneKnown, crooked, odd_stripes, plane_checks, planes_of_cameras
-from cell.calibration.solve.scale import Scale, metric_scale
-from cell.calibration.solve.starts import stripe_means
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.board import board_pose
-from cell.vision.stripe.extract import StripeProfile
+from cell.apps.recordings import result as form
+from cell.apps.recordings.frames import RecordedFrame
+from cell.measure.calibration.judge.board_shape import moved_by_bend
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.flatness import flatness, leave_one_out
+from cell.measure.calibration.judge.hand_eye_checks import hand_eye_checks
+from cell.measure.calibration.judge.plane_checks import (
+    PlaneKnown,
+    crooked,
+    odd_stripes,
+    plane_checks,
+    planes_of_cameras,
+)
+from cell.measure.calibration.judge.scale import Scale, metric_scale
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjustment
+from cell.measure.calibration.solve.blocks import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
+from cell.measure.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
+from cell.measure.calibration.solve.closed_form import points_on_boards
+from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.joint import Staged, solve_staged, start_state
+from cell.measure.calibration.solve.starts import stripe_means
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
 STRANGE_SHARE, STRANGE_TURN = 0.15, math.radians(10.0)

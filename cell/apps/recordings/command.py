@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cell.calibration.recorded.attach import Options, attach_poses
-from cell.calibration.recorded.conventions import check_reading
-from cell.calibration.recorded.frames import RecordedFrame, read_frames
-from cell.calibration.recorded.pairs import calibrate_pairs, read_pose_pairs
-from cell.calibration.recorded.result import empty_result, frame_dict
-from cell.calibration.recorded.series import Series, in_order_of_views, list_folder, match_series, read_series
-from cell.calibration.recorded.solution import (
+from cell.apps.recordings.attach import Options, attach_poses
+from cell.apps.recordings.conventions import check_reading
+from cell.apps.recordings.frames import RecordedFrame, read_frames
+from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
+from cell.apps.recordings.result import empty_result, frame_dict
+from cell.apps.recordings.series import Series, in_order_of_views, list_folder, match_series, read_series
+from cell.apps.recordings.solution import (
     CameraChanged,
     agreeing,
     camera_of,
@@ -25,7 +25,7 @@ from cell.calibration.recorded.solution import (
     rough_camera,
     solve_frames,
 )
-from cell.vision.board.spec import BoardSpec
+from cell.measure.vision.board.spec import BoardSpec
 from drivers.errors import ConfigError, RefusedError
 
 

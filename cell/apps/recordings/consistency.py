@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.frames import RecordedFrame, by_stop, merged
-from cell.calibration.solve.hand_eye import park_martin
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.board import board_pose
-from cell.vision.pictures import Reason
+from cell.apps.recordings.frames import RecordedFrame, by_stop, merged
+from cell.measure.calibration.solve.hand_eye import park_martin
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.pictures import Reason
 from drivers.errors import RefusedError
 
 # Turns that differ by so much, and by so many times what is usual in the folder, are of another pose or picture.

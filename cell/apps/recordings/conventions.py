@@ -12,9 +12,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from cell.calibration.recorded.texts import COUNTS, ORTHOGONAL_OFF
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_matrix, from_parts, from_quaternion
+from cell.apps.recordings.texts import COUNTS, ORTHOGONAL_OFF
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_matrix, from_parts, from_quaternion
 from drivers.errors import ConfigError
 
 TRIED = {

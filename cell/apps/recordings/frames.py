@@ -19,16 +19,16 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.recorded.series import Listing, frame_key
-from cell.calibration.recorded.stripes import Channel, ReadStripe, Source, calmest, choose_channel, read_on_board
-from cell.calibration.recorded.texts import PICTURES
-from cell.geometry.poses import difference, mean
-from cell.vision.board.board import find_board
-from cell.vision.board.spec import BoardSpec
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import PictureRefused, Reason, read_picture
-from cell.vision.stripe.extract import Laser, StripeProfile
-from cell.vision.stripe.planes import read_colours
+from cell.apps.recordings.series import Listing, frame_key
+from cell.apps.recordings.stripes import Channel, ReadStripe, Source, calmest, choose_channel, read_on_board
+from cell.apps.recordings.texts import PICTURES
+from cell.measure.geometry.poses import difference, mean
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
+from cell.measure.vision.stripe.extract import Laser, StripeProfile
+from cell.measure.vision.stripe.planes import read_colours
 from drivers.errors import ConfigError
 
 Small = NDArray[np.float32]

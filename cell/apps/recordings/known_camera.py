@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.recorded.texts import decoded, stored_matrix, structured
-from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
-from cell.storage import EditedError, is_intact
+from cell.apps.recordings.texts import decoded, stored_matrix, structured
+from cell.base.storage import EditedError, is_intact
+from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel
 from drivers.errors import ConfigError
 
 FORM = "it needs width, height, fx, fy, cx, cy and k1 … k3, or camera_matrix and distortion coefficients"

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.frames import SAME_M, SAME_RAD, counted, grouped, near
-from cell.calibration.recorded.result import closed_form_dict, empty_result, hand_eye_dict, setup_note
-from cell.calibration.recorded.solution import apply_checks
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.consistency import misplacements, odd_turns
-from cell.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
-from cell.calibration.solve.scale import metric_scale
-from cell.geometry.camera import Array
-from cell.geometry.poses import difference, from_matrix, mean
-from cell.vision.pictures import Reason
+from cell.apps.recordings.consistency import misplacements, odd_turns
+from cell.apps.recordings.frames import SAME_M, SAME_RAD, counted, grouped, near
+from cell.apps.recordings.result import closed_form_dict, empty_result, hand_eye_dict, setup_note
+from cell.apps.recordings.solution import apply_checks
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.scale import metric_scale
+from cell.measure.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import difference, from_matrix, mean
+from cell.measure.vision.pictures import Reason
 from drivers.errors import ConfigError, RefusedError
 
 Pair = tuple[pin.SE3, pin.SE3]

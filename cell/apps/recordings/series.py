@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.recorded.conventions import Reading
-from cell.calibration.recorded.texts import NEEDED, PICTURES, Content, Record, join_halves, read_content
-from cell.vision.pictures import Reason
+from cell.apps.recordings.conventions import Reading
+from cell.apps.recordings.texts import NEEDED, PICTURES, Content, Record, join_halves, read_content
+from cell.measure.vision.pictures import Reason
 from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cell.calibration.recorded.frames import RecordedFrame
+    from cell.apps.recordings.frames import RecordedFrame
 
 TEXTS = (".txt", ".script", ".csv", ".tsv", ".dat", ".json", ".yaml", ".yml", ".xml", ".npy", ".npz", ".pos")
 OTHERS = {

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.collect.stripe_on_board import on_plane
-from cell.calibration.recorded.chain import (
+from cell.apps.recordings.chain import (  # fmt: skip
     STRIPE_MEANS,
     Profiles,
     Rows,
@@ -18,21 +17,22 @@ from cell.calibration.recorded.chain import (
     of_one_plane,
     report_chain,
     solve_chain,
-)  # fmt: skip
-from cell.calibration.recorded.frames import RecordedFrame, by_stop, counted, merged, used
-from cell.calibration.recorded.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
-from cell.calibration.solve.camera_checks import camera_checks
-from cell.calibration.solve.checks import Check, refused_parts
-from cell.calibration.solve.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
-from cell.calibration.solve.foreign import FOREIGN, foreign_view, parted_at
-from cell.calibration.solve.given_camera import against_pictures
-from cell.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
-from cell.calibration.solve.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
-from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels, zhang
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.board import board_pose
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import PictureRefused, Reason
+)
+from cell.apps.recordings.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
+from cell.apps.recordings.frames import RecordedFrame, by_stop, counted, merged, used
+from cell.apps.recordings.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
+from cell.measure.calibration.judge.camera_checks import camera_checks
+from cell.measure.calibration.judge.checks import Check, refused_parts
+from cell.measure.calibration.judge.foreign_pictures import FOREIGN, foreign_view, parted_at
+from cell.measure.calibration.judge.given_camera import against_pictures
+from cell.measure.calibration.judge.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
+from cell.measure.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
+from cell.measure.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels, zhang
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.stripe_on_board import on_plane
 from drivers.errors import RefusedError
 
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.

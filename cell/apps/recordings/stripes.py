@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import PictureRefused
-from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
-from cell.vision.stripe.planes import MIXES, Picture, read_colours
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import PictureRefused
+from cell.measure.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
+from cell.measure.vision.stripe.planes import MIXES, Picture, read_colours
 
 Shot = NDArray[np.uint8] | NDArray[np.uint16]
 

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 STRUCTURED = (".json", ".yaml", ".yml", ".xml")

@@ -15,13 +15,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cell.config import CellConfig, example_addresses
+from cell.apps.watch.positions import LABEL, arm_lines, rail_lines, vehicle_lines
+from cell.config.cell_config import CellConfig, example_addresses
 from cell.devices.assembly import connect_one
+from cell.devices.lock import CellLock, who_holds
 from cell.motion.arm_models import arm_kinematics
-from cell.run.folder import is_going, list_runs
-from cell.run.lock import CellLock, who_holds
-from cell.run.reading import awaited_word
-from cell.terminal.positions import LABEL, arm_lines, rail_lines, vehicle_lines
+from cell.run.files.folder import is_going, list_runs
+from cell.run.files.reading import awaited_word
 from drivers.clock import Clock
 from drivers.errors import CellError
 from statemachine.journal import JournalError, read

@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from cell.calibration.store import CalibrationEdited, CellCalibration, name_of, read_calibration
+from cell.config.calibrations.store import CalibrationEdited, CellCalibration, name_of, read_calibration
 from drivers.errors import CalibrationStale, NotConnectedError
 
 

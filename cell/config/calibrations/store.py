@@ -11,24 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration import (
-    Priors,
-    ScanCalibration,
-    ScanObservation,
-    TargetCalibration,
-    TargetObservation,
-)
-from cell.calibration.archive import SUFFIX, Observations, write_archive
-from cell.calibration.solve.cameras import adjust_scan, adjust_target
-from cell.calibration.solve.faults import refuse_wrong_lead
-from cell.calibration.solve.joint import Joint
-from cell.calibration.solve.results import Quality, sigmas
-from cell.calibration.validation import require_valid
-from cell.calibration.witness import Witness
-from cell.config import CameraConfig, CellConfig
-from cell.geometry.camera import CameraModel
-from cell.report.html import table
-from cell.storage import read_json, sealed, write_json
+from cell.base.notebook import table
+from cell.base.storage import read_json, sealed, write_json
+from cell.config.calibrations.validation import require_valid
+from cell.config.cell_config import CameraConfig, CellConfig
+from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
+from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
+from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.judge.faults import refuse_wrong_lead
+from cell.measure.calibration.solve.cameras import adjust_scan, adjust_target
+from cell.measure.calibration.solve.joint import Joint
+from cell.measure.calibration.solve.results import Quality, sigmas
+from cell.measure.geometry.camera import CameraModel
 from drivers.errors import CalibrationStale, ConfigError
 
 FORMAT, UNSEALED = 2, 1

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cell.calibration.timing import Timing
-from cell.config import CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, RailConfig
+from cell.config.cell_config import CellConfig
+from cell.makes.records import CameraConfig, DeviceConfig, RailConfig
+from cell.measure.calibration.timing import Timing
 
 LINKED: dict[str, type[DeviceConfig]] = {"scan_camera": CameraConfig, "rail": RailConfig}
 """The devices whose times are compared. What their makes ask for beyond this is how they are linked and set up."""

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cell.calibration.solve.faults import SCALE_RANGE
-from cell.config import CellConfig
-from cell.geometry.camera import Array
-from cell.geometry.light_plane import LightPlane
-from cell.storage import require_date
+from cell.base.storage import require_date
+from cell.config.cell_config import CellConfig
+from cell.measure.calibration.judge.faults import SCALE_RANGE
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.light_plane import LightPlane
 from drivers.errors import CalibrationStale
 
 if TYPE_CHECKING:
-    from cell.calibration.store import CellCalibration
+    from cell.config.calibrations.store import CellCalibration
 
 LENS = range(4, 9)
 """Parameters of a lens that a calibration may leave as they are; all others it must have estimated."""

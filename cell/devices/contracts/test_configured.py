@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from cell.config import CellConfig, load_config, require_real_addresses
+from cell.config.cell_config import CellConfig, load_config, require_real_addresses
 from cell.devices.assembly import connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.arm import ArmContract
@@ -19,8 +19,8 @@ from cell.devices.contracts.camera import CameraContract
 from cell.devices.contracts.rail import RailContract
 from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
-from cell.devices.truth_link import cause_fault, clear_faults
-from cell.run.lock import CellLock
+from cell.devices.lock import CellLock
+from cell.devices.simulated.truth_link import cause_fault, clear_faults
 from drivers.clock import Clock
 from drivers.interfaces import Arm
 

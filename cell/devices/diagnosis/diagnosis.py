@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import DEVICES, CellConfig, config_to_open, require_real_addresses
+from cell.config.cell_config import DEVICES, CellConfig, config_to_open, require_real_addresses
 from cell.devices import assembly
-from cell.devices.examination import examine
-from cell.devices.mix import Sim, simulated_of
-from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
-from cell.run.lock import CellLock
+from cell.devices.diagnosis.examination import examine
+from cell.devices.lock import CellLock
+from cell.devices.simulated.mix import Sim, simulated_of
+from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Reading, SaysHowKnown, Vehicle, why_untold
@@ -86,7 +86,7 @@ def diagnose(
     needed = assembly.connected_for(config, [name for name in wanted if name not in on_arm])
     if not (served := [name for name in names if name in needed]):
         return _diagnose(config, only)
-    from cell.devices.described import Described
+    from cell.devices.simulated.described import Described
 
     # Looked at only, so it follows nothing: its pictures are of where its own devices stand.
     world = SimulatedCell(

@@ -14,17 +14,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from cell.addresses import is_example
-from cell.config import DEVICES, CellConfig, find_config, load_config
-from cell.device_config import DeviceConfig
-from cell.devices.built_in import TmclRailConfig
-from cell.devices.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
-from cell.devices.make import Surroundings
-from cell.devices.makes import make_of
-from cell.devices.rail_makes import ModbusRailConfig
-from cell.devices.switch_makes import OnBoard
-from cell.devices.vehicle_makes import CanopenVehicleConfig
-from cell.run.lock import who_holds
+from cell.base.addresses import is_example
+from cell.config.cell_config import DEVICES, CellConfig, find_config, load_config
+from cell.devices.diagnosis.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
+from cell.devices.lock import who_holds
+from cell.makes.built_in import TmclRailConfig
+from cell.makes.make import Surroundings
+from cell.makes.rails import ModbusRailConfig
+from cell.makes.records import DeviceConfig
+from cell.makes.switches import OnBoard
+from cell.makes.table import make_of
+from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
@@ -71,7 +71,7 @@ def ask_module(port: str, config: CellConfig | None) -> Found:
 
     Where the configured rail is a drive on Modbus, it is that drive that is asked for.
     """
-    from drivers.rail.tmcl_link import TmclLink
+    from drivers.rail.tmcl.link import TmclLink
 
     busy = _held(port) or ("" if "://" in port else barred(port) or opened_by(port))
     if config is not None and isinstance(config.rail, ModbusRailConfig):
@@ -162,7 +162,7 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
 
 
 def _look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
-    from cell.devices.canopen_nodes import look_at_nodes
+    from cell.makes.canopen_nodes import look_at_nodes
 
     return look_at_nodes(record)
 

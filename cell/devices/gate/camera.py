@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from cell.devices.gate import Gate, Gated
-from cell.devices.interlocks import Command
+from cell.devices.gate.gate import Gate, Gated
+from cell.devices.gate.interlocks import Command
 from drivers.interfaces import Camera, Frame, FrameStream
 
 

@@ -3,7 +3,7 @@
 A stop ends what moves, but a step that plans or settles at that moment would begin its next motion after it. Work
 therefore enters the gate with its cancel token: once that is cancelled, or the cell was stopped, it begins nothing
 any more, in whatever thread it still goes on. Then the interlocks are asked whether the command is safe now. The
-devices behind the gate are in `cell.devices.gated`.
+devices behind the gate are in `cell.devices.gate.gated`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Generic, Protocol, TypeVar
 
-from cell.devices.interlocks import Command, Interlocks
+from cell.devices.gate.interlocks import Command, Interlocks
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import Device, Identity
 from statemachine.cancel import CancelToken

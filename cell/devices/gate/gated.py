@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
 
-from cell.devices.arguments import checked_joints, checked_pose, checked_way
 from cell.devices.contact import GuardedMotion
-from cell.devices.gate import Gate, Gated
-from cell.devices.interlocks import Command
+from cell.devices.gate.arguments import checked_joints, checked_pose, checked_way
+from cell.devices.gate.gate import Gate, Gated
+from cell.devices.gate.interlocks import Command
 from drivers.clock_map import Latch
 from drivers.errors import CellError, InterlockError
 from drivers.interfaces import (
@@ -34,7 +34,7 @@ from drivers.interfaces import (
 from drivers.link_table import LinkTable
 
 if TYPE_CHECKING:
-    from cell.devices.simulated_touch import SimulatedTouch
+    from cell.devices.simulated.touch import SimulatedTouch
 
 Begun = TypeVar("Begun", bound=Motion)
 

@@ -1,7 +1,7 @@
 """What has to hold before a command is passed on: checked in the gate, for real and simulated devices alike.
 
-The rules themselves are a table in `cell.devices.rules`. A person lifts named ones with `Cell.maintenance`; nothing
-else does.
+The rules themselves are a table in `cell.devices.gate.rules`. A person lifts named ones with `Cell.maintenance`;
+nothing else does.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-from cell.devices.gate import Gate, Gated
-from cell.devices.interlocks import Command
+from cell.devices.gate.gate import Gate, Gated
+from cell.devices.gate.interlocks import Command
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from drivers.interfaces import Laser

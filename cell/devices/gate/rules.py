@@ -1,6 +1,6 @@
 """The interlocks as a table: which commands each is asked for, what has to hold, and how that is looked up.
 
-`python -m cell.devices.rules` prints the table of docs/interlocks.md; a test keeps that current.
+`python -m cell.devices.gate.rules` prints the table of docs/interlocks.md; a test keeps that current.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from cell.devices.contact import GuardedMotion
-from cell.devices.gated_laser import UNATTENDED_S
-from cell.devices.interlocks import PURPOSES, Command, Rule, Situation
-from cell.geometry.poses import from_ur
+from cell.devices.gate.interlocks import PURPOSES, Command, Rule, Situation
+from cell.devices.gate.laser import UNATTENDED_S
+from cell.measure.geometry.poses import from_ur
 from drivers.errors import DeadlineError
 from drivers.interfaces import Arm, ArmState, Vehicle, VehicleState
 

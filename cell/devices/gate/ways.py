@@ -12,17 +12,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.config import CellConfig
-from cell.devices.interlocks import Command
-from cell.geometry.poses import from_ur
+from cell.config.cell_config import CellConfig
+from cell.config.mounting import deck_plates, mounted
+from cell.config.obstacles import vehicle_obstacles
+from cell.devices.gate.interlocks import Command
+from cell.measure.geometry.poses import from_ur
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import TOUCHES, Body, arm_bodies, tool_bodies, vehicle_bodies
 from cell.motion.clearance import first_touch
 from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import Joints
 from cell.motion.point_speed import PointSpeed, carried_points
-from cell.mounting import deck_plates, mounted
-from cell.obstacles import vehicle_obstacles
 from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
 

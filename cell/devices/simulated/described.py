@@ -15,21 +15,21 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.config import CALIBRATION_DEPTHS, DEVICES, CellConfig
-from cell.device_config import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
-from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
-from cell.devices.rail_makes import ModbusRailConfig
-from cell.devices.switch_makes import NumatoClawConfig, OnBoard, RobotiqClawConfig
-from cell.devices.vehicle_makes import CanopenVehicleConfig
-from cell.geometry.poses import from_parts, transform
-from cell.job import Job, load_job, shipped_mesh
+from cell.config.cell_config import CALIBRATION_DEPTHS, DEVICES, CellConfig
+from cell.config.job import Job, load_job, shipped_mesh
+from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
+from cell.makes.rails import ModbusRailConfig
+from cell.makes.records import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
+from cell.makes.switches import NumatoClawConfig, OnBoard, RobotiqClawConfig
+from cell.makes.vehicles import CanopenVehicleConfig
+from cell.measure.geometry.poses import from_parts, transform
 from drivers.errors import ConfigError
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
+from sim_backends.world.bodies.surfaces import surface
 from sim_backends.world.drawing import STOCK, Drawing
 from sim_backends.world.hardware import CAMERA_RATE
 from sim_backends.world.nominal import SCAN_FOCUS, TABLE_HALF, TARGET_FOCUS
-from sim_backends.world.surfaces import surface
 
 MOST_BLUR, MOST_STRIPE_BLUR_PX = 0.5, 16.0
 """Diameter of the blur disc at which a board's dots are still found, in diameters of a dot, and a stripe, in px."""
@@ -287,7 +287,7 @@ def _table(job: Job, mesh: Path) -> Iterator[str]:
         vertices = np.array([[sx * x, sy * y, 0.0] for sx in (-1, 1) for sy in (-1, 1)])
         faces = np.array([[0, 2, 1], [1, 2, 3]])
     else:
-        from cell.inversion.nominal import read_mesh  # half a second of imports
+        from cell.measure.inversion.nominal import read_mesh  # half a second of imports
 
         vertices, faces = read_mesh(mesh, job.surface.mesh_unit)
     on_place = transform(job.surface.place_from_surface.se3(), vertices)

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import DEVICES, CellConfig
-from cell.device_config import MOST_PAYLOAD, RailConfig, of_make
+from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
-from cell.devices.built_in import TmclRailConfig
-from cell.devices.described import Described, reverses
 from cell.devices.devices import Devices
-from cell.devices.rail_makes import ModbusRailConfig
-from cell.devices.vehicle_makes import CanopenVehicleConfig
+from cell.devices.simulated.described import Described, reverses
+from cell.makes.built_in import TmclRailConfig
+from cell.makes.rails import ModbusRailConfig
+from cell.makes.records import MOST_PAYLOAD, RailConfig, of_make
+from cell.makes.vehicles import CanopenVehicleConfig
 from cell.motion.arm_models import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.limits import ArmLimits
@@ -90,7 +90,7 @@ class VirtualCell(DirectCell):
             raise ConfigError(str(error)) from error
 
     def make_ready(self, described: Described) -> None:
-        """See `cell.devices.simulated.Simulation`."""
+        """See `cell.devices.simulated.process.Simulation`."""
         station = described.drawing(self._truth).station
         try:
             self.world.make_ready(station)

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from cell.devices.devices import Devices
-from cell.devices.gated import GatedArm
+from cell.devices.gate.gated import GatedArm
 from drivers.interfaces import ArmState
 
 Rows = list[list[float]]

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.config import CellConfig
-from cell.devices.built_in import OnArm
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.devices.feeds import AT_REST_S, PERIOD_S, ArmFeed, Feed, RailFeed, SwitchFeed, VehicleFeed
-from cell.devices.world_link import WorldLink
+from cell.devices.simulated.feeds import AT_REST_S, PERIOD_S, ArmFeed, Feed, RailFeed, SwitchFeed, VehicleFeed
+from cell.devices.simulated.world_link import WorldLink
+from cell.makes.built_in import OnArm
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmState, Vector
 

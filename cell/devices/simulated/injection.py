@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from cell.devices.simulated import Simulation
+from cell.devices.simulated.process import Simulation
 from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 from statemachine.runner import Event

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from cell.config import DEVICES, CellConfig, find_config, load_config
+from cell.config.cell_config import DEVICES, CellConfig, find_config, load_config
 from drivers.errors import ConfigError
 
 Sim = str | Sequence[str] | None

@@ -8,18 +8,18 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from cell.config import DEVICES, CellConfig
+from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.assembly import connect, connect_one
-from cell.devices.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
-from cell.devices.described import Described
-from cell.devices.followed_camera import FollowedCamera
-from cell.devices.following import Following
-from cell.devices.gated import GatedArm
-from cell.devices.mix import beware, followed, require_possible
-from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
-from cell.devices.simulated_touch import SimulatedTouch
-from cell.devices.world_link import WorldConnector, WorldLink
-from cell.run.lock import CellLock
+from cell.devices.gate.gated import GatedArm
+from cell.devices.lock import CellLock
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.followed_camera import FollowedCamera
+from cell.devices.simulated.following import Following
+from cell.devices.simulated.mix import beware, followed, require_possible
+from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
+from cell.devices.simulated.touch import SimulatedTouch
+from cell.devices.simulated.world_link import WorldConnector, WorldLink
+from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser

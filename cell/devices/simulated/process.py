@@ -18,14 +18,14 @@ from collections.abc import Callable, Collection
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
-from cell.config import DEVICES, CellConfig
-from cell.devices.truth_link import ask_truth, cause_fault, make_ready
-from cell.devices.world_link import WorldLink
+from cell.config.cell_config import DEVICES, CellConfig
+from cell.devices.simulated.truth_link import ask_truth, cause_fault, make_ready
+from cell.devices.simulated.world_link import WorldLink
 from drivers.errors import ConfigError, DeviceFault
 
 if TYPE_CHECKING:
     # It knows the world's drawing, which takes long to load: only who simulates a cell needs it.
-    from cell.devices.described import Described
+    from cell.devices.simulated.described import Described
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 

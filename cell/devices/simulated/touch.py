@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.devices.following import Following
+from cell.devices.simulated.following import Following
 from drivers.errors import Aborted, CellError
 from drivers.interfaces import ArmMotion, ArmState, Vector
 

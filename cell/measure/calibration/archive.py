@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.solve.adjustment import Priors
-from cell.calibration.witness import Witness, read_edge
-from cell.geometry.camera import Array, CameraModel
-from cell.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
-from cell.vision.board.spec import parse_board
-from cell.vision.board.view import BoardView
-from cell.vision.stripe.extract import StripeProfile
+from cell.base.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
+from cell.measure.calibration.drift.reference_plate import Witness, read_edge
+from cell.measure.calibration.observations import ScanObservation, TargetObservation
+from cell.measure.calibration.solve.adjustment import Priors
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.spec import parse_board
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import ConfigError
 
 FORMAT, UNSEALED = 2, 1

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from cell.vision.board.view import BoardView
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.compiled import compiled
-from cell.geometry.camera import Array
+from cell.base.compiled import compiled
+from cell.measure.geometry.camera import Array
 
 UNDISTORT_STEPS = 20
 UNDISTORT_TOLERANCE = 1e-13
@@ -176,7 +176,7 @@ def dots_terms(
 
     `board`, `flange` and `hand` are the rotations (3, 3) of base_from_board, base_from_flange and flange_from_camera,
     `places` (3, 3) has their translations as rows; `travel` (3,) is the camera's way per metre of `rail`. The columns
-    are those of `cell.calibration.solve.blocks`. A circle of `radius` is seen at its ellipse's centre.
+    are those of `cell.measure.calibration.solve.blocks`. A circle of `radius` is seen at its ellipse's centre.
     """
     to_camera = np.zeros((3, 3))
     for i in range(3):

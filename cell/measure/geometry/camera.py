@@ -96,7 +96,7 @@ class CameraModel:
         if not any(self.dist):
             return target
         # Here, because that module needs this one.
-        from cell.geometry.seen import undistort
+        from cell.measure.geometry.board_projection import undistort
 
         found, off, determinant = np.empty((len(target), 2)), np.empty(len(target)), np.empty(len(target))
         undistort(self.parameters, np.ascontiguousarray(target), found, off, determinant)

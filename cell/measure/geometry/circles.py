@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 
 def seen_centres(centres: ArrayLike, normal: ArrayLike, radius: float) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 NEGLIGIBLE = 1e-12
 """Of the correlations' eigenvalues; their sum is the number of parameters."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cell.geometry.camera import Array, CameraModel
+from cell.measure.geometry.camera import Array, CameraModel
 
 # A ray that makes less than this angle (as its sine) with the plane meets it nowhere useful.
 VANISHING_SINE = 1e-6

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 ROUNDING = 4e-15
 """What is left of R Rᵀ − 1 when a rotation was brought back to the nearest true one."""

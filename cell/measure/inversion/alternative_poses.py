@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, sigmas_along
-from cell.inversion.correspondences import correspondences as matched
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import FREE
-from cell.inversion.registration import Prior
-from cell.inversion.search import MOST_SHIFT, candidates
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan, sigmas_along
+from cell.measure.inversion.correspondences import correspondences as matched
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.observability import FREE
+from cell.measure.inversion.registration import Prior
+from cell.measure.inversion.start_poses import MOST_SHIFT, candidates
 from drivers.errors import Measured, RefusedError
 
 POINTS = 400

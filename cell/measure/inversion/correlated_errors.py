@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import SIGMA_FLOOR
-from cell.inversion.registration import Registration
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import SIGMA_FLOOR
+from cell.measure.inversion.registration import Registration
 
 PATCH_M = 0.004
 LEAST_POINTS = 8

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import cross
-from cell.inversion.closest import Array
-from cell.inversion.nominal import NominalSurface
-from cell.reconstruction.cloud import Cloud
+from cell.measure.geometry.poses import cross
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.reconstruction.cloud import Cloud
 
 SIGMA_FLOOR = 3e-6
 """Smallest standard deviation of a point along a normal, m: what a tessellation leaves."""

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan
-from cell.inversion.dissent import Dissent
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import Tolerance
-from cell.inversion.registration import Prior, Registration
-from cell.inversion.search import across
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.disagreement import Dissent
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.inversion.registration import Prior, Registration
+from cell.measure.inversion.start_poses import across
 from drivers.errors import Measured, RefusedError
 
 BOARD_DISAGREES = 40.0

@@ -14,11 +14,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, correspondences, robust_scale, sigmas_along
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import Tolerance
-from cell.inversion.search import across
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan, correspondences, robust_scale, sigmas_along
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.inversion.start_poses import across
 
 QUARTER = 0.25
 """Share of the scanned area that is asked by itself."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.inversion.closest import Array
+from cell.measure.inversion.closest import Array
 
 PURE = 0.15
 """Share of rotation, in units of the surface's radius, up to which a motion counts as a translation."""

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from cell.inversion.closest import Array, Grid, Indices, Walk, closest
+from cell.measure.inversion.closest import Array, Grid, Indices, Walk, closest
 from drivers.errors import ConfigError
 
 SPACING = 0.0004

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.inversion.closest import Array
-from cell.inversion.motions import name, sorted_out
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.motions import name, sorted_out
 from drivers.errors import Measured, NotObservable
 
 FREE = 1e-3

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.inversion.closest import Array, Indices
-from cell.inversion.nominal import NominalSurface
-from cell.reconstruction.cloud import Cloud
+from cell.measure.inversion.closest import Array, Indices
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
 
 REACH_M = 6e-3

@@ -10,18 +10,25 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan
-from cell.inversion.demands import Demands, fit_figures, require_agreement, require_board, require_fit, require_whole
-from cell.inversion.dissent import dissent
-from cell.inversion.elsewhere import require_alone
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import Tolerance, Verdict, determined, judge
-from cell.inversion.registration import Prior, register
-from cell.inversion.shared import shared_by_patches
-from cell.inversion.sweeps import balance
-from cell.reconstruction.cloud import Cloud
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion.alternative_poses import require_alone
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correlated_errors import shared_by_patches
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.demands import (
+    Demands,
+    fit_figures,
+    require_agreement,
+    require_board,
+    require_fit,
+    require_whole,
+)
+from cell.measure.inversion.disagreement import dissent
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.observability import Tolerance, Verdict, determined, judge
+from cell.measure.inversion.registration import Prior, register
+from cell.measure.inversion.sweeps import balance
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Rows, Scan, correspondences, robust_scale, sigmas_along
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.search import across, candidates
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Rows, Scan, correspondences, robust_scale, sigmas_along
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.start_poses import across, candidates
 from drivers.errors import Measured, RefusedError
 
 COARSE_POINTS = 1200

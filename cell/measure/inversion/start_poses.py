@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.compiled import compiled_fast
-from cell.inversion.closest import Array
-from cell.inversion.nominal import NominalSurface
+from cell.base.compiled import compiled_fast
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.nominal import NominalSurface
 
 REACH = 0.0015
 """Distance from which on a point counts nothing, m."""

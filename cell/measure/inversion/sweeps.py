@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan
-from cell.inversion.registration import Prior, Registration, by_lines
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.registration import Prior, Registration, by_lines
 
 
 def balance(found: Registration, scan: Scan, moved: Array, prior: Prior) -> Registration:

@@ -13,11 +13,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane, triangulate
-from cell.reconstruction.cloud import Array, Cloud
-from cell.reconstruction.outliers import find_outliers
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane, triangulate
+from cell.measure.reconstruction.cloud import Array, Cloud
+from cell.measure.reconstruction.outliers import find_outliers
+from cell.measure.vision.stripe.extract import StripeProfile
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.reconstruction.ply import StoredCloud
+from cell.measure.reconstruction.ply import StoredCloud
 from drivers.errors import ConfigError
 
 

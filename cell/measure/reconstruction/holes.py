@@ -13,8 +13,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
-from cell.reconstruction.cloud import Array, Cloud, Filled, Indices
+from cell.base.compiled import compiled
+from cell.measure.reconstruction.cloud import Array, Cloud, Filled, Indices
 
 LARGEST = 0.0015
 """Widest hole that is filled unless told otherwise, m, across its narrower side."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.reconstruction.cloud import Array, Indices
+from cell.measure.reconstruction.cloud import Array, Indices
 
 STEEPEST = np.cos(np.radians(80.0))
 """Triangles steeper than this against their sweep's mean normal lie between two surfaces, not on one."""

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
+from cell.base.compiled import compiled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cell.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import ConfigError
 
 _WORDS = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}

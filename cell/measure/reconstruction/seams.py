@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from cell.reconstruction.cloud import Array, Cloud, Indices, Mask
+from cell.measure.reconstruction.cloud import Array, Cloud, Indices, Mask
 
 Motions = Callable[[Indices, Indices], Array]
 

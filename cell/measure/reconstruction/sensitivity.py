@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.reconstruction.build import ScanGeometry
-from cell.reconstruction.cloud import Array, Cloud
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.cloud import Array, Cloud
 
 
 def calibration_motions(

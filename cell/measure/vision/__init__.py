@@ -10,14 +10,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cell.vision.board.board import BoardPose, board_pose, find_board
-    from cell.vision.board.spec import BoardSpec, parse_board
-    from cell.vision.board.view import BoardView
-    from cell.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-    from cell.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract
-    from cell.vision.stripe.planes import read_colours
-    from cell.vision.stripe.read import read_stripe
-    from cell.vision.stripe.stream import StripeStream
+    from cell.measure.vision.board.board import BoardPose, board_pose, find_board
+    from cell.measure.vision.board.spec import BoardSpec, parse_board
+    from cell.measure.vision.board.view import BoardView
+    from cell.measure.vision.pictures import PictureRefused, Reason, check_picture, read_picture
+    from cell.measure.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract
+    from cell.measure.vision.stripe.planes import read_colours
+    from cell.measure.vision.stripe.read import read_stripe
+    from cell.measure.vision.stripe.stream import StripeStream
 
 __all__ = [
     "BoardPose",

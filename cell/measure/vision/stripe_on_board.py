@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.spec import DOTS, BoardSpec
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.spec import DOTS, BoardSpec
+from cell.measure.vision.stripe.extract import StripeProfile
 
 # How far beyond the outermost points there is board for certain, in pitches.
 MARGIN_PITCHES = {"marked_dots": 0.8, "asymmetric_dots": 0.8, "dots": 0.8, "chessboard": 2.0, "charuco": 1.5}

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration, TargetCalibration
-from cell.config import CellConfig
-from cell.geometry.poses import from_parts, transform
-from cell.job import Job
-from cell.vision import BoardSpec
-from cell.vision.board.spec import centre_of
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.calibration import ScanCalibration, TargetCalibration
+from cell.measure.geometry.poses import from_parts, transform
+from cell.measure.vision import BoardSpec
+from cell.measure.vision.board.spec import centre_of
 from drivers.errors import CalibrationStale, RefusedError
 
 

@@ -7,10 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.config import ArmConfig, CellConfig
-from cell.devices.interlocks import Interlocks
-from cell.geometry.poses import from_parts
-from cell.job import Job
+from cell.config.cell_config import ArmConfig, CellConfig
+from cell.config.job import Job
+from cell.config.mounting import deck_plates, mounted
+from cell.config.obstacles import station_obstacles, vehicle_obstacles
+from cell.devices.gate.interlocks import Interlocks
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import BoardSpec
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import (
     BASE,
@@ -26,11 +30,7 @@ from cell.motion.collision import CollisionModel, Pair
 from cell.motion.kinematics import JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
-from cell.mounting import deck_plates, mounted
-from cell.obstacles import station_obstacles, vehicle_obstacles
-from cell.run.pace import Pace
-from cell.vision import BoardSpec
-from cell.vision.board.spec import centre_of
+from cell.procedures.pace import Pace
 from drivers.clock import Clock
 from drivers.interfaces import Arm, ArmMotion, Vector
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import TargetCalibration
-from cell.geometry.poses import compose_covariance, from_ur, mean, transform
-from cell.job import PhotoSection
-from cell.steps.quiet import swing
-from cell.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
+from cell.config.job import PhotoSection
+from cell.measure.calibration import TargetCalibration
+from cell.measure.geometry.poses import compose_covariance, from_ur, mean, transform
+from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
+from cell.procedures.drive.settled import swing
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
-from cell.report.bound import part_covariance
+from cell.config.job import Job
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.procedures.part_error import part_covariance
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import ArmState, Vector
 

@@ -11,12 +11,12 @@ from contextlib import suppress
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.hand_eye import solve_hand_eye
-from cell.config import CellConfig
-from cell.geometry.camera import CameraModel
-from cell.geometry.poses import from_parts, mean
-from cell.steps.camera_poses import View
-from cell.vision import BoardView, board_pose
+from cell.config.cell_config import CellConfig
+from cell.measure.calibration.solve.hand_eye import solve_hand_eye
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.poses import from_parts, mean
+from cell.measure.vision import BoardView, board_pose
+from cell.procedures.arm.camera_poses import View
 from drivers.errors import RefusedError
 
 SEARCH_M = 0.009

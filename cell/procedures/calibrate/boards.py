@@ -6,16 +6,16 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TypeVar
 
-from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.collect.aiming import Aim
-from cell.calibration.store import nominal_camera
-from cell.config import CellConfig
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.geometry.poses import from_ur
+from cell.measure.calibration import ScanObservation, TargetObservation
+from cell.measure.geometry.poses import from_ur
+from cell.measure.vision import BoardSpec, BoardView, extract, find_board, parse_board
 from cell.motion.arm_models import HOME
-from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
-from cell.steps.moves import Mover
-from cell.vision import BoardSpec, BoardView, extract, find_board, parse_board
+from cell.procedures.arm.camera_poses import View, scan_calibration_views, target_calibration_views
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.aiming import Aim
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame
 

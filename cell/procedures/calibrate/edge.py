@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.collect.witness import RATES_HZ, configure_fast
-from cell.calibration.store import CellCalibration
-from cell.calibration.witness import Edge, Witness
-from cell.config import CellConfig
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.geometry.camera import Array
+from cell.measure.calibration.drift.reference_plate import Edge, Witness
+from cell.measure.geometry.camera import Array
+from cell.procedures.calibrate.reference_plate import RATES_HZ, configure_fast
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Frame
 

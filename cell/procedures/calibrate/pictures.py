@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cell.calibration.solve.coverage import GRID, Coverage
+from cell.measure.calibration.judge.coverage import GRID, Coverage
 
 SHOWN_PARAMETERS = 14
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.calibration.witness import LEAST_ROWS, Witness
-from cell.config import CellConfig
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.vision import extract
+from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Witness
+from cell.measure.vision import extract
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Frame
 

@@ -12,21 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.archive import Observations
-from cell.calibration.solve.advice import advice
-from cell.calibration.solve.coverage import Coverage
-from cell.calibration.solve.influence import Places, derivatives, influences, place_rms
-from cell.calibration.solve.joint import Joint, paper_plane_of
-from cell.calibration.solve.joint_checks import joint_checks
-from cell.calibration.solve.results import ScanCalibration
-from cell.calibration.store import Solved
-from cell.config import CellConfig
-from cell.geometry.poses import transform
-from cell.inversion import NominalSurface
-from cell.job import Job, load_job
-from cell.report.bound import part_points
-from cell.report.calibration_pictures import camera_picture, influence_picture
-from cell.steps.camera_poses import base_from_place_at_target, scan_plans
+from cell.config.calibrations.store import Solved
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, load_job
+from cell.measure.calibration.archive import Observations
+from cell.measure.calibration.judge.advice import advice
+from cell.measure.calibration.judge.coverage import Coverage
+from cell.measure.calibration.judge.influence import Places, derivatives, influences, place_rms
+from cell.measure.calibration.judge.joint_checks import joint_checks
+from cell.measure.calibration.solve.joint import Joint, paper_plane_of
+from cell.measure.calibration.solve.results import ScanCalibration
+from cell.measure.geometry.poses import transform
+from cell.measure.inversion import NominalSurface
+from cell.procedures.arm.camera_poses import base_from_place_at_target, scan_plans
+from cell.procedures.calibrate.pictures import camera_picture, influence_picture
+from cell.procedures.part_error import part_points
 
 
 @dataclass(frozen=True, eq=False)

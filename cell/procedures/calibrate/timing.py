@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.collect.boards import Check, Keep, Progress, move_to_view
-from cell.calibration.store import CellCalibration
-from cell.calibration.timing import Timing
-from cell.calibration.timing_fit import (
+from cell.config.calibrations.store import CellCalibration
+from cell.config.calibrations.timing_link import link_of, most_late
+from cell.config.cell_config import CellConfig
+from cell.devices.devices import Devices
+from cell.measure.calibration.drift.timing_fit import (
     TimedFrame,
     TimedSweep,
     find_shutter,
@@ -20,14 +21,13 @@ from cell.calibration.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
-from cell.calibration.timing_link import link_of, most_late
-from cell.config import CellConfig
-from cell.devices.devices import Devices
-from cell.geometry.poses import from_ur
+from cell.measure.calibration.timing import Timing
+from cell.measure.geometry.poses import from_ur
+from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.arm_models import HOME
-from cell.steps.camera_poses import rail_ends, verification_views
-from cell.steps.moves import Mover
-from cell.vision import BoardSpec, find_board, parse_board
+from cell.procedures.arm.camera_poses import rail_ends, verification_views
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.boards import Check, Keep, Progress, move_to_view
 from drivers.errors import DeviceFault, LimitError, RefusedError
 
 SLOW_SHARE = 0.25

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 import scipy
 
-from cell.inversion.rocking import require_firm
-from cell.vision import BoardView
+from cell.measure.inversion.effects.rocking import require_firm
+from cell.measure.vision import BoardView
 from drivers.interfaces import Vector
 
 APART_S = 0.07

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cell.geometry.poses import difference
-from cell.steps.camera_poses import photo_pose
-from cell.steps.photograph import BoardFix
-from cell.steps.quiet import swing_covariance
-from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.measure.geometry.poses import difference
+from cell.procedures.arm.camera_poses import photo_pose
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.settled import swing_covariance
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from drivers.errors import Measured, RefusedError
 
 MOVED = 22.46

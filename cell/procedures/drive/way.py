@@ -14,14 +14,14 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import from_parts
-from cell.job import Job
+from cell.config.job import Job
+from cell.config.obstacles import station_obstacles
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.bodies import Body, station_bodies, vehicle_bodies
-from cell.obstacles import station_obstacles
-from cell.steps.approach import Planar, line_command, wrap
-from cell.steps.whereabouts import Whereabouts
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.procedures.drive.approach import Planar, line_command, wrap
+from cell.procedures.drive.whereabouts import Whereabouts
 from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from cell.job import BoardSection, Job
-from cell.steps.approach import Planar, wrap
+from cell.config.job import BoardSection, Job
+from cell.procedures.drive.approach import Planar, wrap
 from drivers.errors import RefusedError
 from drivers.interfaces import Vehicle, VehicleState
 

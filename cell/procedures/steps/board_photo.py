@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import pinocchio as pin
 
-from cell.steps.camera_poses import photo_pose
-from cell.steps.drive_to_target import Arrival
-from cell.steps.moves import Mover
-from cell.steps.photograph import BoardFix
-from cell.steps.quiet import swing_covariance, words
-from cell.steps.step import JobStep
-from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.procedures.arm.camera_poses import photo_pose
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.settled import swing_covariance, words
+from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from statemachine.policy import Step
 from statemachine.runner import StepContext
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from cell.job import Job
+from cell.config.job import Job
 from cell.motion.arm_models import HOME
 from cell.motion.bodies import Body
-from cell.run.pace import Pace
-from cell.steps.approach import Planar, drive_line, turn_to, wrap
-from cell.steps.camera_poses import look_pose
-from cell.steps.photograph import BoardFix
-from cell.steps.step import JobStep
-from cell.steps.way import BACK_UP, Way
-from cell.steps.whereabouts import Whereabouts, next_step
-from cell.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.procedures.arm.camera_poses import look_pose
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.approach import Planar, drive_line, turn_to, wrap
+from cell.procedures.drive.way import BACK_UP, Way
+from cell.procedures.drive.whereabouts import Whereabouts, next_step
+from cell.procedures.pace import Pace
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from drivers.clock import Clock
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vehicle

@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import compose_covariance
-from cell.inversion import NominalSurface, PlacePose, Prior, Tolerance
-from cell.inversion import invert_pose as register
-from cell.inversion.causes import find_causes, likeliest
-from cell.inversion.droop import Head, find_droop
-from cell.inversion.rocking import find_rocking, rocking_covariance, rocking_motions, words
-from cell.job import Job
-from cell.reconstruction.cloud import Indices
-from cell.reconstruction.seams import Motions
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction
-from cell.steps.step import JobStep
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.workplace import Workplace
+from cell.config.job import Job
+from cell.measure.geometry.poses import compose_covariance
+from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
+from cell.measure.inversion import invert_pose as register
+from cell.measure.inversion.effects.causes import find_causes, likeliest
+from cell.measure.inversion.effects.droop import Head, find_droop
+from cell.measure.inversion.effects.rocking import find_rocking, rocking_covariance, rocking_motions, words
+from cell.measure.reconstruction.cloud import Indices
+from cell.measure.reconstruction.seams import Motions
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import NotObservable, RefusedError
 from drivers.interfaces import Vector
 from statemachine.policy import Step

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
 
-from cell.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct
-from cell.steps.step import JobStep
-from cell.steps.workplace import Workplace
+from cell.procedures.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
 from drivers.errors import ConfigError
 from statemachine.policy import Policy
 from statemachine.runner import StepContext

@@ -8,29 +8,29 @@ from dataclasses import replace
 
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration
-from cell.calibration.collect.edge import require_edge
-from cell.calibration.collect.witness import require_witness
-from cell.calibration.slip import Slip, slip_since
-from cell.calibration.timing import Timing
-from cell.calibration.timing_link import changed, doubt_of, link_of
-from cell.calibration.witness import Pointing, Witness
-from cell.calibration.witness import pointing as pointing_since
-from cell.config import CellConfig
+from cell.config.calibrations.timing_link import changed, doubt_of, link_of
+from cell.config.cell_config import CellConfig
+from cell.config.job import ScanSection
 from cell.devices.devices import Devices
-from cell.job import ScanSection
-from cell.reconstruction import ScanGeometry
-from cell.steps.arm_sweep import arm_sweep
-from cell.steps.camera_poses import ScanPlan, scan_plans
-from cell.steps.moves import Mover
-from cell.steps.photograph import BoardFix
-from cell.steps.rail_sweep import rail_sweep
-from cell.steps.step import JobStep
-from cell.steps.stored_sweep import FILE, save_sweep
-from cell.steps.swath import MAX_LOST_FRACTION, Collector, SweepErrors, rehearse
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.unmoved import require_unmoved
-from cell.steps.workplace import Workplace
+from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.drift.reference_plate import Pointing, Witness
+from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
+from cell.measure.calibration.drift.slip import Slip, slip_since
+from cell.measure.calibration.timing import Timing
+from cell.measure.reconstruction import ScanGeometry
+from cell.procedures.arm.camera_poses import ScanPlan, scan_plans
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.calibrate.edge import require_edge
+from cell.procedures.calibrate.reference_plate import require_witness
+from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.arm_sweep import arm_sweep
+from cell.procedures.sweep.rail_sweep import rail_sweep
+from cell.procedures.sweep.stored_sweep import FILE, save_sweep
+from cell.procedures.sweep.swath import MAX_LOST_FRACTION, Collector, SweepErrors, rehearse
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
 from statemachine.policy import Step

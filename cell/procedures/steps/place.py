@@ -8,25 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import from_parts, from_ur, to_ur
-from cell.inversion import PlacePose
-from cell.inversion.creep import Creep
-from cell.inversion.standing import highest_standing, require_bare
-from cell.job import Job
+from cell.config.job import Job
+from cell.measure.geometry.poses import from_parts, from_ur, to_ur
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.effects.creep import Creep
+from cell.measure.inversion.obstruction import highest_standing, require_bare
+from cell.measure.reconstruction.cloud import Indices
 from cell.motion.arm_models import HOME
 from cell.motion.bodies import TOUCHES
-from cell.reconstruction.cloud import Indices
-from cell.steps.invert_pose import inverted
-from cell.steps.moves import Mover
-from cell.steps.part import PartProgress, PartState
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction
-from cell.steps.second_look import SecondLook, require_in_place
-from cell.steps.step import JobStep
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.touch import Touch, TouchCheck, expected_touch, felt_touch
-from cell.steps.unmoved import require_unmoved
-from cell.steps.workplace import Workplace
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.part import PartProgress, PartState
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.arm.touch import Touch, TouchCheck, expected_touch, felt_touch
+from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.invert_pose import inverted
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.second_look import SecondLook, require_in_place
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw, Vector
 from statemachine.policy import OnFailure, Step

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration
-from cell.reconstruction import (
+from cell.measure.calibration import ScanCalibration
+from cell.measure.reconstruction import (
     Cloud,
     Seam,
     calibration_motions,
@@ -21,12 +21,12 @@ from cell.reconstruction import (
     merge,
     write_cloud,
 )
-from cell.reconstruction.cloud import Array, Indices
-from cell.reconstruction.seams import Motions
-from cell.record.seen import Lines
-from cell.steps.step import JobStep
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.workplace import Workplace
+from cell.measure.reconstruction.cloud import Array, Indices
+from cell.measure.reconstruction.seams import Motions
+from cell.procedures.observed import Lines
+from cell.procedures.steps.step import JobStep
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import RefusedError
 from statemachine.policy import Step
 from statemachine.runner import StepContext

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cell.steps.workplace import Workplace
+from cell.procedures.steps.workplace import Workplace
 from statemachine.policy import Step
 from statemachine.runner import StepContext
 

@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.store import CellCalibration
-from cell.config import CellConfig
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
 from cell.devices.devices import Devices
-from cell.inversion import NominalSurface
-from cell.job import Job
-from cell.run.frames import FrameStore
-from cell.run.pace import Pace
-from cell.steps.moves import Mover
-from cell.steps.part import PartProgress
-from cell.steps.photograph import BoardFix, photograph
-from cell.steps.quiet import APART_S
-from cell.steps.swath import Collector
-from cell.steps.whereabouts import Whereabouts
-from cell.vision import BoardSpec, parse_board
+from cell.measure.inversion import NominalSurface
+from cell.measure.vision import BoardSpec, parse_board
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.part import PartProgress
+from cell.procedures.arm.photograph import BoardFix, photograph
+from cell.procedures.drive.settled import APART_S
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.pace import Pace
+from cell.procedures.sweep.swath import Collector
 from drivers.interfaces import Vector
 
 if TYPE_CHECKING:
-    from cell.steps.stored_sweep import StoredSweep
+    from cell.procedures.sweep.stored_sweep import StoredSweep
 
 CHANCE_SCATTER = 1.3
 """Found over configured scatter of the arm that the few views of a calibration show by chance."""
@@ -129,7 +129,7 @@ class Workplace:
         return ratio if ratio > CHANCE_SCATTER else 1.0
 
     def photograph(self, count: int = 1) -> BoardFix:
-        """The station's board from `count` photographs by the target camera; see `cell.steps.photograph`."""
+        """The station's board from `count` photographs by the target camera; see `cell.procedures.arm.photograph`."""
         # Numbered, since a camera may count its frames anew: a later photograph must not take an earlier one's place.
         self._photographs += 1
         what = f"board-{self._photographs:02d}"

@@ -12,11 +12,11 @@ from contextlib import suppress
 import numpy as np
 
 from cell.devices.devices import Devices
-from cell.geometry.poses import from_parts
+from cell.measure.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
-from cell.steps.camera_poses import ScanPlan
-from cell.steps.moves import Mover
-from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.arm.camera_poses import ScanPlan
+from cell.procedures.arm.moves import Mover
+from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.clock_map import ClockMap
 from drivers.errors import CellError, DeviceFault
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from cell.devices.devices import Devices
-from cell.devices.following import MOST_SCATTER
-from cell.geometry.poses import from_ur
-from cell.record.seen import RailPath
-from cell.steps.camera_poses import ScanPlan
-from cell.steps.moves import Mover
-from cell.steps.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.devices.simulated.following import MOST_SCATTER
+from cell.measure.geometry.poses import from_ur
+from cell.procedures.arm.camera_poses import ScanPlan
+from cell.procedures.arm.moves import Mover
+from cell.procedures.observed import RailPath
+from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault
 
 MAX_FLANGE_MOTION = 1e-4

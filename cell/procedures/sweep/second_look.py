@@ -11,20 +11,20 @@ from functools import partial
 
 import numpy as np
 
-from cell.calibration.collect.witness import configure_fast
-from cell.inversion import PlacePose
-from cell.inversion.creep import Creep
-from cell.inversion.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
-from cell.inversion.observability import Tolerance
-from cell.job import ScanSection
-from cell.reconstruction import Cloud, flange_motions
-from cell.steps.laser_sweep import swept
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction, build_cloud
-from cell.steps.swath import Swath
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.unmoved import require_unmoved as require_board_unmoved
-from cell.steps.workplace import Workplace
+from cell.config.job import ScanSection
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.effects.creep import Creep
+from cell.measure.inversion.effects.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.reconstruction import Cloud, flange_motions
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.calibrate.reference_plate import configure_fast
+from cell.procedures.drive.station_check import require_unmoved as require_board_unmoved
+from cell.procedures.steps.laser_sweep import swept
+from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.swath import Swath
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext

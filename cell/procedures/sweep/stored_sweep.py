@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanCalibration
-from cell.calibration.slip import Slip
-from cell.calibration.validation import require_covariance
-from cell.calibration.witness import Pointing
-from cell.geometry.poses import difference, from_matrix
-from cell.job import ScanSection
-from cell.reconstruction import ScanGeometry
-from cell.steps.photograph import BoardFix
-from cell.steps.swath import Collector, Swath
-from cell.steps.sweep_record import SweepRecord
-from cell.storage import DIGEST, replacing, require_unchanged, sealed_arrays, sync_files
+from cell.base.storage import DIGEST, replacing, require_unchanged, sealed_arrays, sync_files
+from cell.config.calibrations.validation import require_covariance
+from cell.config.job import ScanSection
+from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.calibration.drift.slip import Slip
+from cell.measure.geometry.poses import difference, from_matrix
+from cell.measure.reconstruction import ScanGeometry
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.sweep.swath import Collector, Swath
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.camera.folder import read_image
 from drivers.errors import CalibrationStale, CellError, RefusedError
 from drivers.interfaces import Frame, Vector

@@ -12,14 +12,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.timing import Timing
-from cell.geometry.poses import from_matrix
-from cell.inversion import NominalSurface
-from cell.job import ScanSection
-from cell.reconstruction import ProfileBuilder, ScanGeometry
-from cell.steps.frame_times import require_one_clock
-from cell.vision import StripeProfile, StripeStream
-from cell.vision.stripe.rehearsal import drawn
+from cell.config.job import ScanSection
+from cell.measure.calibration.timing import Timing
+from cell.measure.geometry.poses import from_matrix
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction import ProfileBuilder, ScanGeometry
+from cell.measure.vision import StripeProfile, StripeStream
+from cell.measure.vision.stripe.warm_up import drawn
+from cell.procedures.sweep.frame_times import require_one_clock
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Vector
 

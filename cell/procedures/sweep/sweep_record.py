@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.slip import Slip
-from cell.calibration.witness import Pointing
-from cell.steps.swath import Swath
-from cell.vision import StripeProfile
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.calibration.drift.slip import Slip
+from cell.measure.vision import StripeProfile
+from cell.procedures.sweep.swath import Swath
 from drivers.interfaces import ArmMotion, Frame, Vector
 
 

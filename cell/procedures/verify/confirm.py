@@ -11,9 +11,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from cell.calibration.store import CellCalibration, save_calibration
-from cell.calibration.verify.verdict import Verification
-from cell.calibration.witness import ConfirmedTurn
+from cell.config.calibrations.store import CellCalibration, save_calibration
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn
+from cell.procedures.verify.verdict import Verification
 
 
 def keep_confirmed(folder: Path, calibration: CellCalibration, verification: Verification) -> ConfirmedTurn | None:

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.collect.stripe_on_board import points_on_board
-from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.solve.blocks import State, ViewData
-from cell.calibration.solve.joint import STRIPE_POINTS
-from cell.calibration.solve.reference import Reference
-from cell.calibration.solve.results import ScanCalibration, TargetCalibration
-from cell.calibration.solve.starts import stripe_means
-from cell.calibration.verify.decision import Verdict, verdict
-from cell.calibration.verify.evidence import Look, dots_of, evidence
-from cell.calibration.verify.pointing import WitnessCheck
-from cell.calibration.witness import Pointing
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_parts
-from cell.vision.board.board import board_pose
+from cell.measure.calibration.drift.decision import Verdict, verdict
+from cell.measure.calibration.drift.evidence import Look, dots_of, evidence
+from cell.measure.calibration.drift.pointing import WitnessCheck
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.calibration.observations import ScanObservation, TargetObservation
+from cell.measure.calibration.solve.blocks import State, ViewData
+from cell.measure.calibration.solve.joint import STRIPE_POINTS
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.calibration.solve.starts import stripe_means
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.stripe_on_board import points_on_board
 from drivers.errors import CalibrationStale, RefusedError
 
 SWEEP_PROFILES = 24

@@ -1,6 +1,7 @@
 """The verdict on a stored calibration in words and numbers: what to do, what it does to the place, what it can see.
 
-The decision itself is `cell.calibration.verify.decision`'s, the pictures are taken by `cell.calibration.verify.views`.
+The decision itself is `cell.measure.calibration.drift.decision`'s, the pictures are taken by
+`cell.procedures.verify.views`.
 """
 
 from __future__ import annotations
@@ -11,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.solve.place_effect import scan_effect, target_effect
-from cell.calibration.store import CellCalibration
-from cell.calibration.verify.decision import WORST_FIT, Suspect, Verdict
-from cell.calibration.verify.detectability import DETECTED
-from cell.calibration.verify.looks import CheckObservations, check_witness, verify
-from cell.calibration.verify.pointing import WitnessCheck
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_parts
-from cell.job import Job
-from cell.report.html import table
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.base.notebook import table
+from cell.config.calibrations.store import CellCalibration
+from cell.config.job import Job
+from cell.measure.calibration.drift.decision import WORST_FIT, Suspect, Verdict
+from cell.measure.calibration.drift.detectability import DETECTED
+from cell.measure.calibration.drift.place_effect import scan_effect, target_effect
+from cell.measure.calibration.drift.pointing import WitnessCheck
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
+from cell.procedures.verify.looks import CheckObservations, check_witness, verify
 
 SHARE = 0.3
 """Of the place's tolerance: what moves the place by less is told and not called bad. A third, with room for an estimate

@@ -13,23 +13,23 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.collect.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
-from cell.calibration.collect.witness import require_witness
-from cell.calibration.store import CellCalibration
-from cell.calibration.verify.looks import CheckObservations
-from cell.calibration.witness import turn_seen
-from cell.config import CellConfig
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import ScanSection
 from cell.devices.devices import Devices
-from cell.geometry.poses import from_ur
-from cell.job import ScanSection
+from cell.measure.calibration import ScanObservation, TargetObservation
+from cell.measure.calibration.drift.reference_plate import turn_seen
+from cell.measure.geometry.poses import from_ur
+from cell.measure.reconstruction import ScanGeometry
+from cell.measure.vision import BoardSpec, BoardView, StripeProfile, parse_board
 from cell.motion.arm_models import HOME
-from cell.reconstruction import ScanGeometry
-from cell.steps.camera_poses import ScanPlan, View, rail_ends, verification_views
-from cell.steps.moves import Mover
-from cell.steps.rail_sweep import rail_sweep
-from cell.steps.swath import Collector, SweepErrors, rehearse
-from cell.vision import BoardSpec, BoardView, StripeProfile, parse_board
+from cell.procedures.arm.camera_poses import ScanPlan, View, rail_ends, verification_views
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
+from cell.procedures.calibrate.reference_plate import require_witness
+from cell.procedures.sweep.rail_sweep import rail_sweep
+from cell.procedures.sweep.swath import Collector, SweepErrors, rehearse
+from cell.procedures.verify.looks import CheckObservations
 from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cell.storage import write_json as write_json
+from cell.base.storage import write_json as write_json
 from drivers.errors import ConfigError
 from statemachine.journal import JournalError, read
 

@@ -8,8 +8,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from cell.run.folder import REPORT, when
-from cell.storage import EditedError, read_json
+from cell.base.storage import EditedError, read_json
+from cell.run.files.folder import REPORT, when
 from drivers.errors import CellError, ConfigError
 from statemachine.journal import JournalError, Record, read
 

@@ -20,10 +20,10 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from numpy.typing import NDArray
 
-from cell.geometry.camera import CameraModel
+from cell.measure.geometry.camera import CameraModel
 from cell.motion.bodies import Body
 from cell.motion.kinematics import ArmKinematics
-from cell.record.small import stamp
+from cell.run.record.small import stamp
 from drivers.interfaces import Vector
 
 ROOT, BASE = "tf#/", "base"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cell.record.reading import messages
+from cell.run.record.reading import messages
 
 ERROR_FLAG = 0x20000000
 CAN, WIRES = "/vehicle/can", ("/vehicle/can", "/arm/rtde", "/rail/serial", "/laser/serial", "/claw/serial")

@@ -1,8 +1,8 @@
 """The file `record.mcap`, written by a thread of its own: whoever puts something in never waits for the disk.
 
 Messages are made by that thread, too: what is put in is how to make them. Chunks are small and go to the system once a
-second, so that a run that is cut off loses little; `cell.record.repair` closes its file. They are not compressed: the
-pictures are, and the rest is little.
+second, so that a run that is cut off loses little; `cell.run.record.repair` closes its file. They are not compressed:
+the pictures are, and the rest is little.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from cell.record.channels import BY_TOPIC, json_schema
-from cell.storage import sync_folder
+from cell.base.storage import sync_folder
+from cell.run.record.channels import BY_TOPIC, json_schema
 from drivers.errors import CellError
 
 FILE = "record.mcap"

@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from cell.record.reading import Parts, decoding, said
+from cell.run.record.reading import Parts, decoding, said
 from drivers.errors import CellError
 
 

@@ -1,6 +1,6 @@
 """What a run's perception was given and what it made of it, to the last digit: `perception.json` in the run's folder.
 
-With the frames, `sweep.npz`, job, configuration and calibration beside it, `cell.record.replay` does it all again.
+With the frames, `sweep.npz`, job, configuration and calibration beside it, `cell.run.record.replay` does it all again.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from cell.inversion import PlacePose
-from cell.run.folder import write_json
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction
-from cell.steps.sweep_record import SweepRecord
+from cell.measure.inversion import PlacePose
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.run.files.folder import write_json
 from drivers.errors import CellError, ConfigError, RefusedError
 from statemachine.runner import RunResult
 

@@ -12,7 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
-from cell.record.file import message_class, require_packages
+from cell.run.record.file import message_class, require_packages
 from drivers.errors import CellError, ConfigError
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -16,19 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.store import CellCalibration
-from cell.config import DEVICES, CellConfig
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import DEVICES, CellConfig
+from cell.config.mounting import deck_plates, mounted
 from cell.devices.devices import Devices
-from cell.devices.interlocks import Command
+from cell.devices.gate.interlocks import Command
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
-from cell.mounting import deck_plates, mounted
-from cell.record.channels import CAMERAS, COMMANDED
-from cell.record.file import FILE, RecordFile, missing
-from cell.record.seen import Lines, RailPath
-from cell.record.sketch import Sketch
-from cell.record.times import Times
-from cell.record.words import as_json, rtde, wire
-from cell.run.frames import Picture
+from cell.procedures.frame_store import Picture
+from cell.procedures.observed import Lines, RailPath
+from cell.run.record.channels import CAMERAS, COMMANDED
+from cell.run.record.file import FILE, RecordFile, missing
+from cell.run.record.sketch import Sketch
+from cell.run.record.times import Times
+from cell.run.record.words import as_json, rtde, wire
 from cell.run.run import Run
 from drivers.interfaces import ArmState, Frame, RailState
 from statemachine.step import Event
@@ -145,13 +145,13 @@ class Recorder(logging.Handler):
         self._json("/sequence/event", at, {"kind": event.kind, "step": event.step or "", "data": data})
 
     def command(self, command: Command, refused: str | None) -> None:
-        """See `cell.devices.gate.Listener`."""
+        """See `cell.devices.gate.gate.Listener`."""
         if command.device in COMMANDED:
             told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
             self._json(f"/{command.device}/command", self._times.now(), told)
 
     def reading(self, device: str, reading: object) -> None:
-        """See `cell.devices.gate.Listener`."""
+        """See `cell.devices.gate.gate.Listener`."""
         if isinstance(reading, RailPath):
             for stamp, position in reading.samples.tolist():
                 at = self._times.of(stamp)
@@ -171,7 +171,7 @@ class Recorder(logging.Handler):
                 self._rail_at(at, reading.position)
 
     def frame(self, what: str, frame: Frame, picture: Picture) -> None:
-        """A frame is kept, see `cell.run.frames.FrameStore`."""
+        """A frame is kept, see `cell.procedures.frame_store.FrameStore`."""
         camera = self._camera_of(what, frame)
         at = self._times.of(frame.mid_exposure)
         told = {

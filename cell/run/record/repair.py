@@ -10,9 +10,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from cell.record.file import CHUNK_BYTES, require_packages
-from cell.record.reading import CHANNEL, MESSAGE, METADATA, SCHEMA, Parts, decoding, parts
-from cell.storage import replacing
+from cell.base.storage import replacing
+from cell.run.record.file import CHUNK_BYTES, require_packages
+from cell.run.record.reading import CHANNEL, MESSAGE, METADATA, SCHEMA, Parts, decoding, parts
 from drivers.errors import CellError, ConfigError
 
 DAMAGED = ".damaged"

@@ -16,26 +16,26 @@ from typing import Any, cast
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.store import read_calibration
-from cell.config import CellConfig
+from cell.base.toml_file import restored
+from cell.config.calibrations.store import read_calibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
 from cell.devices.assembly import behind_gate
-from cell.geometry.poses import difference, from_matrix
-from cell.inversion import NominalSurface
-from cell.job import Job
-from cell.reconstruction.ply import read_cloud
-from cell.record.file import FILE as RECORD
-from cell.record.perception import CLOUD, REPLAYED, load, of_points, sha256
-from cell.record.reading import messages
-from cell.run.frames import FrameStore
-from cell.steps.board_photo import settled
-from cell.steps.invert_pose import inverted
-from cell.steps.photograph import BoardFix, photograph
-from cell.steps.reconstruct import reconstructed
-from cell.steps.stored_sweep import StoredSweep
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
-from cell.toml_file import restored
+from cell.measure.geometry.poses import difference, from_matrix
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction.ply import read_cloud
+from cell.procedures.arm.photograph import BoardFix, photograph
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps.board_photo import settled
+from cell.procedures.steps.invert_pose import inverted
+from cell.procedures.steps.reconstruct import reconstructed
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.stored_sweep import StoredSweep
+from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.run.record.file import FILE as RECORD
+from cell.run.record.perception import CLOUD, REPLAYED, load, of_points, sha256
+from cell.run.record.reading import messages
 from drivers.camera.folder import read_image
 from drivers.clock import Clock
 from drivers.errors import ConfigError, RefusedError

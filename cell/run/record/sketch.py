@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.store import CellCalibration
-from cell.config import CellConfig
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body
-from cell.record.channels import CAMERAS
-from cell.run.frames import Picture
+from cell.procedures.frame_store import Picture
+from cell.run.record.channels import CAMERAS
 from drivers.errors import CellError
 from drivers.interfaces import ArmState
 
 if TYPE_CHECKING:
-    from cell.record.drawing import Frames
+    from cell.run.record.drawing import Frames
 
 PICTURE_S = 10.0
 """Wall seconds that a picture may take to be encoded before its message is left out."""
@@ -40,7 +40,7 @@ class Sketch:
 
     @cached_property
     def _frames(self) -> Frames:
-        from cell.record.drawing import Frames
+        from cell.run.record.drawing import Frames
 
         try:
             told = self._devices.arm.link_table() if "arm" in self._devices else None
@@ -79,13 +79,13 @@ class Sketch:
 
     def scene(self, at: int, new: Sequence[Body], gone: Sequence[str]) -> bytes:
         """Bodies that are new, or elsewhere, and those that are gone."""
-        from cell.record import drawing
+        from cell.run.record import drawing
 
         return drawing.scene(at, new, gone)
 
     def lens(self, at: int, camera: str) -> bytes | None:
         """A camera's calibration; None where it has none."""
-        from cell.record import drawing
+        from cell.run.record import drawing
 
         if (found := self._calibration) is None:
             return None
@@ -93,26 +93,26 @@ class Sketch:
 
     def image(self, at: int, camera: str, picture: Picture) -> bytes | None:
         """A picture as its file has it; None where there is none."""
-        from cell.record import small
+        from cell.run.record import small
 
         png = picture.png(PICTURE_S)
         return None if png is None else small.image(at, camera, png)
 
     def line(self, at: int, points: NDArray[np.float32]) -> bytes:
         """Points (n, 3) of the base."""
-        from cell.record import drawing
+        from cell.run.record import drawing
 
         return drawing.cloud(at, points)
 
     def grown(self, at: int, points: NDArray[np.float32], seen: NDArray[np.bool_], lines: Any) -> bytes:
         """The points of these lines, thinned evenly."""
-        from cell.record import drawing
+        from cell.run.record import drawing
 
         there = points[lines][seen[lines]]
         return drawing.cloud(at, there[:: max(1, -(-len(there) // MOST_POINTS))])
 
     def log_line(self, at: int, record: logging.LogRecord, text: str) -> bytes:
         """A line of the log."""
-        from cell.record import small
+        from cell.run.record import small
 
         return small.log_line(at, record, text)

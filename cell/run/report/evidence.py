@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cell.inversion import PlacePose, fit_figures
-from cell.job import Job
-from cell.run.frames import FrameStore
-from cell.steps.photograph import BoardFix
-from cell.steps.place import PlaceResult
+from cell.config.job import Job
+from cell.measure.inversion import PlacePose, fit_figures
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps.place import PlaceResult
 from drivers.errors import Measured, RefusedError
 from statemachine.policy import Outcome
 from statemachine.runner import RunResult

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.poses import from_ur, transform
-from cell.inversion import NominalSurface
-from cell.job import load_job
-from cell.reconstruction.e57 import write_e57
-from cell.reconstruction.mesh import triangles, write_mesh
-from cell.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
-from cell.report.figures import simulated_words
-from cell.run.reading import read_report
+from cell.config.job import load_job
+from cell.measure.geometry.poses import from_ur, transform
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction.e57 import write_e57
+from cell.measure.reconstruction.mesh import triangles, write_mesh
+from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
+from cell.run.files.reading import read_report
+from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError
 
 SUFFIXES = {"ply": ".ply", "e57": ".e57", "stl": ".stl", "mesh": ".ply"}

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from cell.report.figures import told
-from cell.vision import BoardView
+from cell.measure.vision import BoardView
+from cell.run.report.figures import told
 from drivers.interfaces import Image, Vector
 
 LEAST_SQUARE_MM, MOST_SQUARES = 1.2, 60

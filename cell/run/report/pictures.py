@@ -14,13 +14,19 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
 
-from cell.geometry.poses import transform
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
-from cell.reconstruction import Cloud
-from cell.report.evidence import Evidence, ended_in
-from cell.report.figures import simulated_words
-from cell.report.panels import (
+from cell.config.job import Job
+from cell.measure.geometry.poses import transform
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.reconstruction import Cloud
+from cell.measure.vision import BoardView
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.run.report.evidence import Evidence, ended_in
+from cell.run.report.figures import simulated_words
+from cell.run.report.panels import (
     BoardPanel,
     StripePanel,
     SurfacePanel,
@@ -31,12 +37,6 @@ from cell.report.panels import (
     draw_surface,
     empty,
 )
-from cell.run.frames import FrameStore
-from cell.steps.drive_to_target import Arrival
-from cell.steps.photograph import BoardFix
-from cell.steps.reconstruct import Reconstruction
-from cell.steps.sweep_record import SweepRecord
-from cell.vision import BoardView
 from drivers.interfaces import Frame
 from statemachine.runner import RunResult
 

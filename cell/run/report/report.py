@@ -13,19 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from cell.config import CellConfig
-from cell.geometry.poses import to_ur
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
-from cell.report.bound import stated_bound
-from cell.report.evidence import last_frames, measured, refusal
-from cell.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
-from cell.run.folder import REPORT, timeless, when
-from cell.run.frames import FrameStore
-from cell.steps.reconstruct import Reconstruction
-from cell.steps.sweep_record import SweepRecord
-from cell.storage import sealed, write_json
-from cell.version import release
+from cell.base.storage import sealed, write_json
+from cell.base.version import release
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.geometry.poses import to_ur
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.part_error import stated_bound
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.run.files.folder import REPORT, timeless, when
+from cell.run.report.evidence import last_frames, measured, refusal
+from cell.run.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
 from statemachine.step import summary_of
@@ -95,7 +95,7 @@ def make_report(
     report["measured"] = measured(result, job, report["truth"], report["place_bound_95"])
     try:
         # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
-        from cell.report.pictures import draw_run
+        from cell.run.report.pictures import draw_run
 
         draw_run(folder / "picture.png", job, nominal, result, report, frames)
     except Exception as error:

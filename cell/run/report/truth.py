@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import difference, from_matrix, transform
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job
-from cell.reconstruction import Cloud
-from cell.report.bound import draws, part_points, placed_points, point_covariances, through
+from cell.config.job import Job
+from cell.measure.geometry.poses import difference, from_matrix, transform
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.reconstruction import Cloud
+from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, through
 from drivers.interfaces import Vector
 from statemachine.runner import Event
 

@@ -6,19 +6,12 @@ from collections.abc import Collection
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
-from cell.config import (
-    DEVICES,
-    Confirm,
-    beside,
-    config_to_open,
-    load_config,
-    require_real_addresses,
-)
+from cell.config.cell_config import DEVICES, Confirm, beside, config_to_open, load_config, require_real_addresses
 from cell.devices.assembly import connect, connected_for
-from cell.devices.mix import Sim, simulated_of
-from cell.devices.simulated import SimulatedCell, on_gige, with_endpoints
-from cell.opened import Opened
-from cell.run.lock import CellLock
+from cell.devices.lock import CellLock
+from cell.devices.simulated.mix import Sim, simulated_of
+from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
+from cell.run.session.session import Opened
 from drivers.errors import ConfigError, NotConnectedError
 
 SIM_SPEED = 3.0
@@ -57,8 +50,8 @@ def open_devices(
     true = loaded if truth is None else load_config(Path(truth))
     # The world takes long to load, and real devices have none; over wires it is in another process.
     if clock == "virtual":
-        from cell.devices.described import Described
-        from cell.devices.direct import VirtualCell
+        from cell.devices.simulated.described import Described
+        from cell.devices.simulated.direct import VirtualCell
 
         virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
@@ -68,8 +61,8 @@ def open_devices(
             raise NotConnectedError(name, missing)
     world: SimulatedCell | None = None
     if whole:
-        from cell.devices.described import Described
-        from cell.vision.stripe.rehearsal import read_drawn
+        from cell.devices.simulated.described import Described
+        from cell.measure.vision.stripe.warm_up import read_drawn
 
         world = SimulatedCell(
             true,
@@ -85,7 +78,7 @@ def open_devices(
     else:
         require_real_addresses(loaded, names)
     if beside_real := tuple(name for name in names if name in needed and not whole):
-        from cell.devices.mixed import MixedCell
+        from cell.devices.simulated.mixed import MixedCell
 
         if speed not in (None, loaded.cell.time_scale):
             raise ConfigError(f"speed={speed:g}: real devices keep the wall's time; leave that out")

@@ -1,6 +1,6 @@
 """An open cell as the work on it sees it: its devices, where results go, what world it stands in, how work is recorded.
 
-What goes on in it, one run at a time, is `cell.run.runs`'s; how it is opened, `cell.opening`'s.
+What goes on in it, one run at a time, is `cell.run.runs`'s; how it is opened, `cell.run.session.opening`'s.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cell.config import CellConfig
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
 from cell.devices.devices import Devices
-from cell.devices.simulated import Simulation
+from cell.devices.simulated.process import Simulation
+from cell.devices.simulated.truth_link import ask_truth
 from cell.devices.stopping import require_healthy, require_no_emergency_stop
-from cell.devices.truth_link import ask_truth
-from cell.job import Job
-from cell.run.pace import Pace
+from cell.procedures.arm.moves import Mover
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.pace import Pace
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.run import Run
-from cell.steps.moves import Mover
-from cell.steps.whereabouts import Whereabouts
 
 Made = TypeVar("Made")
 

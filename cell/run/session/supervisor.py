@@ -18,33 +18,33 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from cell.calibration import sessions
-from cell.calibration.store import CalibrationEdited, CellCalibration
-from cell.calibration.verify.verdict import Verification
-from cell.config import DEVICES, CellConfig, Confirm
+from cell.base.lateness import LATENESS
+from cell.config.calibrations.store import CalibrationEdited, CellCalibration
+from cell.config.cell_config import DEVICES, CellConfig, Confirm
+from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
-from cell.devices.injection import Injector
-from cell.devices.jogging import arm_is_ready, begin_program
-from cell.devices.mix import Sim
-from cell.devices.simulated import Simulation, is_whole
+from cell.devices.simulated.injection import Injector
+from cell.devices.simulated.mix import Sim
+from cell.devices.simulated.process import Simulation, is_whole
 from cell.devices.stopping import stop_cell
-from cell.job import Job, load_job
 from cell.motion.arm_models import HOME
-from cell.opened import Opened
-from cell.opening import open_devices
-from cell.run.folder import find_run
+from cell.procedures.arm.moves import Mover
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.steps.kinds import find_kind
+from cell.procedures.verify.verdict import Verification
+from cell.run import calibration as sessions
+from cell.run.files.folder import find_run
 from cell.run.job_run import Observer, RunOutcome
 from cell.run.job_work import JobWork
-from cell.run.lateness import LATENESS
+from cell.run.jogging import arm_is_ready, begin_program
 from cell.run.maintenance import recorded_maintenance
 from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import Hands
 from cell.run.resumption import UnfinishedRun
 from cell.run.run import Run
 from cell.run.runs import Runs
-from cell.steps.kinds import find_kind
-from cell.steps.moves import Mover
-from cell.steps.whereabouts import Whereabouts
+from cell.run.session.opening import open_devices
+from cell.run.session.session import Opened
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import Event
 from statemachine.script import NO_SCRIPT, Script
@@ -383,7 +383,7 @@ class Cell:
         stops = self.stops
         ready = ReadyJob.read(job, self.config, until, script, calibrates=is_whole(self.simulated))
         if self.simulated is not None:
-            from cell.devices.described import Described
+            from cell.devices.simulated.described import Described
 
             self.simulated.make_ready(Described.of(job))
         stored: CellCalibration | None = None

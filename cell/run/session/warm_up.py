@@ -15,13 +15,13 @@ import threading
 import numpy as np
 import pinocchio as pin
 
-from cell.compiled import is_kept
-from cell.inversion import NominalSurface
-from cell.inversion.closest import closest
-from cell.inversion.search import candidates
-from cell.reconstruction import Cloud, fill_holes
-from cell.reconstruction.outliers import find_outliers
-from cell.vision.stripe.rehearsal import read_drawn
+from cell.base.compiled import is_kept
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.closest import closest
+from cell.measure.inversion.start_poses import candidates
+from cell.measure.reconstruction import Cloud, fill_holes
+from cell.measure.reconstruction.outliers import find_outliers
+from cell.measure.vision.stripe.warm_up import read_drawn
 
 LINES = 40
 """Lines and rows of the drawn cloud."""
@@ -39,7 +39,7 @@ def begin() -> None:
     """Compile in a second process what is not kept on disk yet. It ends with this one, if not before."""
     if _second or is_kept(closest):
         return
-    mine, nowhere = [sys.executable, "-m", "cell.ahead"], subprocess.DEVNULL
+    mine, nowhere = [sys.executable, "-m", "cell.run.session.warm_up"], subprocess.DEVNULL
     # Nothing is written to the pipe; it closes when this process ends, in whatever way.
     try:
         _second.append(subprocess.Popen(mine, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere))

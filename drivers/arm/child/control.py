@@ -15,6 +15,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from drivers.arm.child.program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
+from drivers.arm.child.streaming import Streaming
 from drivers.arm.messages import (
     UNANSWERED,
     Ended,
@@ -25,8 +27,6 @@ from drivers.arm.messages import (
     Snapshot,
 )
 from drivers.arm.motion import Trajectory, pose_difference
-from drivers.arm.ur_program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
-from drivers.arm.ur_streaming import Streaming
 from drivers.clock import Clock
 
 _PLACE_TOLERANCE, _TURN_TOLERANCE = 1e-3, 2e-3

@@ -26,13 +26,13 @@ from typing import Any
 from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 
+from drivers.arm.child.control import ControlThread
+from drivers.arm.child.outbox import Message, Outbox
+from drivers.arm.child.outputs import OFF_S, keep_low, make_safe, switch_output
+from drivers.arm.child.packets import Packets
+from drivers.arm.child.program import PERIOD
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.messages import MODE_RUNNING, UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
-from drivers.arm.outbox import Message, Outbox
-from drivers.arm.ur_control import ControlThread
-from drivers.arm.ur_outputs import OFF_S, keep_low, make_safe, switch_output
-from drivers.arm.ur_packets import Packets
-from drivers.arm.ur_program import PERIOD
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.last_words_child import FROZEN_S, LOOK_S, Owner, raise_priority

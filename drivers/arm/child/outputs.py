@@ -10,9 +10,9 @@ from typing import Any
 
 from rtde_io import RTDEIOInterface
 
+from drivers.arm.child.packets import Packets
+from drivers.arm.child.program import PERIOD
 from drivers.arm.messages import STOPPED
-from drivers.arm.ur_packets import Packets
-from drivers.arm.ur_program import PERIOD
 from drivers.clock import Clock
 
 OFF_S = 1.0

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
+from drivers.arm.child.program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.messages import Pace, Setup, Six, Snapshot
 from drivers.arm.motion import Trajectory
-from drivers.arm.ur_program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.clock import Clock
 
 _LOOKAHEAD, _GAIN = 0.05, 500

@@ -5,11 +5,11 @@ from __future__ import annotations
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeviceFault
 from drivers.quantities import shown
-from drivers.rail.arrival import STANDSTILL_S
 from drivers.rail.axis import Samples
-from drivers.rail.modbus_drive import ModbusDrive
-from drivers.rail.modbus_zero import ZERO_M, DriveZero
+from drivers.rail.modbus.drive import ModbusDrive
+from drivers.rail.modbus.zero import ZERO_M, DriveZero
 from drivers.rail.motion import patience
+from drivers.rail.tmcl.arrival import STANDSTILL_S
 
 
 class DriveArrival:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from drivers.errors import DeviceFault, LimitError
-from drivers.rail.modbus_link import ModbusLink
-from drivers.rail.registers import Flag, Number, Rate, RegisterMap
+from drivers.rail.modbus.link import ModbusLink
+from drivers.rail.modbus.registers import Flag, Number, Rate, RegisterMap
 
 
 class ModbusDrive:

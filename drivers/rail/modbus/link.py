@@ -17,7 +17,7 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
-from drivers.rail.registers import Action
+from drivers.rail.modbus.registers import Action
 from drivers.serial_port import FAILURES, open_port
 
 REPLY_TIMEOUT_S = 0.3

@@ -12,11 +12,11 @@ from drivers.errors import Aborted, ConfigError, LimitError
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.quantities import UNTOLD, shown
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.modbus_arrival import DriveArrival
-from drivers.rail.modbus_drive import ModbusDrive
-from drivers.rail.modbus_link import ModbusLink
-from drivers.rail.modbus_zero import DriveZero
-from drivers.rail.registers import Number, Rate, RegisterMap
+from drivers.rail.modbus.arrival import DriveArrival
+from drivers.rail.modbus.drive import ModbusDrive
+from drivers.rail.modbus.link import ModbusLink
+from drivers.rail.modbus.registers import Number, Rate, RegisterMap
+from drivers.rail.modbus.zero import DriveZero
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from drivers.quantities import shown
-from drivers.rail.modbus_drive import ModbusDrive
+from drivers.rail.modbus.drive import ModbusDrive
 from drivers.rail.motion import patience
 
 BEGINS_S = 1.0

@@ -7,9 +7,9 @@ from drivers.errors import Aborted, DeviceFault
 from drivers.quantities import shown
 from drivers.rail.axis import Samples
 from drivers.rail.motion import patience
-from drivers.rail.tmcl_codec import Axis
-from drivers.rail.tmcl_link import TmclLink
-from drivers.rail.zero import ZeroMark
+from drivers.rail.tmcl.codec import Axis
+from drivers.rail.tmcl.link import TmclLink
+from drivers.rail.tmcl.zero import ZeroMark
 
 STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""

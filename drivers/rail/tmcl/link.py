@@ -18,7 +18,7 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
-from drivers.rail.tmcl_codec import (
+from drivers.rail.tmcl.codec import (
     STATUS_OK,
     STATUS_TEXT,
     TELEGRAM_BYTES,

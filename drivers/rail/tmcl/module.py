@@ -11,8 +11,8 @@ import re
 from dataclasses import dataclass
 
 from drivers.errors import ConfigError, DeviceFault
-from drivers.rail.tmcl_codec import Axis
-from drivers.rail.tmcl_link import NO_SUCH_TYPE, WRONG_VALUE, CommandRefused, TmclLink
+from drivers.rail.tmcl.codec import Axis
+from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, CommandRefused, TmclLink
 
 SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "6212", "6214")
 """Modules of the vendor with a six-point ramp that take speeds in pulses per second."""

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError
 from drivers.interfaces import Identity, RailState, Reading
-from drivers.rail import health
-from drivers.rail.arrival import Arrival
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
 from drivers.rail.motion import RailMotion
-from drivers.rail.tmcl_codec import Axis, Reference
-from drivers.rail.tmcl_link import NO_SUCH_TYPE, CommandRefused, TmclLink
-from drivers.rail.zero import STALL_FLAG, ZeroMark
+from drivers.rail.tmcl import health
+from drivers.rail.tmcl.arrival import Arrival
+from drivers.rail.tmcl.codec import Axis, Reference
+from drivers.rail.tmcl.link import NO_SUCH_TYPE, CommandRefused, TmclLink
+from drivers.rail.tmcl.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
+from drivers.rail.tmcl.zero import STALL_FLAG, ZeroMark
 
 _HOME_SWITCH_ON_BELOW = (5, 7)
 """Reference modes whose zero is the edge below which the home switch is on."""
@@ -38,7 +38,7 @@ class TmclRail(RailAxis):
     motion that runs on it runs on. Everything but reading is then an `InterlockError`.
 
     Raises `NotConnectedError` or `DeadlineError` when no module answers, `ConfigError` on impossible parameters and for
-    a module that is not in `drivers.rail.module.SUPPORTED`.
+    a module that is not in `drivers.rail.tmcl.module.SUPPORTED`.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class TmclRail(RailAxis):
         return self._clock.wall(self._link.get_stamped(Axis.POSITION)[2])
 
     def examine(self, seconds: float) -> list[Reading]:
-        """What the module tells of its motor driver, at once; see `drivers.rail.health`."""
+        """What the module tells of its motor driver, at once; see `drivers.rail.tmcl.health`."""
         try:
             return health.readings(self._link.get(Axis.DRIVER_ERRORS))
         except CommandRefused as refused:

@@ -12,8 +12,8 @@ import logging
 import zlib
 
 from drivers.errors import CellError, DeviceFault, InterlockError
-from drivers.rail.tmcl_codec import Axis
-from drivers.rail.tmcl_link import TmclLink
+from drivers.rail.tmcl.codec import Axis
+from drivers.rail.tmcl.link import TmclLink
 
 MARK_VARIABLE = 200
 """User variable that holds the mark: in RAM only."""

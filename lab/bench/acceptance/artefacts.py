@@ -12,10 +12,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import from_axes, from_parts
-from cell.lab.paper.rig import RigSpec, TrueHead
-from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry
-from cell.vision import StripeStream
+from cell.measure.geometry.poses import from_axes, from_parts
+from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.vision import StripeStream
+from lab.paper.rig import RigSpec, TrueHead
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, SceneObject, render
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.lab.bench import artefacts, form_errors
-from cell.lab.paper.rig import Noise, RigSpec, draw_head, observe
-from cell.lab.paper.solved import in_scan_frame, solve
-from cell.reconstruction import Cloud
+from cell.measure.reconstruction import Cloud
+from lab.bench.acceptance import artefacts, form_errors
+from lab.paper.rig import Noise, RigSpec, draw_head, observe
+from lab.paper.solved import in_scan_frame, solve
 from sim_backends.world.levels import deviations
 
 Array = NDArray[np.float64]

@@ -16,13 +16,13 @@ import numpy as np
 import pinocchio as pin
 from scipy.stats import chi2
 
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.poses import difference
-from cell.lab.bench.board_conditions import CONDITIONS, Condition, View, draw_view
-from cell.lab.bench.board_render import Lens
-from cell.vision.board.board import board_pose, find_board
-from cell.vision.board.spec import KINDS, Kind
-from cell.vision.pictures import PictureRefused
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.poses import difference
+from cell.measure.vision.board.board import board_pose, find_board
+from cell.measure.vision.board.spec import KINDS, Kind
+from cell.measure.vision.pictures import PictureRefused
+from lab.bench.board.conditions import CONDITIONS, Condition, View, draw_view
+from lab.bench.board.render import Lens
 
 # A point farther than this share of a pitch from its own place bears another's name.
 STRAY = 0.25

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.lab.bench.board_render import Lens, Placed, paint, true_pixels
-from cell.vision.board.spec import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.spec import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
+from lab.bench.board.render import Lens, Placed, paint, true_pixels
 
 LENSES = (
     Lens(1280, 1024, 1668, 1664, 641.3, 507.6, (-0.1, 0.15, 1e-3, -8e-4, 0.0)),

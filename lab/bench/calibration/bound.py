@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cell.calibration.observations import ScanObservation
-from cell.lab.bench.calibration_world import OWN, SHARED, Array, HeadWorld, Noise, seen_dots, seen_rows
+from cell.measure.calibration.observations import ScanObservation
+from lab.bench.calibration.world import OWN, SHARED, Array, HeadWorld, Noise, seen_dots, seen_rows
 
 STEPS = np.array(
     [1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-3, 1e-5, 1e-5] + [1e-4] * 3 + [1e-5] * 3 + [1e-6] * 12  # lens, plane, rail, poses

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.bench.calibration_bound import cramer_rao
-from cell.lab.bench.calibration_frames import FRAMES, measured_errors
-from cell.lab.bench.calibration_world import (
+from lab.bench.calibration.bound import cramer_rao
+from lab.bench.calibration.frames import FRAMES, measured_errors
+from lab.bench.calibration.world import (
     HEIGHT,
     STRIPE_WIDTH_PX,
     WIDTH,
@@ -26,7 +26,7 @@ from cell.lab.bench.calibration_world import (
     seen_dots,
     seen_rows,
 )
-from cell.lab.bench.over_cores import run_all
+from lab.bench.over_cores import run_all
 
 TANGENTIAL = (6, 7)
 LENS_TO_MOUNT = 20
@@ -65,10 +65,10 @@ def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None]) ->
 
 def one_trial(seed: int, noise: Noise) -> Trial:
     """Draw, calibrate, measure."""
-    from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-    from cell.calibration.solve.joint import solve_joint, solve_staged, start_state
-    from cell.calibration.store import nominal_camera
-    from cell.config import load_config
+    from cell.config.calibrations.store import nominal_camera
+    from cell.config.cell_config import load_config
+    from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+    from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state
 
     rng = np.random.default_rng(seed)
     world = draw_head(rng)
@@ -113,10 +113,10 @@ def _whitened(error: Array, covariance: Array) -> float:
 
 def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[Any]:
     """What the head sees and its devices report, as `ScanObservation`s with noise; the flange is said to be as sent."""
-    from cell.calibration import ScanObservation
-    from cell.geometry.poses import from_matrix
-    from cell.vision.board.view import BoardView
-    from cell.vision.stripe.extract import StripeProfile
+    from cell.measure.calibration import ScanObservation
+    from cell.measure.geometry.poses import from_matrix
+    from cell.measure.vision.board.view import BoardView
+    from cell.measure.vision.stripe.extract import StripeProfile
 
     made = []
     for view in range(len(world.rails)):
@@ -158,15 +158,15 @@ def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
 
 
 def _names() -> tuple[str, ...]:
-    from cell.calibration.solve.results import PARAMETERS
+    from cell.measure.calibration.solve.results import PARAMETERS
 
     return PARAMETERS
 
 
 def _parameter_errors(state: Any, world: HeadWorld) -> Array:
     """Errors (21,) of the estimate in the order and the terms of the calibration's covariance."""
-    from cell.calibration.solve.blocks import tangents
-    from cell.geometry.poses import difference, from_matrix
+    from cell.measure.calibration.solve.blocks import tangents
+    from cell.measure.geometry.poses import difference, from_matrix
 
     length = np.linalg.norm(world.plane)
     normal, distance = world.plane / length, 1 / length

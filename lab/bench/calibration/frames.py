@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.lab.bench.calibration_bound import STEPS, Bound, differentiated
-from cell.lab.bench.calibration_world import Array, HeadWorld, Noise
+from lab.bench.calibration.bound import STEPS, Bound, differentiated
+from lab.bench.calibration.world import Array, HeadWorld, Noise
 
 FRAMES = ("camera", "scan", "scan_radial_lens", "scan_aligned", "base")
 SCAN_POINTS, BASE_POINTS = 1000, 45

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.collect.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
-from cell.config import CellConfig
-from cell.geometry.poses import from_matrix
+from cell.config.cell_config import CellConfig
+from cell.measure.calibration import ScanObservation, TargetObservation
+from cell.measure.geometry.poses import from_matrix
+from cell.measure.vision import BoardSpec, BoardView, parse_board
+from cell.measure.vision.stripe.extract import StripeProfile
 from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.kinematics import Joints
-from cell.steps.camera_poses import View, scan_calibration_views, target_calibration_views
-from cell.vision import BoardSpec, BoardView, parse_board
-from cell.vision.stripe.extract import StripeProfile
+from cell.procedures.arm.camera_poses import View, scan_calibration_views, target_calibration_views
+from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from drivers.link_table import LinkTable
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
@@ -202,7 +202,7 @@ class ObservedCell:
     # --- a calibration's observations ---
 
     def collect_scan(self, views: Sequence[View] | None = None) -> list[ScanObservation]:
-        """What `cell.calibration.collect.boards.collect_scan` brings, at the same views."""
+        """What `cell.procedures.calibrate.boards.collect_scan` brings, at the same views."""
         made = []
         for k, view in enumerate(scan_calibration_views(self.config, self.fine) if views is None else views):
             rest = self.move(view.base_from_flange.homogeneous)
@@ -217,7 +217,7 @@ class ObservedCell:
         return made
 
     def collect_target(self) -> list[TargetObservation]:
-        """What `cell.calibration.collect.boards.collect_target` brings, at the same views."""
+        """What `cell.procedures.calibrate.boards.collect_target` brings, at the same views."""
         made = []
         for k, view in enumerate(target_calibration_views(self.config, self.large)):
             rest = self.move(view.base_from_flange.homogeneous)

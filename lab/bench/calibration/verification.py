@@ -3,7 +3,7 @@
 Each seed's world is calibrated from synthetic observations and then looked at again: as it was, with one part moved by
 0.2 mm or 0.05°, with one part moved by what the verification says that it can just find, in the least visible
 direction, and with one moved anyhow so that the place of a job is off by a third of its tolerance. The observations
-are `cell.lab.bench.observed_cell`'s: the simulator's optics, arm and deviations.
+are `lab.bench.calibration.observed_cell`'s: the simulator's optics, arm and deviations.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, tangents
-from cell.calibration.store import CellCalibration
-from cell.calibration.verify.detectability import Change, Detectable
-from cell.calibration.verify.hypotheses import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
-from cell.calibration.verify.looks import CheckObservations, verify
-from cell.calibration.verify.verdict import Verification, at_place
-from cell.calibration.verify.views import SCAN_APPROACHES, TARGET_APPROACHES
-from cell.config import load_config
-from cell.geometry.poses import from_matrix
-from cell.job import load_job
-from cell.lab.bench.observed_cell import ObservedCell, Truth
-from cell.steps.camera_poses import rail_ends, verification_views
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import load_config
+from cell.config.job import load_job
+from cell.measure.calibration import ScanObservation, TargetObservation
+from cell.measure.calibration.drift.detectability import Change, Detectable
+from cell.measure.calibration.drift.hypotheses import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
+from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, tangents
+from cell.measure.geometry.poses import from_matrix
+from cell.procedures.arm.camera_poses import rail_ends, verification_views
+from cell.procedures.verify.looks import CheckObservations, verify
+from cell.procedures.verify.verdict import Verification, at_place
+from cell.procedures.verify.views import SCAN_APPROACHES, TARGET_APPROACHES
+from lab.bench.calibration.observed_cell import ObservedCell, Truth
 from sim_backends.world.scene import draw, rotation
 
 PROFILES = 40
@@ -174,7 +174,7 @@ def disturbances() -> list[Disturbance]:
 
 
 def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObservations:
-    """What `cell.calibration.verify.views.collect_verification` brings from this world."""
+    """What `cell.procedures.verify.views.collect_verification` brings from this world."""
     config = cell.config
     assert calibration.scan.reference is not None
     scan_view, target_view = verification_views(config, cell.fine, cell.large, calibration.scan, calibration.target)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cell.config import load_config
-from cell.steps.camera_poses import scan_calibration_views
-from cell.vision.board.spec import BoardSpec, parse_board
+from cell.config.cell_config import load_config
+from cell.measure.vision.board.spec import BoardSpec, parse_board
+from cell.procedures.arm.camera_poses import scan_calibration_views
 from sim_backends.optics.camera import project_points, undistort_pixels
 from sim_backends.world.levels import NOMINAL
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.inversion import Prior
-from cell.inversion.correspondences import Scan
-from cell.inversion.registration import register
-from cell.lab.bench.inversion_parts import PARTS, nominal
-from cell.lab.bench.inversion_scenes import SETTINGS, TRUE, scan, start_away
+from cell.measure.inversion import Prior
+from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.registration import register
 from drivers.errors import RefusedError
+from lab.bench.inversion.parts import PARTS, nominal
+from lab.bench.inversion.scenes import SETTINGS, TRUE, scan, start_away
 
 STARTS = {"far": (0.008, 20.0), "near": (0.003, 0.8)}
 """Where the search begins: m and degrees from the true pose; the prior's standard deviations are the same."""

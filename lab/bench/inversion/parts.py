@@ -16,9 +16,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from cell.geometry.poses import difference
-from cell.inversion import NominalSurface
-from cell.inversion.closest import Array
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.closest import Array
 
 Height = Callable[[Array, Array], Array]
 Symmetry = Literal["none", "axis", "centre"]

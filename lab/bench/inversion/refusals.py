@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import difference, perturbed
-from cell.inversion import Prior, Tolerance, invert_pose
-from cell.inversion.closest import Array
-from cell.lab.bench.inversion_parts import PARTS, nominal
-from cell.lab.bench.inversion_scenes import TRUE, Setting, scan
-from cell.reconstruction import Cloud
+from cell.measure.geometry.poses import difference, perturbed
+from cell.measure.inversion import Prior, Tolerance, invert_pose
+from cell.measure.inversion.closest import Array
+from cell.measure.reconstruction import Cloud
 from drivers.errors import CellError
+from lab.bench.inversion.parts import PARTS, nominal
+from lab.bench.inversion.scenes import TRUE, Setting, scan
 
 TOLERANCE = Tolerance(0.0006, 0.006)
 """The one of the job `pot`."""

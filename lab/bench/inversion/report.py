@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from cell.inversion.closest import Array
-from cell.lab.bench import inversion_refusals as refusals
-from cell.lab.bench.inversion import table, task
-from cell.lab.bench.inversion_parts import PARTS
-from cell.lab.bench.inversion_scenes import RAIL_SIGMA, STRIPE_SIGMA
-from cell.lab.bench.over_cores import Progress, Task, run_all
+from cell.measure.inversion.closest import Array
+from lab.bench.inversion import refusals
+from lab.bench.inversion.campaign import table, task
+from lab.bench.inversion.parts import PARTS
+from lab.bench.inversion.scenes import RAIL_SIGMA, STRIPE_SIGMA
+from lab.bench.over_cores import Progress, Task, run_all
 
 
 def campaign(starts: int, cases: int, progress: Progress) -> dict[str, object]:

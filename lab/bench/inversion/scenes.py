@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.poses import perturbed
-from cell.inversion.closest import Array
-from cell.lab.bench.inversion_parts import Part
-from cell.reconstruction import Cloud
+from cell.measure.geometry.poses import perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.reconstruction import Cloud
+from lab.bench.inversion.parts import Part
 
 Mask = NDArray[np.bool_]
 

@@ -14,19 +14,19 @@ import numpy as np
 import pinocchio as pin
 from scipy.stats import chi2
 
-from cell.config import CellConfig, load_config
-from cell.geometry.poses import difference, transform
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job, load_job
-from cell.lab.bench.acceptance import acceptance
-from cell.lab.bench.coverage import WANTED, interval
-from cell.lab.bench.expected import expect
-from cell.lab.bench.over_cores import over_cores
-from cell.lab.bench.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from cell.report.bound import part_points
-from cell.report.truth import pose_of
+from cell.config.cell_config import CellConfig, load_config
+from cell.config.job import Job, load_job
+from cell.measure.geometry.poses import difference, transform
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.procedures.part_error import part_points
+from cell.run.report.truth import pose_of
 from drivers.interfaces import Vector
+from lab.bench.acceptance.campaign import acceptance
+from lab.bench.coverage import WANTED, interval
+from lab.bench.job.expected import expect
+from lab.bench.job.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
+from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.over_cores import over_cores
 from sim_backends.world.levels import assumed_noise
 
 LIMITS: dict[str, dict[str, float]] = {

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.geometry.poses import transform
-from cell.inversion import NominalSurface, PlacePose
-from cell.lab.bench.scan_errors import by_pose
-from cell.report.bound import part_points
+from cell.measure.geometry.poses import transform
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.procedures.part_error import part_points
 from drivers.interfaces import Vector
+from lab.bench.job.scan_errors import by_pose
 
 DRAWS = 1000
 UNDERSIDE = 400

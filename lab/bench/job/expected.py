@@ -14,23 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import SHARED, State
-from cell.calibration.solve.joint import solve_joint, solve_staged
-from cell.calibration.store import nominal_camera
-from cell.config import CellConfig
-from cell.geometry.covariance import covariance_root
-from cell.geometry.poses import composition_jacobians, transform
-from cell.inversion import NominalSurface
-from cell.job import Job
-from cell.lab.bench.contact import mean_after_contact
-from cell.lab.bench.scan_errors import by_pose
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction import Cloud, calibration_motions, flange_motions
-from cell.reconstruction.build import ScanGeometry
-from cell.report.bound import part_points
-from cell.steps.sweep_record import SweepRecord
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.joint import solve_joint, solve_staged
+from cell.measure.geometry.covariance import covariance_root
+from cell.measure.geometry.poses import composition_jacobians, transform
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction import Cloud, calibration_motions, flange_motions
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.procedures.part_error import part_points
+from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.interfaces import Vector
+from lab.bench.job.contact import mean_after_contact
+from lab.bench.job.scan_errors import by_pose
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.world.scene import draw
 

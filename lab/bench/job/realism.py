@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from cell.config import CellConfig, load_config
-from cell.geometry.poses import difference
-from cell.inversion import NominalSurface, PlacePose
-from cell.job import Job, load_job
-from cell.lab.bench.accuracy import figures
-from cell.lab.bench.coverage import WANTED, interval
-from cell.lab.bench.over_cores import over_cores
-from cell.lab.bench.scan_errors import COVERED
-from cell.lab.bench.whole_job import JobRecord, run_whole_job
-from cell.report.bound import part_covariance
-from cell.report.truth import pose_of
+from cell.config.cell_config import CellConfig, load_config
+from cell.config.job import Job, load_job
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import NominalSurface, PlacePose
+from cell.procedures.part_error import part_covariance
+from cell.run.report.truth import pose_of
+from lab.bench.coverage import WANTED, interval
+from lab.bench.job.accuracy import figures
+from lab.bench.job.scan_errors import COVERED
+from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.over_cores import over_cores
 from sim_backends.world.effects import Effects
 from sim_backends.world.levels import assumed_noise
 

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_matrix, mean, transform
-from cell.inversion import NominalSurface
-from cell.lab.bench.whole_job import JobRecord
-from cell.reconstruction import Cloud
-from cell.reconstruction.build import ScanGeometry
-from cell.report.bound import part_points
-from cell.report.truth import SENSOR_POINTS, pose_of
-from cell.steps.reconstruct import Reconstruction
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_matrix, mean, transform
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.procedures.part_error import part_points
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.run.report.truth import SENSOR_POINTS, pose_of
 from drivers.interfaces import Vector
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.models.arm import ArmParams
 from sim_backends.models.arm_joints import JointErrors
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics

@@ -12,29 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration import ScanObservation, TargetObservation
-from cell.calibration.collect.boards import collect_scan, collect_target
-from cell.calibration.collect.edge import with_edge
-from cell.calibration.collect.timing import look_at_shutter
-from cell.calibration.collect.witness import look_at_witness
-from cell.calibration.sessions import arm_table
-from cell.calibration.store import CellCalibration
-from cell.config import CellConfig
-from cell.devices.described import Described
-from cell.devices.direct import VirtualCell
-from cell.inversion import NominalSurface
-from cell.job import Job
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration import ScanObservation, TargetObservation
+from cell.measure.inversion import NominalSurface
+from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.boards import collect_scan, collect_target
+from cell.procedures.calibrate.edge import with_edge
+from cell.procedures.calibrate.reference_plate import look_at_witness
+from cell.procedures.calibrate.timing import look_at_shutter
+from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.run.calibration import arm_table
 from cell.run.faults import classify
-from cell.run.frames import FrameStore
 from cell.run.job_run import JobRun
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.resumption import mesh_source
 from cell.run.run import Run
-from cell.steps.kinds import PLACE
-from cell.steps.moves import Mover
-from cell.steps.sweep_record import SweepRecord
-from cell.steps.whereabouts import Whereabouts
-from cell.steps.workplace import Workplace
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 from sim_backends.direct.camera import Shot

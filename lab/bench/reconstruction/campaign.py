@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.bench.reconstruction_scenes import KINDS, SURFACES, Mask, Scene, cut_holes, scene, sweep
-from cell.reconstruction import fill_holes
-from cell.reconstruction.outliers import find_outliers
+from cell.measure.reconstruction import fill_holes
+from cell.measure.reconstruction.outliers import find_outliers
+from lab.bench.reconstruction.scenes import KINDS, SURFACES, Mask, Scene, cut_holes, scene, sweep
 
 SHARES = (0.01, 0.03, 0.05)
 HOLES = ((1, 1), (2, 6), (4, 12), (1, 60))

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_parts
-from cell.reconstruction import Cloud, ProfileBuilder, ScanGeometry
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_parts
+from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.vision.stripe.extract import StripeProfile
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

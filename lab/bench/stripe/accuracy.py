@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.bench.stripe_truth import ELECTRONS_PER_DN, READ_NOISE_DN, Cell, bound, draw
-from cell.vision.stripe.extract import extract
+from cell.measure.vision.stripe.extract import extract
+from lab.bench.stripe.truth import ELECTRONS_PER_DN, READ_NOISE_DN, Cell, bound, draw
 
 SHAPE = (1024, 640)
 WIDTHS = (1.2, 1.6, 2.0, 2.5, 3.0)

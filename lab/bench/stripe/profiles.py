@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cell.lab.bench.stripe_workshop import Scene, bound, draw
-from cell.vision.stripe.extract import extract
+from cell.measure.vision.stripe.extract import extract
+from lab.bench.stripe.workshop import Scene, bound, draw
 
 LEAST_EFFICIENCY, STATED, LEAST_FOUND, MOST_FALSE = 0.9, (0.8, 1.2), 0.95, 0.01
 FALSE_PX = 3.0

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.lab.bench.stripe_truth import Cell, draw
-from cell.vision.stripe.extract import StripeSettings, extract
-from cell.vision.stripe.stream import StripeStream
+from cell.measure.vision.stripe.extract import StripeSettings, extract
+from cell.measure.vision.stripe.stream import StripeStream
+from lab.bench.stripe.truth import Cell, draw
 
 SHAPE = (1024, 1280)
 FRAMES = 32

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from cell.lab.bench.stripe_truth import ELECTRONS_PER_DN, READ_NOISE_DN
+from lab.bench.stripe.truth import ELECTRONS_PER_DN, READ_NOISE_DN
 
 Array = NDArray[np.float64]
 

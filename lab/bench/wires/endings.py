@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.devices.truth_link import TIMEOUT_S
-from cell.run.folder import is_going, list_runs
-from cell.steps.kinds import PLACE
+from cell.devices.simulated.truth_link import TIMEOUT_S
+from cell.procedures.steps.kinds import PLACE
+from cell.run.files.folder import is_going, list_runs
 from drivers.clock import Clock
 from drivers.errors import CellError
 from statemachine.journal import JournalError, read, request
@@ -239,4 +239,4 @@ def _moving(truth: dict[str, Any], before: dict[str, Any] | None) -> set[str]:
 
 
 def _command(*words: str) -> list[str]:
-    return [sys.executable, "-c", "from cell.cli import main; main()", *words]
+    return [sys.executable, "-c", "from cell.apps.cli import main; main()", *words]

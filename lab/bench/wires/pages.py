@@ -19,12 +19,12 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from cell.console.console import Console
-from cell.lab.bench.servo import streamed
-from cell.run.frames import FrameStore
+from cell.apps.console.host.console import Console
+from cell.procedures.frame_store import FrameStore
 from cell.run.run import Run
-from cell.supervisor import Cell
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, DeadlineError
+from lab.bench.wires.servo import streamed
 
 PAGES = 5
 FRAME_RATE_HZ, EXPOSURE_S = 50.0, 1e-3

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.lab.bench.stripe_truth import Cell as Stripe
-from cell.lab.bench.stripe_truth import draw
-from cell.supervisor import Cell
-from cell.vision.stripe.stream import StripeStream
+from cell.measure.vision.stripe.stream import StripeStream
+from cell.run.session.supervisor import Cell
+from drivers.arm.child.streaming import pace_of
 from drivers.arm.motion import UrMotion
 from drivers.arm.ur import UrArm
-from drivers.arm.ur_streaming import pace_of
 from drivers.errors import ConfigError
+from lab.bench.stripe.truth import Cell as Stripe
+from lab.bench.stripe.truth import draw
 
 RATE_HZ, RATE_OFF_HZ, LONGEST_P99_S = 500.0, 0.05, 2.5e-3
 """What the stream has to hold: its rate, by how much that may be off, and 99 % of the times between two points."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.supervisor import Cell
+from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, CalibrationStale, CellError, ConfigError
 
 WARM_UP = 2

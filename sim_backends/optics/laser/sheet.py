@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sim_backends.optics.camera import step_on_plane
 from sim_backends.optics.compiled import compiled
-from sim_backends.optics.profile import NARROWEST
+from sim_backends.optics.laser.profile import NARROWEST
+from sim_backends.optics.laser.visibility import laser_frame
 from sim_backends.optics.scene import Grain, LaserOptics
-from sim_backends.optics.visibility import laser_frame
 
 Vector = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sim_backends.models.arm import ArmModel, Power, Safety
-from sim_backends.peers.script import ControlProgram, RuntimeState
+from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
 
 VERSION = (5, 15, 2, 1130077)
 """Controller version: major, minor, bug fix, build."""

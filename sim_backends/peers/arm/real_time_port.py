@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 
 from sim_backends.models.arm import Power
-from sim_backends.peers.rtde_registers import View
+from sim_backends.peers.arm.rtde.registers import View
 
 _PACKET = struct.Struct(">i152d")
 _SIX, _THREE = (0.0,) * 6, (0.0,) * 3

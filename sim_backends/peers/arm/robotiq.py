@@ -10,7 +10,7 @@ import threading
 
 from sim_backends.clock import WorldClock
 from sim_backends.peers.server import TcpServer
-from sim_backends.world.gripper import Gripper
+from sim_backends.world.bodies.gripper import Gripper
 from sim_backends.world.world import World
 
 FAULTS = ("claw.overcurrent", "claw.link_lost")

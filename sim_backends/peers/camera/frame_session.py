@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraModel
-from sim_backends.peers.frame_wire import Rejected
+from sim_backends.peers.camera.frame_wire import Rejected
 
 log = logging.getLogger(__name__)
 

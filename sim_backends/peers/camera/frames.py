@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import FAULTS, CameraModel, CameraSpec
-from sim_backends.peers.frame_session import BACKLOG, Exposure, FrameSession, Render
-from sim_backends.peers.frame_wire import Rejected, message, number, receive
+from sim_backends.peers.camera.frame_session import BACKLOG, Exposure, FrameSession, Render
+from sim_backends.peers.camera.frame_wire import Rejected, message, number, receive
 from sim_backends.peers.server import TcpServer
 
 __all__ = ["BACKLOG", "FAULTS", "CameraSpec", "FramePeer", "Render"]

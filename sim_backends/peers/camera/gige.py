@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraModel, CameraSpec
-from sim_backends.peers import gige_registers as memory
-from sim_backends.peers.frame_session import Exposure, FrameSession, Render
-from sim_backends.peers.frame_wire import Rejected
-from sim_backends.peers.gige_memory import GigeMemory
-from sim_backends.peers.gige_stream import GigeStream
-from sim_backends.peers.gvcp import PORT, Command, Refused, Request, Status
+from sim_backends.peers.camera import gige_registers as memory
+from sim_backends.peers.camera.frame_session import Exposure, FrameSession, Render
+from sim_backends.peers.camera.frame_wire import Rejected
+from sim_backends.peers.camera.gige_memory import GigeMemory
+from sim_backends.peers.camera.gige_stream import GigeStream
+from sim_backends.peers.camera.gvcp import PORT, Command, Refused, Request, Status
 
 __all__ = ["GigePeer"]
 

@@ -6,8 +6,8 @@ Source: GenICam Standard 2.1 (schema 1.1); Standard Features Naming Convention 2
 from __future__ import annotations
 
 from sim_backends.models.camera import CameraSpec
-from sim_backends.peers.gige_pixels import ENCODERS
-from sim_backends.peers.gige_registers import (
+from sim_backends.peers.camera.gige_pixels import ENCODERS
+from sim_backends.peers.camera.gige_registers import (
     ACQUISITION,
     ACQUISITION_MODE,
     EXPOSURE,

@@ -11,9 +11,9 @@ import socket
 import struct
 
 from sim_backends.models.camera import CameraSpec
-from sim_backends.peers.gige_description import describe
-from sim_backends.peers.gige_pixels import ENCODERS
-from sim_backends.peers.gige_registers import (
+from sim_backends.peers.camera.gige_description import describe
+from sim_backends.peers.camera.gige_pixels import ENCODERS
+from sim_backends.peers.camera.gige_registers import (
     ACQUISITION,
     ACQUISITION_MODE,
     CONTROL,
@@ -43,7 +43,7 @@ from sim_backends.peers.gige_registers import (
     TRIGGER_SOURCE,
     WIDTH,
 )
-from sim_backends.peers.gvcp import Refused, Status
+from sim_backends.peers.camera.gvcp import Refused, Status
 
 _DESCRIPTION = 0x20000
 _TICKS_PER_SECOND = 10**9

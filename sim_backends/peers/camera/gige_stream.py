@@ -16,10 +16,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.peers import gige_registers as memory
-from sim_backends.peers.gige_memory import GigeMemory
-from sim_backends.peers.gige_pixels import ENCODERS
-from sim_backends.peers.gvcp import Leader, packets, test_packet
+from sim_backends.peers.camera import gige_registers as memory
+from sim_backends.peers.camera.gige_memory import GigeMemory
+from sim_backends.peers.camera.gige_pixels import ENCODERS
+from sim_backends.peers.camera.gvcp import Leader, packets, test_packet
 
 _KEPT = 8
 """Pictures whose packets can be asked for again."""

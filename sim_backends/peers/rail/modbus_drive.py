@@ -204,7 +204,7 @@ class ModbusPeer(SerialServer):
         super().__init__("modbus", self._hear, pty=pty)
 
     def fault(self, name: str) -> None:
-        """Cause a fault of `FAULTS`, as `sim_backends.peers.tmcl` has them; ValueError for another name."""
+        """Cause a fault of `FAULTS`, as `sim_backends.peers.rail.tmcl` has them; ValueError for another name."""
         match name:
             case "rail.drop_reply":
                 self._drop += 1

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import FAULTS as RAIL_FAULTS
 from sim_backends.models.rail import RailModel
+from sim_backends.peers.rail.tmcl_module import TmclModule
 from sim_backends.peers.serial_port import SerialServer
-from sim_backends.peers.tmcl_module import TmclModule
 
 FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset", *RAIL_FAULTS)
 LATE_S = 0.2

@@ -14,7 +14,7 @@ from typing import Any
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailSettings
-from sim_backends.peers.tmcl_parameters import (
+from sim_backends.peers.rail.tmcl_parameters import (
     EEPROM_LOCK,
     GLOBALS,
     INPUTS,

@@ -17,7 +17,7 @@ from dataclasses import replace
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
 from sim_backends.models.vehicle import Feedback, Mode, VehicleModel, VehicleParams
-from sim_backends.peers.slcan import CanFrame, SlcanBus
+from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
 
 FOREIGN, SECOND = "can.foreign_commands", "can.second_vehicle"
 FAULTS = ("can.bus_off", "can.refused_frames", FOREIGN, SECOND, *VEHICLE_FAULTS)

@@ -16,8 +16,8 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, Mode, VehicleModel
 from sim_backends.models.vehicle import State as VehicleState
 from sim_backends.models.wheel_drive import WheelDrive
-from sim_backends.peers.canopen_node import WRONG_VALUE, Abort, CanopenNode, Value
-from sim_backends.peers.slcan import CanFrame, SlcanBus
+from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort, CanopenNode, Value
+from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
 
 _TICK = 0.005
 _TURNS = {"rpm": 1 / 60, "0.1 rpm": 1 / 600, "0.01 rpm": 1 / 6000, "0.001 rpm": 1 / 60000}

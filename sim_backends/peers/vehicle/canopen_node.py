@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_backends.peers.slcan import CanFrame
+from sim_backends.peers.vehicle.slcan import CanFrame
 
 BOOTED, STOPPED, OPERATIONAL, PREPARING = 0x00, 0x04, 0x05, 0x7F
 ABSENT, ABSENT_SUB, READ_ONLY = 0x06020000, 0x06090011, 0x06010002

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from sim_backends.models.vehicle import VehicleModel
-from sim_backends.peers.agilex import AgilexPeer
-from sim_backends.peers.canopen import CanopenPeer, CanopenSettings
+from sim_backends.peers.vehicle.agilex import AgilexPeer
+from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
 from sim_backends.world.world import World
 
 

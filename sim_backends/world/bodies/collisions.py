@@ -17,8 +17,8 @@ from scipy.spatial import ConvexHull
 
 from sim_backends.optics.scene import Board
 from sim_backends.world import nominal
-from sim_backends.world.arm_points import BODIES, ArmPoints
-from sim_backends.world.contact import PartContact
+from sim_backends.world.bodies.arm_points import BODIES, ArmPoints
+from sim_backends.world.bodies.contact import PartContact
 from sim_backends.world.drawing import Box
 from sim_backends.world.nominal import inverse
 from sim_backends.world.scene import Scene

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.world import nominal
+from sim_backends.world.bodies.surfaces import Surface
 from sim_backends.world.nominal import inverse
-from sim_backends.world.surfaces import Surface
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.compiled import compiled
-from sim_backends.world.surfaces import Mesh, Surface
+from sim_backends.world.bodies.surfaces import Mesh, Surface
 
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int64]

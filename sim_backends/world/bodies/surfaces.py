@@ -3,7 +3,7 @@
 `pot` is a free-form relief without symmetry, `seat` a curved seat with a ledge, a step and a recess whose flanks are
 steep but finite; both cover |x| ≤ 35 mm, |y| ≤ 18 mm. `panel` is a curved sheet with three beads, |y| ≤ 30 mm: wider
 than the scan camera's field. Around them lies the table, z = 0.
-`python -m sim_backends.world.surfaces pot pot.stl` writes the nominal surface as binary STL in metres.
+`python -m sim_backends.world.bodies.surfaces pot pot.stl` writes the nominal surface as binary STL in metres.
 """
 
 from __future__ import annotations

@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.cli import calibrate_solve, calibrate_timing, calibration_list, verify
-from cell.cli.options import (
+from cell.apps.cli.calibration import solve as calibrate_solve
+from cell.apps.cli.calibration import stored as calibration_list
+from cell.apps.cli.calibration import timing as calibrate_timing
+from cell.apps.cli.calibration import verify
+from cell.apps.cli.options import (  # fmt: skip
     ConfigOption,
     JobOption,
     JsonOption,
@@ -17,11 +20,11 @@ from cell.cli.options import (
     SeedOption,
     SimOption,
     print_json,
-)  # fmt: skip
+)
 
 if TYPE_CHECKING:
-    from cell.calibration.recorded.attach import Options
-    from cell.vision import Laser
+    from cell.apps.recordings.attach import Options
+    from cell.measure.vision import Laser
 
 
 def register(app: typer.Typer) -> None:
@@ -99,20 +102,20 @@ def calibrate(
             if value:
                 raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
-        from cell.calibration.recorded.attach import Options
-        from cell.calibration.recorded.known_camera import read_camera
+        from cell.apps.recordings.attach import Options
+        from cell.apps.recordings.known_camera import read_camera
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
         options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures", _laser(laser))
         _from_folder(source, board, options, json, details)
         return
-    from cell.calibration.archive import read_archive
-    from cell.calibration.report import examine
-    from cell.calibration.store import archive_of, solve_observations
-    from cell.cli.calibration_tables import print_examination
-    from cell.cli.display import print_calibration
-    from cell.cli.progress import ProgressDisplay
-    from cell.supervisor import Cell
+    from cell.apps.cli.calibration.tables import print_examination
+    from cell.apps.cli.display import print_calibration
+    from cell.apps.cli.progress import ProgressDisplay
+    from cell.config.calibrations.store import archive_of, solve_observations
+    from cell.measure.calibration.archive import read_archive
+    from cell.procedures.calibrate.report import examine
+    from cell.run.session.supervisor import Cell
 
     with (
         Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell,
@@ -140,7 +143,7 @@ def _setup(text: str | None) -> str | None:
 
 
 def _laser(text: str | None) -> Laser | None:
-    from cell.vision import Laser
+    from cell.measure.vision import Laser
     from drivers.errors import ConfigError
 
     allowed = ("none", "red", "green", "blue", "grey", "auto")
@@ -150,10 +153,10 @@ def _laser(text: str | None) -> Laser | None:
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:
-    from cell.calibration.recorded.command import calibrate_folder
-    from cell.cli.recorded_tables import print_recorded
-    from cell.storage import sealed
-    from cell.vision import parse_board
+    from cell.apps.cli.calibration.recorded_tables import print_recorded
+    from cell.apps.recordings.command import calibrate_folder
+    from cell.base.storage import sealed
+    from cell.measure.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
     result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), options)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption, JobOption, JsonOption, print_json
+from cell.apps.cli.options import ConfigOption, JobOption, JsonOption, print_json
 
 
 def register(group: typer.Typer) -> None:
@@ -28,12 +28,12 @@ def solve(
     """
     from dataclasses import replace
 
-    from cell.calibration.archive import SUFFIX, read_archive
-    from cell.calibration.report import examine
-    from cell.calibration.store import gathered, solve_observations
-    from cell.cli.calibration_tables import print_examination
-    from cell.cli.display import print_calibration
-    from cell.config import find_config, load_config
+    from cell.apps.cli.calibration.tables import print_examination
+    from cell.apps.cli.display import print_calibration
+    from cell.config.calibrations.store import gathered, solve_observations
+    from cell.config.cell_config import find_config, load_config
+    from cell.measure.calibration.archive import SUFFIX, read_archive
+    from cell.procedures.calibrate.report import examine
 
     observations = read_archive(archive)
     loaded = load_config(find_config(config, simulated=True))

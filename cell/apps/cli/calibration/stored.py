@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.cli.options import ConfigOption, JsonOption, new_table, print_json
+from cell.apps.cli.options import ConfigOption, JsonOption, new_table, print_json
 
 
 def register(group: typer.Typer) -> None:
@@ -21,7 +21,7 @@ def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> 
     """List the stored calibrations, newest last: when, of which devices, how well they fit, what was found since."""
     from rich.console import Console
 
-    from cell.calibration.store import read_calibration
+    from cell.config.calibrations.store import read_calibration
     from drivers.errors import CalibrationStale
 
     rows: list[dict[str, Any]] = []
@@ -56,8 +56,8 @@ def show(
     json: JsonOption = False,
 ) -> None:
     """Show a stored calibration: its values with their deviations, and what was found out since."""
-    from cell.calibration.store import read_calibration
-    from cell.cli.display import print_calibration
+    from cell.apps.cli.display import print_calibration
+    from cell.config.calibrations.store import read_calibration
     from drivers.errors import CalibrationStale, ConfigError
 
     folder = _folder(config)
@@ -89,7 +89,7 @@ def accept(
     """
     import getpass
 
-    from cell.calibration.store import accept_calibration
+    from cell.config.calibrations.store import accept_calibration
     from drivers.errors import ConfigError
 
     path = _folder(config) / f"{name}.json"
@@ -116,7 +116,7 @@ def _since(row: dict[str, Any]) -> str:
 
 
 def _folder(config: Path | None) -> Path:
-    from cell.config import beside, find_config, load_config
+    from cell.config.cell_config import beside, find_config, load_config
 
     path = find_config(config, simulated=True)
     return beside(path) / load_config(path).cell.calibrations

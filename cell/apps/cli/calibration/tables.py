@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from cell.cli.options import new_table
+from cell.apps.cli.options import new_table
 
 
 def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> None:

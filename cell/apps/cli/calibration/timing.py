@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from cell.cli.options import (
+from cell.apps.cli.options import (  # fmt: skip
     ConfigOption,
     JobOption,
     JsonOption,
@@ -13,7 +13,7 @@ from cell.cli.options import (
     SeedOption,
     SimOption,
     print_json,
-)  # fmt: skip
+)
 
 
 def register(group: typer.Typer) -> None:
@@ -34,8 +34,8 @@ def timing(
     What is found is kept with the stored calibration and taken out of every sweep by the rail. A rolling shutter, and
     stamps that are not those of an exposure's beginning, are refused by name. Exit code 1 when it is refused.
     """
-    from cell.cli.progress import ProgressDisplay
-    from cell.supervisor import Cell
+    from cell.apps.cli.progress import ProgressDisplay
+    from cell.run.session.supervisor import Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
         found = cell.time_stamps(display, job).scan.timing

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from cell.cli.options import (
+from cell.apps.cli.options import (  # fmt: skip
     ConfigOption,
     JobOption,
     JsonOption,
@@ -17,7 +17,7 @@ from cell.cli.options import (
     SimOption,
     new_table,
     print_json,
-)  # fmt: skip
+)
 
 
 def register(group: typer.Typer) -> None:
@@ -38,8 +38,8 @@ def verify(
     Exit code 0: good, or changed by less than matters at the job's place. 1: the place may be off by a third of its
     tolerance or more, with the suspected part, or the pictures fit worse than they did.
     """
-    from cell.cli.progress import ProgressDisplay
-    from cell.supervisor import Cell
+    from cell.apps.cli.progress import ProgressDisplay
+    from cell.run.session.supervisor import Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
         verification = cell.verify(display, job)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cell.cli.options import (
+from cell.apps.cli.options import (  # fmt: skip
     CellClock,
     ConfigOption,
     Confirm,
@@ -19,13 +19,13 @@ from cell.cli.options import (
     SimOption,
     print_json,
     wide_console,
-)  # fmt: skip
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cell.commission.check import Check, Result
-    from cell.commission.sequence import Commissioning
+    from cell.apps.commission.check import Check, Result
+    from cell.apps.commission.sequence import Commissioning
 
 
 def register(app: typer.Typer) -> None:
@@ -62,10 +62,10 @@ def commission(
     """
     from rich.console import Console
 
-    from cell.cli.progress import tell_question
-    from cell.commission.begin import begin, confirms_itself
-    from cell.commission.protocol import write_protocol
-    from cell.commission.sequence import CHECKS, chosen
+    from cell.apps.cli.progress import tell_question
+    from cell.apps.commission.begin import begin, confirms_itself
+    from cell.apps.commission.protocol import write_protocol
+    from cell.apps.commission.sequence import CHECKS, chosen
     from drivers.errors import ConfigError
 
     if sim != "all" and (truth is not None or confirm is Confirm.simulated):
@@ -119,7 +119,7 @@ def commission(
 
 
 def _person(simulated: bool, console: Console) -> Any:
-    from cell.commission.person import PersonAtTheConsole, SimulatedPerson
+    from cell.apps.commission.person import PersonAtTheConsole, SimulatedPerson
 
     if simulated:
         return SimulatedPerson(lambda text: console.print(text, style="dim", markup=False))
@@ -137,7 +137,7 @@ class _Page:
         from rich.table import Table
         from rich.text import Text
 
-        from cell.commission.check import bounds
+        from cell.apps.commission.check import bounds
 
         style = "green" if verdict.startswith("good") else "yellow" if verdict.startswith("waits") else "red"
         self._console.print(
@@ -161,7 +161,7 @@ class _Page:
 
 
 def _list(made: Commissioning, checks: list[Check], json: bool) -> None:
-    from cell.config import load_config
+    from cell.config.cell_config import load_config
 
     config = load_config(made.path)
     rows = [

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption, JobOption, Level, LevelOption, SeedOption, SimOption
+from cell.apps.cli.options import ConfigOption, JobOption, Level, LevelOption, SeedOption, SimOption
 
 if TYPE_CHECKING:
-    from cell.console.console import Address
+    from cell.apps.console.host.console import Address
     from cell.run.job_run import Observer, RunOutcome
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 NoOpenOption = Annotated[bool, typer.Option("--no-open", help="Do not open the page; its link is printed.")]
 PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Where the page is; 0 is any that is free.")]
@@ -51,10 +51,10 @@ def console(
 
     It is held until Ctrl-C. One page holds it at a time, any page stops it. STOP there is not an emergency stop.
     """
-    from cell.config import DEVICES
-    from cell.console.console import Address
-    from cell.devices.mix import simulated_of
-    from cell.supervisor import Cell
+    from cell.apps.console.host.console import Address
+    from cell.config.cell_config import DEVICES
+    from cell.devices.simulated.mix import simulated_of
+    from cell.run.session.supervisor import Cell
 
     require_installed()
     address = Address(host, port, tuple(name or ()), token_file, certificate, key)
@@ -80,7 +80,7 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     """Show a cell until Ctrl-C: 0, or 130 where that cuts short what goes on. Until the server ends: stopped, and 1."""
     import threading
 
-    from cell.console.console import Console
+    from cell.apps.console.host.console import Console
     from drivers.errors import CellError
     from statemachine.watch import SignalWatch
 
@@ -104,7 +104,7 @@ def run_shown(
     """Run a job and show it, and until its pages are closed what it was; on the virtual clock computed first."""
     import time
 
-    from cell.console.console import Address, Console
+    from cell.apps.console.host.console import Address, Console
     from statemachine.watch import SignalWatch
 
     virtual = cell.simulated is not None and cell.simulated.facts["clock"] == "virtual"

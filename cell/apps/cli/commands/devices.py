@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.cli import completing
-from cell.cli.options import (
+from cell.apps.cli import completion as completing
+from cell.apps.cli.options import (
     ConfigOption,
     JobOption,
     JsonOption,
@@ -23,8 +23,8 @@ from cell.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from cell.devices.diagnosis import Diagnosis
-    from cell.devices.local_devices import Found
+    from cell.devices.diagnosis.diagnosis import Diagnosis
+    from cell.devices.diagnosis.local_devices import Found
     from drivers.interfaces import Reading
 
 
@@ -62,10 +62,10 @@ def jog(
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
-    from cell.cli.progress import tell_question
-    from cell.devices.jogging import jog as perform
-    from cell.devices.jogging import needed_for, parse_jog
-    from cell.supervisor import Cell
+    from cell.apps.cli.progress import tell_question
+    from cell.run.jogging import jog as perform
+    from cell.run.jogging import needed_for, parse_jog
+    from cell.run.session.supervisor import Cell
     from drivers.errors import ConfigError
 
     if device is None:
@@ -96,9 +96,9 @@ def home(
     level: LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
-    from cell.cli.progress import tell_question
-    from cell.config import DEVICES
-    from cell.supervisor import HOMED, Cell
+    from cell.apps.cli.progress import tell_question
+    from cell.config.cell_config import DEVICES
+    from cell.run.session.supervisor import HOMED, Cell
     from drivers.errors import ConfigError
 
     if device not in (None, *HOMED):
@@ -123,7 +123,7 @@ def recover(
     import getpass
     import sys
 
-    from cell.cli import EXIT_FAILED
+    from cell.apps.cli import EXIT_FAILED
     from drivers.errors import ConfigError
 
     if by is None:
@@ -131,8 +131,8 @@ def recover(
             raise ConfigError("a person has to look at the cell first: say who has, with --by NAME")
         if not typer.confirm("Have you looked at the cell, and is the way of the arm clear?"):
             raise typer.Exit(EXIT_FAILED)
-    from cell.cli.progress import tell_question
-    from cell.supervisor import HOMED, Cell
+    from cell.apps.cli.progress import tell_question
+    from cell.run.session.supervisor import HOMED, Cell
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, only=HOMED["arm"]) as cell:
         cell.recover(by or getpass.getuser(), tell_question)
@@ -157,7 +157,7 @@ def diag(
 
     Looks only: nothing on a device is set, started or ended.
     """
-    from cell.devices.diagnosis import diagnose
+    from cell.devices.diagnosis.diagnosis import diagnose
 
     rows = diagnose(config, device or (), sim=sim, seed=seed, level=level.value, speed=speed)
     if json:
@@ -181,8 +181,8 @@ def find(
     Serial ports, CAN interfaces and cameras of this computer, and the addresses that are configured. No broadcast is
     sent, nothing moves, and no port is opened that is not asked.
     """
-    from cell.devices.finding import NEXT
-    from cell.devices.finding import find as look
+    from cell.devices.diagnosis.finding import NEXT
+    from cell.devices.diagnosis.finding import find as look
 
     found = look(config, ports or (), ask=ask)
     if json:
@@ -209,7 +209,7 @@ def _print_found(found: list[Found]) -> None:
 
 def devices(json: JsonOption = False) -> None:
     """List the makes of devices that `driver = "…"` can name, where each comes from, and what is wrong with it."""
-    from cell.devices.makes import installed
+    from cell.makes.table import installed
 
     rows = installed()
     if json:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from cell.cli.options import ConfigOption, JsonOption, print_json, wide_console
+from cell.apps.cli.options import ConfigOption, JsonOption, print_json, wide_console
 
 
 def register(app: typer.Typer) -> None:
@@ -17,7 +17,7 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     Touches no device. Exit code 1 when something is wrong that the configured cell needs; what mends it is beside it.
     """
-    from cell.doctor.examine import examine_computer
+    from cell.apps.doctor.examine import examine_computer
 
     rows = examine_computer(config)
     if json:

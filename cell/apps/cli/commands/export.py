@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption, JsonOption, print_json
-from cell.cli.runs import RunArgument
+from cell.apps.cli.commands.runs import RunArgument
+from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
 
 class Format(StrEnum):
@@ -40,10 +40,10 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
-    from cell.config import beside, find_config, load_config
-    from cell.report.export import SUFFIXES, export_run
-    from cell.run.folder import find_run
-    from cell.units import parse_quantity
+    from cell.base.units import parse_quantity
+    from cell.config.cell_config import beside, find_config, load_config
+    from cell.run.files.folder import find_run
+    from cell.run.report.export import SUFFIXES, export_run
     from drivers.errors import ConfigError
 
     try:

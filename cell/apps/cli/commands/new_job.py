@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption, JsonOption, print_json
+from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
 Answer = Annotated[str | None, typer.Option()]
 
@@ -55,9 +55,9 @@ def new_job(
 
     Every question is an option, too. Writes NAME.toml, NAME.stl (what the sweeps see) and NAME.png.
     """
-    from cell.config import find_config, load_config
-    from cell.new_job.make import make_job
-    from cell.new_job.questions import Asker
+    from cell.apps.new_job.make import make_job
+    from cell.apps.new_job.questions import Asker
+    from cell.config.cell_config import find_config, load_config
 
     given = {
         "mesh": mesh, "unit": unit, "bodies": bodies, "up": up, "turn": turn, "flip": flip, "name": name, "like": like,

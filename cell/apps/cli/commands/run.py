@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from cell.cli import completing
-from cell.cli.options import (
+from cell.apps.cli import completion as completing
+from cell.apps.cli.commands.runs import NoiseOption, RunArgument, folder_of_runs
+from cell.apps.cli.options import (  # fmt: skip
     CellClock,
     ConfigOption,
     Confirm,
@@ -22,13 +23,12 @@ from cell.cli.options import (
     SeedOption,
     SimOption,
     print_json,
-)  # fmt: skip
-from cell.cli.runs import NoiseOption, RunArgument, folder_of_runs
+)
 
 if TYPE_CHECKING:
-    from cell.config import CellConfig
+    from cell.config.cell_config import CellConfig
     from cell.run.job_run import Observer, RunOutcome
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 UntilOption = Annotated[
     str | None,
@@ -64,8 +64,8 @@ def run(
 
     The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
     """
-    from cell.run.pace import require_share
-    from cell.supervisor import Cell
+    from cell.procedures.pace import require_share
+    from cell.run.session.supervisor import Cell
 
     def perform(cell: Cell, display: Observer) -> RunOutcome:
         cell.pace = pace
@@ -116,11 +116,11 @@ def dry_run(
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
     from cell.check.fit import require_fit
-    from cell.config import find_config, load_config
-    from cell.devices.injection import Injection
-    from cell.job import load_job
-    from cell.steps.kinds import find_kind
-    from cell.supervisor import Cell
+    from cell.config.cell_config import find_config, load_config
+    from cell.config.job import load_job
+    from cell.devices.simulated.injection import Injection
+    from cell.procedures.steps.kinds import find_kind
+    from cell.run.session.supervisor import Cell
 
     loaded, mesh = load_job(job)
     described = load_config(find_config(config, simulated=True))
@@ -142,7 +142,7 @@ def dry_run(
         clock=(clock or CellClock.wall).value,
     )
     if console:
-        from cell.cli.console import require_installed, run_shown
+        from cell.apps.cli.commands.console import require_installed, run_shown
 
         require_installed()
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
@@ -152,7 +152,7 @@ def dry_run(
 
 def _clock(config: CellConfig) -> CellClock:
     """The wall's time, or the virtual one, said so, where something is missing to speak with the devices."""
-    from cell.config import DEVICES
+    from cell.config.cell_config import DEVICES
 
     missing = (f"{name}: {why}" for name in DEVICES if (why := config.make(name).missing()))
     if why := next(missing, ""):
@@ -171,9 +171,9 @@ def resume(
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
-    from cell.run.folder import find_run
+    from cell.run.files.folder import find_run
     from cell.run.resumption import UnfinishedRun
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
     before = UnfinishedRun.find(find_run(folder_of_runs(config), name, "job"))
     simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
@@ -195,9 +195,9 @@ def _perform(
     opened: Callable[[], Cell], work: Callable[[Cell, Observer], RunOutcome], json: bool, noise: bool
 ) -> NoReturn:
     """Do a job on a cell, show how it ended, and exit with its code: 130 also for a signal after its end."""
-    from cell.cli import EXIT_INTERRUPTED, say_unshown
-    from cell.cli.display import print_late, print_report
-    from cell.cli.progress import ProgressDisplay
+    from cell.apps.cli import EXIT_INTERRUPTED, say_unshown
+    from cell.apps.cli.display import print_late, print_report
+    from cell.apps.cli.progress import ProgressDisplay
     from statemachine.watch import SignalInterrupt
 
     outcome = None

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import completing
-from cell.cli.options import ConfigOption, JsonOption, print_json
+from cell.apps.cli import completion as completing
+from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
 RunArgument = Annotated[
     str | None,
@@ -36,7 +36,7 @@ def abort(
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
-    from cell.run.folder import list_runs, listens
+    from cell.run.files.folder import list_runs, listens
     from drivers.errors import ConfigError
 
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
@@ -82,8 +82,8 @@ def confirm(
     import getpass
     import sys
 
-    from cell.cli import EXIT_FAILED
-    from cell.run.reading import awaited_word
+    from cell.apps.cli import EXIT_FAILED
+    from cell.run.files.reading import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
@@ -111,16 +111,16 @@ def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: 
 
 
 def _going(name: str | None, config: Path | None) -> Path:
-    from cell.run.folder import find_going
+    from cell.run.files.folder import find_going
 
     return find_going(_going_folder(config), name)
 
 
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
     """List what was run, newest last, a line each: when, what, how it ended, how long it took, and why."""
-    from cell.cli.display import print_runs
-    from cell.run.folder import list_runs
-    from cell.run.reading import run_row
+    from cell.apps.cli.display import print_runs
+    from cell.run.files.folder import list_runs
+    from cell.run.files.reading import run_row
 
     rows = [run_row(folder) for folder in list_runs(folder_of_runs(config))]
     if json:
@@ -142,9 +142,9 @@ def report(
     ] = None,
 ) -> None:
     """Show the report of a run."""
-    from cell.cli.display import print_report
-    from cell.run.folder import find_run
-    from cell.run.reading import read_report
+    from cell.apps.cli.display import print_report
+    from cell.run.files.folder import find_run
+    from cell.run.files.reading import read_report
     from drivers.errors import ConfigError
 
     if out is not None and not html:
@@ -152,7 +152,7 @@ def report(
     folder = find_run(folder_of_runs(config), name)
     if html:
         # Drawing is slow to load; whoever reads a report on the screen does not wait for it.
-        from cell.report.page.make import write_page
+        from cell.run.report.page.make import write_page
 
         path = out or folder / "report.html"
         size = write_page(folder, path)
@@ -170,13 +170,13 @@ def report(
 
 def folder_of_runs(config: Path | None) -> Path:
     """Where the runs are of the cell that is configured; raises `ConfigError` where its file cannot be read."""
-    from cell.which_config import find_config, runs_folder
+    from cell.config.files import find_config, runs_folder
 
     path = find_config(config, simulated=True)
     try:
         tomllib.loads("" if path is None else path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        from cell.config import tables_of
+        from cell.config.cell_config import tables_of
 
         # Raises what is wrong, in words; it is slow to load.
         tables_of(path)
@@ -185,6 +185,6 @@ def folder_of_runs(config: Path | None) -> Path:
 
 def _going_folder(config: Path | None) -> Path:
     """As `folder_of_runs`, for who ends or holds what goes on: the configuration may have become wrong meanwhile."""
-    from cell.which_config import find_config, runs_folder
+    from cell.config.files import find_config, runs_folder
 
     return runs_folder(find_config(config, simulated=True))

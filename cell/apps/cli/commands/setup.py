@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cell.cli import EXIT_USAGE
-from cell.cli.options import ConfigOption, JobOption, JsonOption, print_json
+from cell.apps.cli import EXIT_USAGE
+from cell.apps.cli.options import ConfigOption, JobOption, JsonOption, print_json
 
 
 def register(app: typer.Typer) -> None:
@@ -24,8 +24,8 @@ def init(
     """Write a complete configuration and a job to start from. Never overwrites a file."""
     import shutil
 
-    from cell.config import default_toml
-    from cell.job import job_path, load_job
+    from cell.config.cell_config import default_toml
+    from cell.config.job import job_path, load_job
     from drivers.errors import ConfigError
 
     _, mesh = load_job(job)
@@ -50,13 +50,13 @@ def init(
 
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
+    from cell.apps.console.view.meshes import link_meshes
     from cell.check.contact import contact_notes
     from cell.check.fit import require_fit
-    from cell.config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
-    from cell.console.meshes import link_meshes
-    from cell.devices.mix import require_possible
-    from cell.job import job_path, load_job
-    from cell.report.figures import simulated_words
+    from cell.config.cell_config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
+    from cell.config.job import job_path, load_job
+    from cell.devices.simulated.mix import require_possible
+    from cell.run.report.figures import simulated_words
     from drivers.errors import ConfigError
 
     source = find_config(config, simulated=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption, JobOption, JsonOption, Level, LevelOption, SeedOption, SpeedOption
+from cell.apps.cli.options import ConfigOption, JobOption, JsonOption, Level, LevelOption, SeedOption, SpeedOption
 
 app = typer.Typer(help="The simulated cell.", no_args_is_help=True)
 
@@ -38,8 +38,8 @@ def serve(
     """
     import sys
 
-    from cell.config import config_to_open, tables_of
-    from cell.devices.described import Described
+    from cell.config.cell_config import config_to_open, tables_of
+    from cell.devices.simulated.described import Described
     from drivers.errors import ConfigError
     from sim_backends import serve as server
 
@@ -52,7 +52,7 @@ def serve(
 
     def ready(endpoints: dict[str, object]) -> None:
         if config_out is not None:
-            from cell.devices.simulated import endpoint_toml
+            from cell.devices.simulated.process import endpoint_toml
 
             config_out.write_text(endpoint_toml(tables_of(path), endpoints), encoding="utf-8")
 
@@ -67,9 +67,9 @@ def fill(config: ConfigOption = None, job: JobOption = "pot") -> None:
 
     What lay there is taken away. Nothing changes where the station stands already, with its part in the claw.
     """
-    from cell.config import find_config, load_config
-    from cell.devices.described import Described
-    from cell.devices.truth_link import make_ready
+    from cell.config.cell_config import find_config, load_config
+    from cell.devices.simulated.described import Described
+    from cell.devices.simulated.truth_link import make_ready
     from drivers.errors import ConfigError
 
     loaded, described = load_config(find_config(config)), Described.of(job)

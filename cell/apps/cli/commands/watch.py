@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cell.cli.options import ConfigOption
+from cell.apps.cli.options import ConfigOption
 
 EVERY_S = 0.2
 SETTLE_S = 1.0
@@ -39,8 +39,8 @@ def watch(
     from rich.live import Live
     from rich.text import Text
 
-    from cell.config import beside, find_config, load_config
-    from cell.terminal.watch import watching
+    from cell.apps.watch.watch import watching
+    from cell.config.cell_config import beside, find_config, load_config
 
     source = find_config(config, simulated=True)
     loaded = load_config(source)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from cell.commission.check import Check, Finding, Result
-from cell.commission.desk import Desk
-from cell.geometry.poses import from_ur
+from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.workplace import Desk
+from cell.measure.geometry.poses import from_ur
 from cell.motion.arm_models import HOME
 from drivers.errors import LimitError
 from drivers.interfaces import Vector

@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.commission.check import Check, Finding, Result
-from cell.commission.desk import Desk
-from cell.commission.measuring import measure
-from cell.commission.mounting import RoughMounting, against_drawing
-from cell.commission.seeing import Eye, eye_of, find_view
-from cell.vision import BoardSpec
+from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.measuring import measure
+from cell.apps.commission.mounting import RoughMounting, against_drawing
+from cell.apps.commission.seeing import Eye, eye_of, find_view
+from cell.apps.commission.workplace import Desk
+from cell.measure.vision import BoardSpec
 from drivers.interfaces import Image
 
 PITCH_OFF = 0.025

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from cell.commission.check import Check, Result
-from cell.commission.desk import Desk
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.workplace import Desk
 from drivers.errors import CalibrationStale, RefusedError
 
 BEFORE_PLACING = "invert_pose"

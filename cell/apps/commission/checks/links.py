@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from cell.commission.check import Check, Result
-from cell.commission.desk import Desk
-from cell.config import DEVICES
-from cell.devices.diagnosis import STATES, ask
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.workplace import Desk
+from cell.config.cell_config import DEVICES
+from cell.devices.diagnosis.diagnosis import STATES, ask
 
 WHERE = tuple(
     f"{name}.{key}" for name in DEVICES for key in ("driver", "address", "url", "channel", "interface", "model", "baud")

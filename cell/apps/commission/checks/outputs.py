@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.commission.check import Check, Finding, Result
-from cell.commission.desk import Desk
-from cell.commission.seeing import camera_of, centred_view, eye_of
-from cell.devices.built_in import OnArm
-from cell.vision import extract
+from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.seeing import camera_of, centred_view, eye_of
+from cell.apps.commission.workplace import Desk
+from cell.makes.built_in import OnArm
+from cell.measure.vision import extract
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame, Image
 

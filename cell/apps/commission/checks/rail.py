@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from cell.commission.check import Check, Finding, Result
-from cell.commission.desk import Desk
-from cell.commission.seeing import centred_view, eye_of, see
-from cell.device_config import RailConfig
+from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.seeing import centred_view, eye_of, see
+from cell.apps.commission.workplace import Desk
+from cell.makes.records import RailConfig
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
 

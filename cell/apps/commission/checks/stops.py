@@ -9,10 +9,10 @@ from functools import partial
 
 import numpy as np
 
-from cell.commission.check import Check, Result
-from cell.commission.desk import Desk
+from cell.apps.commission.check import Check, Result
+from cell.apps.commission.workplace import Desk
+from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line
 from cell.run.recorded_work import Hands
-from cell.steps.approach import Planar, RelativeOdometry, drive_line
 from drivers.errors import Aborted, CellError, InterlockError
 from drivers.interfaces import ArmSafety, Motion
 

@@ -8,16 +8,16 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.store import nominal_camera
-from cell.commission.camera_checks import PITCH_OFF, renamed
-from cell.commission.check import Check, Finding, Result
-from cell.commission.desk import Desk
-from cell.commission.mounting import axes_from_shifts
-from cell.geometry.poses import from_parts, from_ur
-from cell.job import job_path, ships
-from cell.steps.approach import Planar, RelativeOdometry, drive_line
-from cell.steps.camera_poses import look_pose
-from cell.vision import BoardSpec, board_pose, find_board, parse_board
+from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
+from cell.apps.commission.mounting import axes_from_shifts
+from cell.apps.commission.workplace import Desk
+from cell.config.calibrations.store import nominal_camera
+from cell.config.job import job_path, ships
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.vision import BoardSpec, board_pose, find_board, parse_board
+from cell.procedures.arm.camera_poses import look_pose
+from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line
 from drivers.errors import CellError, DeviceFault, RefusedError
 
 WAY, SPEED = 0.050, 0.050

@@ -17,20 +17,20 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from cell.console.desk import Desk
-from cell.console.facts import cell_facts
-from cell.console.link import ServerProcess
-from cell.console.look import Look
-from cell.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
-from cell.job import load_job
+from cell.apps.console.host.controller import Desk
+from cell.apps.console.host.link import ServerProcess
+from cell.apps.console.host.observer import Look
+from cell.apps.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
+from cell.apps.console.view.facts import cell_facts
+from cell.config.job import load_job
+from cell.procedures.steps.kinds import find_kind
 from cell.run.job_run import RunOutcome
 from cell.run.run import Run
-from cell.steps.kinds import find_kind
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.script import Script
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 LEAST_TOKEN = 32
 _LOOPBACK = "127.0.0.1"

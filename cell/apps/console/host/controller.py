@@ -1,7 +1,7 @@
 """The operator's desk: what a page may ask of the cell, by the words of the command line, and who may ask it.
 
 Whoever asks is answered by a thread of its own, so that nothing waits behind something long. The stop is not here: it
-has a way of its own (`cell.console.link`), and asks nobody.
+has a way of its own (`cell.apps.console.host.link`), and asks nobody.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from cell.calibration.verify.verdict import Verification
-from cell.console.commands import checked_command, checked_message
-from cell.console.holders import Holders
-from cell.console.holding import Press, Presses
-from cell.console.manual import Manual
-from cell.console.questions import Questions
-from cell.console.rehearsal import Rehearsals
-from cell.devices.diagnosis import ask
-from cell.devices.gate import Gated
-from cell.devices.jogging import Jog
-from cell.job import load_job, require_job_name
+from cell.apps.console.host.holding import Press, Presses
+from cell.apps.console.host.manual import Manual
+from cell.apps.console.host.questions import Questions
+from cell.apps.console.host.rehearsal import Rehearsals
+from cell.apps.console.server.commands import checked_command, checked_message
+from cell.apps.console.server.holders import Holders
+from cell.config.job import load_job, require_job_name
+from cell.devices.diagnosis.diagnosis import ask
+from cell.devices.gate.gate import Gated
+from cell.procedures.steps.kinds import find_kind
+from cell.procedures.verify.verdict import Verification
+from cell.run.jogging import Jog
 from cell.run.run import Run
-from cell.steps.kinds import find_kind
 from drivers.errors import CellError, InterlockError
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 FREE = ("hold",)
 """What a page may do that does not hold the cell."""

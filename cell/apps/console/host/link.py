@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from cell.console.messages import MOST_STOPS, CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
+from cell.apps.console.messages import MOST_STOPS, CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
 from drivers.errors import CellError
 
 START_S = 30.0
@@ -97,7 +97,7 @@ class ServerProcess:
         fds = [bound.fileno(), *(end.fileno() for end in theirs)]
         environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path or "." for path in sys.path))
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "cell.console.serve", str(fds[1]), str(fds[2])],
+            [sys.executable, "-m", "cell.apps.console.server.serve", str(fds[1]), str(fds[2])],
             pass_fds=fds,
             stdin=subprocess.DEVNULL,
             env=environment,

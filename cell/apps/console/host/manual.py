@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from cell.config import RailConfig
-from cell.console.holding import Press
-from cell.devices.gate import Gated
-from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
-from cell.job import Job
+from cell.apps.console.host.holding import Press
+from cell.config.cell_config import RailConfig
+from cell.config.job import Job
+from cell.devices.gate.gate import Gated
 from cell.run.faults import CONFIRMED_BY_A_PERSON
+from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import Attended, Motion
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 LOOK_S = 0.005
 HOLD_SPEED = 0.05

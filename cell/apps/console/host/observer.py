@@ -10,24 +10,24 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from cell.console.archive import true_error_mm
-from cell.console.desk import Desk
-from cell.console.messages import CloudPart, Happened, Picture, Show
-from cell.console.pictures import GrowingCloud, Pictures
-from cell.console.readings import Readings
-from cell.console.run_view import RunView
-from cell.console.scene_now import SceneNow
-from cell.geometry.poses import from_ur
-from cell.job import load_job
-from cell.run.folder import list_runs
-from cell.run.lateness import busy_words
-from cell.run.reading import read_report
+from cell.apps.console.host.controller import Desk
+from cell.apps.console.messages import CloudPart, Happened, Picture, Show
+from cell.apps.console.view.archive import true_error_mm
+from cell.apps.console.view.pictures import GrowingCloud, Pictures
+from cell.apps.console.view.readings import Readings
+from cell.apps.console.view.run_view import RunView
+from cell.apps.console.view.scene_now import SceneNow
+from cell.base.lateness import busy_words
+from cell.config.job import load_job
+from cell.measure.geometry.poses import from_ur
+from cell.procedures.steps.kinds import find_kind
+from cell.run.files.folder import list_runs
+from cell.run.files.reading import read_report
 from cell.run.run import Run
-from cell.steps.kinds import find_kind
 from drivers.errors import CellError
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 PERIOD_S = 0.05
 EVERY = 2

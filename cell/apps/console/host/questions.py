@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from cell.console.run_view import RunView
+from cell.apps.console.view.run_view import RunView
 from cell.run.run import Run
 from drivers.errors import ConfigError, Measured, RefusedError
 from statemachine.policy import Failure

@@ -1,7 +1,8 @@
 """A job's dry run on the virtual clock, in a process of its own, so that a person sees what it would do.
 
 Computed first, then shown: the virtual clock has no time of the wall. The run lies among the others, with its record.
-Run as a module by the console: `python -m cell.console.rehearsal JOB SEED LEVEL CONFIG`, in the cell's folder.
+Run as a module by the console: `python -m cell.apps.console.host.rehearsal JOB SEED LEVEL CONFIG`, in the cell's
+folder.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cell.config import CONFIGURATION
+from cell.config.cell_config import CONFIGURATION
 from drivers.errors import CellError, InterlockError
 from statemachine.step import Event
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 LONGEST_S = 600.0
 
@@ -130,9 +131,9 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
         print(json.dumps({"fraction": round(fraction, 3), "text": text}), flush=True)
 
     tell(0.0, "loading the program")
-    from cell.job import load_job
-    from cell.steps.kinds import find_kind
-    from cell.supervisor import Cell
+    from cell.config.job import load_job
+    from cell.procedures.steps.kinds import find_kind
+    from cell.run.session.supervisor import Cell
 
     tell(0.0, "simulating the cell")
     with Cell.open(

@@ -22,10 +22,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from cell.console.access import HEADERS, Access, Bucket
-from cell.console.archive import Archive
-from cell.console.commands import checked_command
-from cell.console.pages import PROTOCOL, Pages
+from cell.apps.console.server.access import HEADERS, Access, Bucket
+from cell.apps.console.server.commands import checked_command
+from cell.apps.console.server.pages import PROTOCOL, Pages
+from cell.apps.console.view.archive import Archive
 from drivers.errors import ConfigError
 
 MOST_BODY, MOST_PATH = 4096, 300
@@ -40,7 +40,7 @@ ENTERED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Assembl
 <meta http-equiv="refresh" content="0;url=/#key={key}"><a href="/#key={key}">To the cell</a></html>
 """
 LOST = "open the link that `cell console` printed in its terminal; it works once, for one tab of the browser"
-PAGE = Path(__file__).with_name("page")
+PAGE = Path(__file__).parents[1] / "page"
 ENTER = "/enter"
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"

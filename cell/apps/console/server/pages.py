@@ -12,10 +12,10 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from cell.console.access import Bucket
-from cell.console.commands import checked_message
-from cell.console.mailbox import Mailbox
-from cell.console.messages import Beat, Joined, Left
+from cell.apps.console.messages import Beat, Joined, Left
+from cell.apps.console.server.access import Bucket
+from cell.apps.console.server.commands import checked_message
+from cell.apps.console.server.mailbox import Mailbox
 from drivers.errors import ConfigError
 
 VERSION = 1

@@ -28,10 +28,7 @@ import numpy as np
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from cell.console.access import Access
-from cell.console.application import Application
-from cell.console.archive import Archive
-from cell.console.messages import (
+from cell.apps.console.messages import (
     MOST_STOPS,
     Answer,
     AskCell,
@@ -47,7 +44,10 @@ from cell.console.messages import (
     Stop,
     Stopped,
 )
-from cell.console.pages import MOST_BYTES, Pages
+from cell.apps.console.server.access import Access
+from cell.apps.console.server.application import Application
+from cell.apps.console.server.pages import MOST_BYTES, Pages
+from cell.apps.console.view.archive import Archive
 
 JPEG = (cv2.IMWRITE_JPEG_QUALITY, 75)
 ANSWER_S, STOP_S = 60.0, 15.0

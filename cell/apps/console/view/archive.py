@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cell.console.recorded import moves
-from cell.record.file import FILE
-from cell.run.folder import list_runs
-from cell.run.reading import read_report, run_row
-from cell.toml_file import below
+from cell.apps.console.view.recorded import moves
+from cell.base.toml_file import below
+from cell.run.files.folder import list_runs
+from cell.run.files.reading import read_report, run_row
+from cell.run.record.file import FILE
 from drivers.errors import CellError
 
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
@@ -25,8 +25,8 @@ PICTURE = re.compile(r"[\w][\w.+-]*\.png")
 READ = ("report.json", "journal.sqlite")
 MOST_RUNS, MOST_PICTURES = 200, 60
 DRAW_S = 60.0
-_DRAW = "import sys; from pathlib import Path; from cell.report.page.make import write_page; "
-_DRAW += "from cell.console.rehearsal import end_with_parent; end_with_parent(); "
+_DRAW = "import sys; from pathlib import Path; from cell.run.report.page.make import write_page; "
+_DRAW += "from cell.apps.console.host.rehearsal import end_with_parent; end_with_parent(); "
 _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
@@ -117,7 +117,7 @@ class Archive:
         kept = Path(self._pages.name) / f"{name}.json"
         with self._drawing:
             if not kept.exists():
-                read = self._printed("-m", "cell.console.recorded", str(folder / FILE))
+                read = self._printed("-m", "cell.apps.console.view.recorded", str(folder / FILE))
                 if read is None:
                     return None
                 # A run that goes on is read anew each time.

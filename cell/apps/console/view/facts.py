@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cell.config import DEVICES
-from cell.console.manual import HOLD_SPEED, HOLD_TURN, rail_hold_speed
-from cell.console.scene import scene
-from cell.devices.gate import Gated
-from cell.devices.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
-from cell.devices.rules import RULES
-from cell.devices.simulated import is_whole
-from cell.job import load_job, require_job_name, shipped_jobs
+from cell.apps.console.host.manual import HOLD_SPEED, HOLD_TURN, rail_hold_speed
+from cell.apps.console.view.scene import scene
+from cell.config.cell_config import DEVICES
+from cell.config.job import load_job, require_job_name, shipped_jobs
+from cell.devices.gate.gate import Gated
+from cell.devices.gate.rules import RULES
+from cell.devices.simulated.process import is_whole
 from cell.motion.arm_models import arm_kinematics
-from cell.steps.kinds import find_kind
+from cell.procedures.steps.kinds import find_kind
+from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
 from drivers.errors import CellError
 from drivers.interfaces import Attended
 
 if TYPE_CHECKING:
-    from cell.supervisor import Cell
+    from cell.run.session.supervisor import Cell
 
 MM, DEG = 1e-3, 3.141592653589793 / 180
 LENGTHS = [0.1 * MM, 1 * MM, 10 * MM, 50 * MM]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.procedures.sweep.swath import Collector, Sweeping
 from cell.run.run import Run
-from cell.steps.swath import Collector, Sweeping
 from drivers.interfaces import Frame
 
 WIDTH = 640

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cell.config import DEVICES, CellConfig
+from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmSafety, ArmState, RailState, VehicleState

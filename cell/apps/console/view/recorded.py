@@ -1,6 +1,6 @@
 """How the cell moved in a run, by its `record.mcap`: for the replay with a slider.
 
-Run as a module by the server, in a process of its own: `python -m cell.console.recorded FILE`.
+Run as a module by the server, in a process of its own: `python -m cell.apps.console.view.recorded FILE`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cell.console.rehearsal import end_with_parent
-from cell.record.reading import Parts, messages, said
+from cell.apps.console.host.rehearsal import end_with_parent
+from cell.run.record.reading import Parts, messages, said
 from drivers.errors import CellError
 
 JOINTS, VEHICLE, EVENT = "/joints", "/vehicle/state", "/sequence/event"

@@ -15,18 +15,18 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.config import CellConfig
-from cell.console.meshes import LINKS, coarser, link_meshes
-from cell.device_config import CameraConfig
-from cell.inversion.nominal import read_mesh
-from cell.job import Job, load_job
+from cell.apps.console.view.meshes import LINKS, coarser, link_meshes
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, load_job
+from cell.config.mounting import deck_plates, mounted
+from cell.config.obstacles import station_obstacles, vehicle_obstacles
+from cell.makes.records import CameraConfig
+from cell.measure.inversion.nominal import read_mesh
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.spec import centre_of
 from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
-from cell.mounting import deck_plates, mounted
-from cell.obstacles import station_obstacles, vehicle_obstacles
-from cell.steps.camera_poses import base_from_place_at_target
-from cell.vision import parse_board
-from cell.vision.board.spec import centre_of
+from cell.procedures.arm.camera_poses import base_from_place_at_target
 from drivers.link_table import LinkTable
 
 ON_RAIL = "scan head"

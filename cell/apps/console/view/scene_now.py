@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.console.scene import numbers
-from cell.devices.interlocks import Situation
+from cell.apps.console.view.scene import numbers
+from cell.devices.gate.interlocks import Situation
 from cell.motion.bodies import PLACED, Body, station_bodies
 from drivers.interfaces import Vector
 

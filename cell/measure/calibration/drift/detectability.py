@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, State, tangents
-from cell.calibration.verify.evidence import Evidence
-from cell.calibration.verify.hypotheses import (
+from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.hypotheses import (
     SCAN_DEPTH,
     SHIFT,
     TARGET_DEPTH,
@@ -25,7 +24,8 @@ from cell.calibration.verify.hypotheses import (
     log_mean,
     quadratic,
 )
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, State, tangents
+from cell.measure.geometry.camera import Array
 
 DETECTED = 0.95
 DRAWS = 2_000

@@ -13,8 +13,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.blocks import (
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.blocks import (
     BOARD,
     CAMERA,
     COLUMNS,
@@ -26,8 +27,7 @@ from cell.calibration.solve.blocks import (
     dots_block,
     stripe_block,
 )
-from cell.calibration.solve.reference import Reference
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 # The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.
 LEAST_DOTS_PX = 0.02

@@ -1,7 +1,7 @@
 """What may have changed in a calibrated chain, and how strongly a score speaks for each of these changes.
 
 A hypothesis is a Gaussian change of about `SHIFT` or `TURN` of some parameters of one camera's chain; against it stands
-that nothing changed. Scores and information are those of `cell.calibration.verify.evidence`.
+that nothing changed. Scores and information are those of `cell.measure.calibration.drift.evidence`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.calibration.solve.blocks import HAND, PLANE, RAIL
-from cell.calibration.verify.evidence import Evidence
-from cell.geometry.camera import Array
+from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.solve.blocks import HAND, PLANE, RAIL
+from cell.measure.geometry.camera import Array
 
 SHIFT, TURN = 0.2e-3, float(np.deg2rad(0.05))
 """The disturbance that has to be found, m and rad."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.calibration.solve.blocks import SHARED, State
-from cell.calibration.solve.results import ScanCalibration, TargetCalibration
-from cell.geometry.camera import Array
-from cell.reconstruction.build import ScanGeometry
+from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.geometry.camera import Array
+from cell.measure.reconstruction.build import ScanGeometry
 
 DEPTHS = (-0.01, 0.0, 0.01)
 ROWS = 9

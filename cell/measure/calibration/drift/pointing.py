@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from cell.calibration.solve.blocks import HAND, PLANE, SHARED, State, tangents
-from cell.calibration.verify.evidence import Evidence
-from cell.calibration.witness import LARGEST_RAD, NOTED_RAD, ConfirmedTurn, Pointing, turned
-from cell.geometry.camera import Array
+from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, NOTED_RAD, ConfirmedTurn, Pointing, turned
+from cell.measure.calibration.solve.blocks import HAND, PLANE, SHARED, State, tangents
+from cell.measure.geometry.camera import Array
 
 APART = 3.5
 """Standard deviations by which witness and board may differ. Normal errors do so in 0.05 % of all checks."""

@@ -8,20 +8,21 @@ from typing import Any, Self
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.adjustment import Adjusted
-from cell.calibration.solve.blocks import SHARED
-from cell.geometry.camera import Array
-from cell.geometry.poses import from_matrix
+from cell.measure.calibration.solve.adjustment import Adjusted
+from cell.measure.calibration.solve.blocks import SHARED
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """The board in the arm's base, and the covariance (27, 27) of everything that the calibration estimated.
 
-    The covariance is in the order of `cell.calibration.solve.blocks` (camera, light plane, rail, hand-eye, board),
-    zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m), `arm_rotation`
-    (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as configured, or
-    as found where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and stripe.
+    The covariance is in the order of `cell.measure.calibration.solve.blocks` (camera, light plane, rail, hand-eye,
+    board), zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m),
+    `arm_rotation` (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as
+    configured, or as found where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and
+    stripe.
     """
 
     base_from_board: pin.SE3

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.roll import roll_of, rolled
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.light_plane import LightPlane, triangulate
+from cell.measure.calibration.drift.roll import roll_of, rolled
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import Measured, RefusedError
 
 LEAST_ROWS = 40

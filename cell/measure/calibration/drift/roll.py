@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.geometry.camera import Array
-from cell.geometry.light_plane import LightPlane
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.light_plane import LightPlane
 from drivers.errors import Measured, RefusedError
 
 SIGMAS = 3.0

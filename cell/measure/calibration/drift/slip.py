@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.calibration.witness import Witness
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.light_plane import LightPlane, triangulate
+from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import Measured, RefusedError
 
 NOTED_M = 0.05e-3

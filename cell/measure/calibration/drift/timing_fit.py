@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.blocks import BOARD, POSITION, State, dots_block
-from cell.calibration.solve.results import ScanCalibration
-from cell.calibration.timing import Shutter, Timing
-from cell.calibration.verify.evidence import dots_of
-from cell.geometry.camera import Array
-from cell.vision import BoardView
+from cell.measure.calibration.drift.evidence import dots_of
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.blocks import BOARD, POSITION, State, dots_block
+from cell.measure.calibration.solve.results import ScanCalibration
+from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.geometry.camera import Array
+from cell.measure.vision import BoardView
 from drivers.errors import CalibrationStale, Measured, RefusedError
 
 LEAST_FRAMES = 4

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import State, ViewData
-from cell.calibration.solve.coverage import Coverage
-from cell.calibration.solve.joint import Joint
-from cell.geometry.camera import Array
-from cell.geometry.circles import seen_centres
-from cell.geometry.poses import from_parts, transform
-from cell.vision.board.spec import BoardSpec
+from cell.measure.calibration.judge.coverage import Coverage
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.blocks import State, ViewData
+from cell.measure.calibration.solve.joint import Joint
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.circles import seen_centres
+from cell.measure.geometry.poses import from_parts, transform
+from cell.measure.vision.board.spec import BoardSpec
 
 STEEP = np.deg2rad(28.0)
 SLIGHT = np.deg2rad(12.0)

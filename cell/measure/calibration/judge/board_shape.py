@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.solve.adjustment import Adjustment
-from cell.calibration.solve.blocks import CAMERA, FLANGE, State
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.adjustment import Adjustment
+from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, State
+from cell.measure.geometry.camera import Array
 
 SHAPES = 3
 SIGNIFICANT, CERTAIN = 4.0, 2.0

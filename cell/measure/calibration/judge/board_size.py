@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.calibration.solve.blocks import SHARED
-from cell.calibration.solve.one_more import one_more
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
+from cell.measure.calibration.solve.blocks import SHARED
+from cell.measure.calibration.solve.extra_parameter import one_more
+from cell.measure.geometry.camera import Array
 from drivers.errors import Measured, RefusedError
 
 ARM_SHARE = 0.5e-3

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cell.calibration.solve.adjustment import DISTORTION_PRIOR
-from cell.calibration.solve.board_shape import USUAL
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.intrinsics import CENTRED_LENS, Intrinsics
-from cell.geometry.camera import PARAMETER_NAMES, Array, CameraModel
-from cell.geometry.circles import seen_centres
-from cell.geometry.poses import transform
-from cell.vision.board.board import board_pose
-from cell.vision.board.view import BoardView
+from cell.measure.calibration.judge.board_shape import USUAL
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR
+from cell.measure.calibration.solve.intrinsics import CENTRED_LENS, Intrinsics
+from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel
+from cell.measure.geometry.circles import seen_centres
+from cell.measure.geometry.poses import transform
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.board.view import BoardView
 
 CELLS = (8, 6)
 LEAST_IN_CELL = 6

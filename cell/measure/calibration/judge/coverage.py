@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.solve.blocks import dots_block, stripe_block
-from cell.calibration.solve.joint import Joint
-from cell.geometry.camera import Array
-from cell.geometry.poses import transform
+from cell.measure.calibration.solve.blocks import dots_block, stripe_block
+from cell.measure.calibration.solve.joint import Joint
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import transform
 
 GRID = (8, 6)
 """Cells of the picture, columns and rows."""

@@ -13,11 +13,11 @@ import numpy as np
 import pinocchio as pin
 import scipy
 
-from cell.calibration.solve.adjustment import Adjusted
-from cell.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
-from cell.calibration.solve.board_shape import surface_shapes
-from cell.geometry.camera import Array
-from cell.geometry.poses import angle_apart, difference, from_parts, perturbed
+from cell.measure.calibration.judge.board_shape import surface_shapes
+from cell.measure.calibration.solve.adjustment import Adjusted
+from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, ViewData, dots_block
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import angle_apart, difference, from_parts, perturbed
 from drivers.errors import RefusedError
 
 LARGEST_TURN = float(np.deg2rad(0.5))

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.adjustment import Adjustment
-from cell.calibration.solve.blocks import State
-from cell.calibration.solve.choice import Solution
-from cell.calibration.solve.joint import Staged
-from cell.calibration.solve.starts import stripe_pixels
-from cell.geometry.camera import Array
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import transform
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjustment
+from cell.measure.calibration.solve.blocks import State
+from cell.measure.calibration.solve.choice import Solution
+from cell.measure.calibration.solve.joint import Staged
+from cell.measure.calibration.solve.starts import stripe_pixels
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import transform
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.solve.blocks import FLANGE, SHARED
-from cell.calibration.solve.intrinsics import Intrinsics, adjustment_of
-from cell.geometry.camera import Array
-from cell.vision.board.view import BoardView
+from cell.measure.calibration.solve.blocks import FLANGE, SHARED
+from cell.measure.calibration.solve.intrinsics import Intrinsics, adjustment_of
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.view import BoardView
 
 LEAST_OTHERS = 5
 """Pictures that a picture has to disagree with: of fewer, any may be the foreign one."""

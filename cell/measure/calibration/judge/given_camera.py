@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.intrinsics import LEAST_LEFT_OUT, Intrinsics, beside_given
-from cell.geometry.camera import PARAMETER_NAMES
-from cell.vision.board.view import BoardView
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.solve.intrinsics import LEAST_LEFT_OUT, Intrinsics, beside_given
+from cell.measure.geometry.camera import PARAMETER_NAMES
+from cell.measure.vision.board.view import BoardView
 from drivers.errors import RefusedError
 
 DOUBT_SIGMAS, REFUSE_SIGMAS = 3.0, 6.0

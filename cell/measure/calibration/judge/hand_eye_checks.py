@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.blocks import HAND
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.choice import Choice, Solution
-from cell.calibration.solve.intrinsics import Intrinsics
-from cell.geometry.camera import PARAMETER_NAMES, Array
-from cell.geometry.poses import difference
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.solve.blocks import HAND
+from cell.measure.calibration.solve.choice import Choice, Solution
+from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.geometry.camera import PARAMETER_NAMES, Array
+from cell.measure.geometry.poses import difference
 
 LEAST_FRAMES = 6
 SHIFT_SHARE = 3.0

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.blocks import SHARED, State
-from cell.calibration.solve.results import KEPT, PARAMETERS
-from cell.geometry.camera import Array
-from cell.reconstruction.build import ScanGeometry
+from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.results import KEPT, PARAMETERS
+from cell.measure.geometry.camera import Array
+from cell.measure.reconstruction.build import ScanGeometry
 
 GROUPS = {
     "camera": range(9),

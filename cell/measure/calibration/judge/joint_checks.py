@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 
-from cell.calibration.solve.blocks import stripe_block
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.joint import Joint
-from cell.calibration.solve.plane_checks import plane_fit_check
-from cell.geometry.camera import PARAMETER_NAMES, CameraModel
-from cell.geometry.poses import difference
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.plane_checks import plane_fit_check
+from cell.measure.calibration.solve.blocks import stripe_block
+from cell.measure.calibration.solve.joint import Joint
+from cell.measure.geometry.camera import PARAMETER_NAMES, CameraModel
+from cell.measure.geometry.poses import difference
 
 
 def joint_checks(joint: Joint, nominal: CameraModel) -> list[Check]:

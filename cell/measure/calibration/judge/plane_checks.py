@@ -9,16 +9,16 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.collect.stripe_on_board import on_plane
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.intrinsics import Intrinsics
-from cell.calibration.solve.starts import robust_plane, stripe_pixels
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.covariance import covariance_root
-from cell.geometry.light_plane import LightPlane
-from cell.vision.board.board import board_pose
-from cell.vision.board.view import BoardView
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.starts import robust_plane, stripe_pixels
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.covariance import covariance_root
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe_on_board import on_plane
 
 CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0
 """A stripe whose centres leave a straight line by more than all of these is not one line of light on a flat board."""

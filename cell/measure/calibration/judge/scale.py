@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.checks import Check
-from cell.calibration.solve.hand_eye import park_martin
-from cell.geometry.camera import Array
+from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.solve.hand_eye import park_martin
+from cell.measure.geometry.camera import Array
 from drivers.errors import RefusedError
 
 UNITS = {1000.0: "mm", 100.0: "cm", 1 / 0.0254: "inches"}

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.solve.blocks import (
+from cell.measure.calibration.solve.blocks import (
     CAMERA,
     COLUMNS,
     FLANGE,
@@ -30,12 +30,12 @@ from cell.calibration.solve.blocks import (
     rests_of,
     stripe_block,
 )
-from cell.calibration.solve.normal import Block, Inverse, Normal
-from cell.geometry.camera import Array
-from cell.geometry.poses import difference
+from cell.measure.calibration.solve.normal import Block, Inverse, Normal
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import difference
 
 if TYPE_CHECKING:
-    from cell.calibration.solve.bow import Bow
+    from cell.measure.calibration.solve.bow import Bow
 
 DISTORTION_PRIOR = (0.5, 2.0, 0.01, 0.01, 2.0)
 FOCAL_TIE_PX = 1e-3

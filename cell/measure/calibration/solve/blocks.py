@@ -1,7 +1,7 @@
 """Residuals of one view of a calibration, with their analytic derivatives: the dots in px, the stripe in m.
 
 Columns of every Jacobian: camera (9), light plane (3: two turns of the normal, distance), rail (3), hand-eye (6),
-board (6), then the view's own flange pose (6) and rail position (1). Poses move as in `cell.geometry.poses`.
+board (6), then the view's own flange pose (6) and rail position (1). Poses move as in `cell.measure.geometry.poses`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import cross, from_parts, perturbed
-from cell.geometry.seen import dots_terms
+from cell.measure.geometry.board_projection import dots_terms
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import cross, from_parts, perturbed
 
 CAMERA, PLANE, RAIL = slice(0, 9), slice(9, 12), slice(12, 15)
 HAND, BOARD = slice(15, 21), slice(21, 27)

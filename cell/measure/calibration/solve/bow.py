@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.calibration.solve.blocks import SHARED, State
-from cell.calibration.solve.one_more import OneMore, one_more
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
+from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.extra_parameter import OneMore, one_more
+from cell.measure.geometry.camera import Array
 
 EVIDENCE = 5.0
 """A bow of less than so many standard deviations is taken for noise: what it could do is less than they are."""

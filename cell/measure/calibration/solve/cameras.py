@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cell.calibration.observations import ScanObservation, TargetObservation
-from cell.calibration.solve.adjustment import Adjustment, Priors
-from cell.calibration.solve.board_size import board_size
-from cell.calibration.solve.faults import refuse_bent, refuse_exchanged, refuse_slipped
-from cell.calibration.solve.joint import Joint, Staged, solve_joint, solve_staged
-from cell.calibration.solve.joint_checks import joint_checks
-from cell.calibration.solve.results import ScanCalibration, TargetCalibration
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.board import board_pose
+from cell.measure.calibration.judge.board_size import board_size
+from cell.measure.calibration.judge.faults import refuse_bent, refuse_exchanged, refuse_slipped
+from cell.measure.calibration.judge.joint_checks import joint_checks
+from cell.measure.calibration.observations import ScanObservation, TargetObservation
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors
+from cell.measure.calibration.solve.joint import Joint, Staged, solve_joint, solve_staged
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
 

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import CAMERA, PLANE, SHARED, ViewData
-from cell.calibration.solve.closed_form import closed_form
-from cell.calibration.solve.intrinsics import Intrinsics
-from cell.calibration.solve.joint import Staged, start_state, view_data
-from cell.calibration.solve.left_out import LeftOut, Mask, leave_out
-from cell.geometry.camera import Array
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.blocks import CAMERA, PLANE, SHARED, ViewData
+from cell.measure.calibration.solve.closed_form import closed_form
+from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.joint import Staged, start_state, view_data
+from cell.measure.calibration.solve.left_out import LeftOut, Mask, leave_out
+from cell.measure.geometry.camera import Array
 
 TRUSTS = (1.0, 0.3, 0.1)
 """Shares of the arm's estimated scatter that are tried as its weight: much of that is the pictures' own."""

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.collect.stripe_on_board import on_plane
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors
-from cell.calibration.solve.blocks import BOARD, HAND, PLANE, SHARED, State, ViewData, tangents
-from cell.calibration.solve.hand_eye import solve_hand_eye
-from cell.calibration.solve.joint import Staged, start_state
-from cell.calibration.solve.left_out import LeftOut, Mask, predicted
-from cell.calibration.solve.starts import robust_plane, stripe_pixels
-from cell.geometry.camera import Array
-from cell.geometry.poses import difference
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors
+from cell.measure.calibration.solve.blocks import BOARD, HAND, PLANE, SHARED, State, ViewData, tangents
+from cell.measure.calibration.solve.hand_eye import solve_hand_eye
+from cell.measure.calibration.solve.joint import Staged, start_state
+from cell.measure.calibration.solve.left_out import LeftOut, Mask, predicted
+from cell.measure.calibration.solve.starts import robust_plane, stripe_pixels
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import difference
+from cell.measure.vision.stripe_on_board import on_plane
 from drivers.errors import RefusedError
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.calibration.solve.adjustment import Adjustment
-from cell.calibration.solve.blocks import SHARED, State
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.adjustment import Adjustment
+from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.geometry.camera import Array
 
 DAMPING = 1e-9
 LEAST_LEFT = 1e-9

@@ -13,8 +13,8 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.camera import Array
-from cell.geometry.poses import difference, from_parts, mean, perturbed
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import difference, from_parts, mean, perturbed
 from drivers.errors import RefusedError
 
 LEAST_TURN = np.deg2rad(2.0)

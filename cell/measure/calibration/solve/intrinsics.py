@@ -12,14 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
-from cell.calibration.solve.blocks import CAMERA, SHARED, State, ViewData
-from cell.calibration.solve.board_shape import Bend, bend_of, untold_by_bend
-from cell.calibration.solve.left_out import LeftOut, leave_out
-from cell.calibration.solve.starts import zhang
-from cell.geometry.camera import Array, CameraModel
-from cell.vision.board.board import board_pose
-from cell.vision.board.view import BoardView
+from cell.measure.calibration.judge.board_shape import Bend, bend_of, untold_by_bend
+from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
+from cell.measure.calibration.solve.blocks import CAMERA, SHARED, State, ViewData
+from cell.measure.calibration.solve.left_out import LeftOut, leave_out
+from cell.measure.calibration.solve.starts import zhang
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.board.view import BoardView
 from drivers.errors import RefusedError
 
 # Poses that nothing is known of: each picture's own.

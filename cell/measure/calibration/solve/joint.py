@@ -9,17 +9,26 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.observations import ScanObservation
-from cell.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.calibration.solve.blocks import CAMERA, COLUMNS, HAND, State, ViewData, dots_block, rests_of, stripe_block
-from cell.calibration.solve.board_size import BoardSize
-from cell.calibration.solve.bow import with_bow
-from cell.calibration.solve.hand_eye import HandEye, solve_hand_eye
-from cell.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
-from cell.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.poses import from_parts
-from cell.vision.board.board import board_pose
+from cell.measure.calibration.judge.board_size import BoardSize
+from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.blocks import (
+    CAMERA,
+    COLUMNS,
+    HAND,
+    State,
+    ViewData,
+    dots_block,
+    rests_of,
+    stripe_block,
+)
+from cell.measure.calibration.solve.bow import with_bow
+from cell.measure.calibration.solve.hand_eye import HandEye, solve_hand_eye
+from cell.measure.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
+from cell.measure.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision.board.board import board_pose
 from drivers.errors import RefusedError
 
 STRIPE_POINTS = 120

@@ -12,10 +12,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.calibration.solve.blocks import CAMERA, FLANGE, OWN, SHARED, State, ViewData, dots_block, stripe_block
-from cell.geometry.camera import Array
-from cell.geometry.poses import perturbed, transform
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
+from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, OWN, SHARED, State, ViewData, dots_block, stripe_block
+from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import perturbed, transform
 
 Mask = NDArray[np.bool_]
 BEST_POSE_STEPS = 3

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.calibration.solve.blocks import OWN, SHARED
-from cell.geometry.camera import Array
+from cell.measure.calibration.solve.blocks import OWN, SHARED
+from cell.measure.geometry.camera import Array
 
 GROUPS = ("dots", "stripe", "shift", "turn", "rail", "lens")
 

@@ -14,13 +14,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.collect.stripe_on_board import on_plane
-from cell.calibration.solve.starts import zhang
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.light_plane import LightPlane, triangulate
-from cell.geometry.poses import transform
-from cell.vision.board.board import board_pose, predict
-from cell.vision.board.view import BoardView
+from cell.measure.calibration.solve.starts import zhang
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.light_plane import LightPlane, triangulate
+from cell.measure.geometry.poses import transform
+from cell.measure.vision.board.board import board_pose, predict
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe_on_board import on_plane
 from drivers.errors import RefusedError
 
 LEAST_IN_ROW = 3

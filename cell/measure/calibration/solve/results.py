@@ -9,18 +9,18 @@ from typing import Any, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from cell.calibration.roll import rolled
-from cell.calibration.solve.blocks import HAND, SHARED, State
-from cell.calibration.solve.bow import FLAT
-from cell.calibration.solve.joint import Joint, effective_hand_eye_covariance
-from cell.calibration.solve.reference import Reference
-from cell.calibration.timing import Shutter, Timing
-from cell.calibration.witness import ConfirmedTurn, Pointing, Witness, turned
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.covariance import covariance_root
-from cell.geometry.light_plane import LightPlane
-from cell.geometry.poses import from_matrix, from_parts
-from cell.reconstruction.build import ScanGeometry
+from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing, Witness, turned
+from cell.measure.calibration.drift.roll import rolled
+from cell.measure.calibration.solve.blocks import HAND, SHARED, State
+from cell.measure.calibration.solve.bow import FLAT
+from cell.measure.calibration.solve.joint import Joint, effective_hand_eye_covariance
+from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.covariance import covariance_root
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.reconstruction.build import ScanGeometry
 
 PARAMETERS = (
     "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
@@ -59,14 +59,14 @@ class ScanCalibration:
 
     `rail_direction` (3,): metres that the camera moves, in its own axes, per metre of rail reading (direction times
     scale). `flange_from_camera` holds at rail position 0. `covariance` (21, 21) in the order of `PARAMETERS`; the light
-    plane's tilts are about the tangents of `cell.calibration.solve.blocks.tangents`, the hand-eye's are (translation,
-    rotation) in flange axes. `reference` is what a verification compares with; files of older programs have none.
-    `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain` (21,) how the
-    other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as usual. With a
-    `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,), m, in the
-    camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the camera's
-    time stamps were found to come, `shutter` how its rows are exposed; `unread` says what of these a file held that
-    cannot be read, `refused` why a later look at the camera's times was refused, "" if none was.
+    plane's tilts are about the tangents of `cell.measure.calibration.solve.blocks.tangents`, the hand-eye's are
+    (translation, rotation) in flange axes. `reference` is what a verification compares with; files of older programs
+    have none. `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain`
+    (21,) how the other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as
+    usual. With a `pointing` the light plane is the one that the `witness` showed later, turned about `exit_point` (3,),
+    m, in the camera's frame. `confirmed` is what a verification found out about the laser since, `timing` how late the
+    camera's time stamps were found to come, `shutter` how its rows are exposed; `unread` says what of these a file held
+    that cannot be read, `refused` why a later look at the camera's times was refused, "" if none was.
     """
 
     camera: CameraModel

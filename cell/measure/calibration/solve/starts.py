@@ -14,11 +14,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.calibration.collect.stripe_on_board import on_plane, points_on_board
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.light_plane import LightPlane
-from cell.vision.board.view import BoardView
-from cell.vision.stripe.extract import StripeProfile
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe_on_board import on_plane, points_on_board
 from drivers.errors import RefusedError
 
 LEAST_VIEWS = 3

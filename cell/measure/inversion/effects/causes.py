@@ -14,14 +14,14 @@ from itertools import product
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import perturbed
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, correspondences
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.rocking import LARGEST_OVERTONES
-from cell.inversion.search import across
-from cell.inversion.shared import PATCH_M
-from cell.reconstruction.cloud import Cloud
+from cell.measure.geometry.poses import perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correlated_errors import PATCH_M
+from cell.measure.inversion.correspondences import Scan, correspondences
+from cell.measure.inversion.effects.rocking import LARGEST_OVERTONES
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.start_poses import across
+from cell.measure.reconstruction.cloud import Cloud
 
 GATE_M, MOST_POINTS = 1.5e-3, 30_000
 ROW_GROUPS = 24

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.geometry.poses import perturbed
-from cell.inversion.closest import Array
-from cell.inversion.moved import SurfaceMotion
-from cell.inversion.place_pose import PlacePose
-from cell.reconstruction.cloud import Cloud, Indices
+from cell.measure.geometry.poses import perturbed
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.effects.moved import SurfaceMotion
+from cell.measure.inversion.place_pose import PlacePose
+from cell.measure.reconstruction.cloud import Cloud, Indices
 
 EVIDENCE = 32.0
 """Squared Mahalanobis distance by the scatter alone from which on something creeps: as for a motion (`moved`)."""

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, correspondences
-from cell.inversion.nominal import NominalSurface
-from cell.reconstruction.cloud import Cloud, Indices
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan, correspondences
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.reconstruction.cloud import Cloud, Indices
 
 GATE_M = 0.5e-3
 LEAST_LINES, LEAST_SHARE = 40, 0.1

@@ -13,13 +13,13 @@ import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, correspondences
-from cell.inversion.motions import name, sorted_out
-from cell.inversion.nominal import NominalSurface
-from cell.inversion.observability import Tolerance
-from cell.reconstruction.cloud import Cloud
-from cell.reconstruction.seams import Motions
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan, correspondences
+from cell.measure.inversion.motions import name, sorted_out
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.seams import Motions
 
 GATE_M = 5e-3
 """Points farther from where the surface was are not of it; where it has moved farther, few are left."""

@@ -13,10 +13,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.inversion.closest import Array
-from cell.inversion.correspondences import Scan, correspondences
-from cell.inversion.nominal import NominalSurface
-from cell.reconstruction.cloud import Cloud
+from cell.measure.inversion.closest import Array
+from cell.measure.inversion.correspondences import Scan, correspondences
+from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
 
 SLOWEST_HZ, FASTEST_HZ, STEP_HZ = 1.5, 14.0, 0.05

@@ -12,17 +12,17 @@ import cv2
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.camera import Array, CameraModel
-from cell.geometry.poses import difference, from_parts, perturbed, transform
-from cell.geometry.seen import pose_equations, seen_points
-from cell.vision.board.charuco import find_charuco
-from cell.vision.board.chess import find_chessboard
-from cell.vision.board.dot_board import find_dots
-from cell.vision.board.outliers import without_outliers
-from cell.vision.board.spec import DOTS, BoardSpec
-from cell.vision.board.tags import find_tags
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason, check_picture
+from cell.measure.geometry.board_projection import pose_equations, seen_points
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
+from cell.measure.vision.board.charuco import find_charuco
+from cell.measure.vision.board.chess import find_chessboard
+from cell.measure.vision.board.dot_board import find_dots
+from cell.measure.vision.board.outliers import without_outliers
+from cell.measure.vision.board.spec import DOTS, BoardSpec
+from cell.measure.vision.board.tags import find_tags
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30
 LEAST_POINTS = 4

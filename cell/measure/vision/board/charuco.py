@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
-from cell.vision.board.corner_fit import fit_corners
-from cell.vision.board.ends import check_hidden_sides, smoothed
-from cell.vision.board.plane_map import PlaneMap
-from cell.vision.board.spec import BoardSpec, propose_counts
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
+from cell.measure.vision.board.corner_fit import fit_corners
+from cell.measure.vision.board.ends import check_hidden_sides, smoothed
+from cell.measure.vision.board.plane_map import PlaneMap
+from cell.measure.vision.board.spec import BoardSpec, propose_counts
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 LEAST_MARKERS = 3
 # Markers that agree with one another but not with the board found, or that it does not have: a second board.

@@ -10,15 +10,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.corner_fit import WINDOW_SHARE, fit_corners
-from cell.vision.board.corners import Corners, corner_lattices, find_corners
-from cell.vision.board.ends import check_chess_ends, grey
-from cell.vision.board.identify import Places, by_outline
-from cell.vision.board.plane_map import PlaneMap
-from cell.vision.board.spec import BoardSpec
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason, only_one
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.corner_fit import WINDOW_SHARE, fit_corners
+from cell.measure.vision.board.corners import Corners, corner_lattices, find_corners
+from cell.measure.vision.board.ends import check_chess_ends, grey
+from cell.measure.vision.board.identify import Places, by_outline
+from cell.measure.vision.board.plane_map import PlaneMap
+from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import Image, PictureRefused, Reason, only_one
 
 LEAST_CORNERS = 6
 LEAST_SHARE = 0.5

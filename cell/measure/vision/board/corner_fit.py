@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
-from cell.geometry.camera import Array
-from cell.vision.pictures import Image
+from cell.base.compiled import compiled
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.pictures import Image
 
 PARAMETERS = 10
 STEPS = 30

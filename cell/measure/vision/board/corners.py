@@ -14,9 +14,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.lattice import Places, grow
-from cell.vision.pictures import Image
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.lattice import Places, grow
+from cell.measure.vision.pictures import Image
 
 SAMPLES = 32
 RADII = (4.5, 7.0)

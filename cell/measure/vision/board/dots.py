@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.lattice import Blobs
-from cell.vision.pictures import Image
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.lattice import Blobs
+from cell.measure.vision.pictures import Image
 
 Outline = NDArray[np.int32]
 

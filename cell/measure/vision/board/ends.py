@@ -10,10 +10,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.plane_map import PlaneMap
-from cell.vision.board.spec import BoardSpec
-from cell.vision.pictures import Image, PictureRefused, Reason
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.plane_map import PlaneMap
+from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 # Share of the places along a side that have to show its end, and how many further points contradict it.
 LEAST_ENDS = 0.3

@@ -10,9 +10,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.spec import BoardSpec
-from cell.vision.pictures import PictureRefused, Reason
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.pictures import PictureRefused, Reason
 
 Places = NDArray[np.intp]
 

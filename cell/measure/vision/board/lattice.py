@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 
 Places = NDArray[np.intp]
 

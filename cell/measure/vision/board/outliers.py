@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from cell.vision.board.view import BoardView
+from cell.measure.vision.board.view import BoardView
 
 OUTLYING = 6.0
 LEAST_PX = 0.2

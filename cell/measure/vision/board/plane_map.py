@@ -10,8 +10,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.pictures import PictureRefused, Reason
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.pictures import PictureRefused, Reason
 
 NEAREST = 4
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
+from cell.measure.geometry.camera import Array
 from drivers.errors import ConfigError
 
 Kind = Literal["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco", "aprilgrid"]

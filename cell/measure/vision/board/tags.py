@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.charuco import best_dictionary
-from cell.vision.board.spec import BoardSpec, propose_counts
-from cell.vision.board.view import BoardView
-from cell.vision.pictures import Image, PictureRefused, Reason
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.charuco import best_dictionary
+from cell.measure.vision.board.spec import BoardSpec, propose_counts
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 LEAST_TAGS = 4
 # A tag lies where the others put it to this share of its side, its corners as they are first read to that one.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.geometry.camera import Array
-from cell.vision.board.spec import BoardSpec
+from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.spec import BoardSpec
 
 
 @dataclass(frozen=True, eq=False)

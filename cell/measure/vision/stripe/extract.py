@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.careful import read_carefully
-from cell.vision.stripe.neighbours import widen_what_departs
-from cell.vision.stripe.planes import FULL, Picture, as_picture
-from cell.vision.stripe.planes import Laser as Laser
-from cell.vision.stripe.profile import Array as Array
-from cell.vision.stripe.profile import Axis as Axis
-from cell.vision.stripe.profile import Image as Image
-from cell.vision.stripe.profile import Mark as Mark
-from cell.vision.stripe.profile import StripeProfile as StripeProfile
-from cell.vision.stripe.profile import StripeSettings as StripeSettings
-from cell.vision.stripe.quick import Verdict, read_quickly, refuse_white
-from cell.vision.stripe.rivals import DOUBLE
+from cell.measure.vision.stripe.careful.careful import read_carefully
+from cell.measure.vision.stripe.careful.competing_peaks import DOUBLE
+from cell.measure.vision.stripe.careful.neighbours import widen_what_departs
+from cell.measure.vision.stripe.ordinary.quick import Verdict, read_quickly, refuse_white
+from cell.measure.vision.stripe.planes import FULL, Picture, as_picture
+from cell.measure.vision.stripe.planes import Laser as Laser
+from cell.measure.vision.stripe.profile import Array as Array
+from cell.measure.vision.stripe.profile import Axis as Axis
+from cell.measure.vision.stripe.profile import Image as Image
+from cell.measure.vision.stripe.profile import Mark as Mark
+from cell.measure.vision.stripe.profile import StripeProfile as StripeProfile
+from cell.measure.vision.stripe.profile import StripeSettings as StripeSettings
 
 TRUSTED_SHARE = 0.98
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cell.vision.stripe.profile import StripeProfile
+    from cell.measure.vision.stripe.profile import StripeProfile
 
 Array = NDArray[np.float64]
 

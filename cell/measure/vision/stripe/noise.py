@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled
+from cell.base.compiled import compiled
 
 SAMPLED_LINES = 5
 # The declared noise is believed up to an excess of this share: the stripe's own flanks look like noise.

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.follow import SCALES, Candidates, Chain, candidates, follow
-from cell.vision.stripe.learning import FREE_SCALE
-from cell.vision.stripe.planes import MIXES, Laser, Picture
-from cell.vision.stripe.shape import gaussian
-from cell.vision.stripe.shaped_fit import Noise, Plane, binned, fit_shape
-from cell.vision.stripe.surroundings import around, carried, surrounded
+from cell.measure.vision.stripe.careful.follow import SCALES, Candidates, Chain, candidates, follow
+from cell.measure.vision.stripe.careful.learning import FREE_SCALE
+from cell.measure.vision.stripe.careful.shape import gaussian
+from cell.measure.vision.stripe.careful.shaped_fit import Noise, Plane, binned, fit_shape
+from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded
+from cell.measure.vision.stripe.planes import MIXES, Laser, Picture
 
 Array = NDArray[np.float64]
 

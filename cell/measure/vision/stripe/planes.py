@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.pictures import PictureRefused, Reason
 
 FULL = 255.0
 NEAR_FULL = 0.985

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.marks import Mark as Mark
-from cell.vision.stripe.marks import marks_of
-from cell.vision.stripe.speckle import Speckle
+from cell.measure.vision.stripe.careful.speckle import Speckle
+from cell.measure.vision.stripe.marks import Mark as Mark
+from cell.measure.vision.stripe.marks import marks_of
 
 if TYPE_CHECKING:
-    from cell.vision.stripe.careful import Learned
+    from cell.measure.vision.stripe.careful.careful import Learned
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

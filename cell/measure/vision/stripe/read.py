@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from cell.vision.stripe.extract import Axis, Laser, StripeProfile, StripeSettings, extract, subtracted
-from cell.vision.stripe.look import LEAST_SCORE, Look, choose_mix, coarse
-from cell.vision.stripe.sureness import refuse_unsure
+from cell.measure.vision.stripe.careful.confidence import refuse_unsure
+from cell.measure.vision.stripe.extract import Axis, Laser, StripeProfile, StripeSettings, extract, subtracted
+from cell.measure.vision.stripe.overview import LEAST_SCORE, Look, choose_mix, coarse
 
 LEAST_POINTS = 30
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.extract import Axis, Image, StripeProfile, StripeSettings, extract
+from cell.measure.vision.stripe.extract import Axis, Image, StripeProfile, StripeSettings, extract
 
 BLOCK = 16
 """Pictures for which what was measured holds: 1.6 mm of a sweep at .1 mm a profile."""

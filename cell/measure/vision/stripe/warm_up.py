@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.extract import extract
+from cell.measure.vision.stripe.extract import extract
 
 
 def drawn(height: int, width: int) -> Iterator[NDArray[np.uint8]]:

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from cell.report.figures import shown_limit, shown_value, simulated_words
+from cell.run.report.figures import shown_limit, shown_value, simulated_words
 
 Row = tuple[str, ...]
 K95 = 1.96

@@ -10,15 +10,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from cell.report.figures import noise_rows, simulated_words
-from cell.report.page import facts
-from cell.report.page.maps import map_picture, view_data
-from cell.report.page.photographs import chosen, photograph
-from cell.report.page.scanned import scanned
-from cell.report.page.timeline import mark_rows, timeline, timeline_svg
-from cell.report.page.trend import past_runs, trend_svg
-from cell.report.pictures import SCALE_SHARE
-from cell.run.reading import read_report
+from cell.run.files.reading import read_report
+from cell.run.report.figures import noise_rows, simulated_words
+from cell.run.report.page import facts
+from cell.run.report.page.maps import map_picture, view_data
+from cell.run.report.page.photographs import chosen, photograph
+from cell.run.report.page.scanned import scanned
+from cell.run.report.page.timeline import mark_rows, timeline, timeline_svg
+from cell.run.report.page.trend import past_runs, trend_svg
+from cell.run.report.pictures import SCALE_SHARE
 from drivers.errors import CellError
 
 MOST_BYTES = 3_000_000
@@ -69,7 +69,7 @@ def _head(report: Any) -> str:
 
 
 def _resource(name: str) -> str:
-    return files("cell.report.page").joinpath(name).read_text(encoding="utf-8")
+    return files("cell.run.report.page").joinpath(name).read_text(encoding="utf-8")
 
 
 def _verdict(report: Any) -> str:

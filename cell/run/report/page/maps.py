@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cell.report.page.scanned import Scanned
-from cell.report.panels import frame_map, square_means
+from cell.run.report.page.scanned import Scanned
+from cell.run.report.panels import frame_map, square_means
 from drivers.interfaces import Vector
 
 MOST_POINTS = 20_000

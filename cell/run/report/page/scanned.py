@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.geometry.poses import from_ur, transform
-from cell.inversion import NominalSurface
-from cell.reconstruction.ply import read_cloud
-from cell.report.evidence import CLOUD
+from cell.measure.geometry.poses import from_ur, transform
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction.ply import read_cloud
+from cell.run.report.evidence import CLOUD
 from drivers.errors import CellError
 from drivers.interfaces import Vector
 

@@ -7,8 +7,8 @@ import struct
 from dataclasses import dataclass
 
 from sim_backends.models.arm import ArmModel
-from sim_backends.peers.rtde_registers import Registers, View
-from sim_backends.peers.rtde_variables import FORMATS, INPUTS, Getter
+from sim_backends.peers.arm.rtde.registers import Registers, View
+from sim_backends.peers.arm.rtde.variables import FORMATS, INPUTS, Getter
 
 _COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
 _REGISTER = re.compile(r"input_(int|double|bit)_register_(\d+)")

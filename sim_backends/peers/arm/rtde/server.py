@@ -21,13 +21,13 @@ import numpy as np
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.controller_ports import Client, TcpPorts
-from sim_backends.peers.dashboard import BANNER, Dashboard
-from sim_backends.peers.rtde_recipes import InputRecipe
-from sim_backends.peers.rtde_registers import Registers, View
-from sim_backends.peers.rtde_session import Session
-from sim_backends.peers.script import ControlProgram
-from sim_backends.peers.script_clients import SCRIPT_PORTS, ScriptClients
+from sim_backends.peers.arm.controller_ports import Client, TcpPorts
+from sim_backends.peers.arm.dashboard import BANNER, Dashboard
+from sim_backends.peers.arm.rtde.recipes import InputRecipe
+from sim_backends.peers.arm.rtde.registers import Registers, View
+from sim_backends.peers.arm.rtde.session import Session
+from sim_backends.peers.arm.script.clients import SCRIPT_PORTS, ScriptClients
+from sim_backends.peers.arm.script.script import ControlProgram
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
@@ -175,7 +175,7 @@ class RtdePeer:
 
 def main(arguments: list[str] | None = None) -> None:
     """Serve one arm with exact kinematics until SIGINT, SIGTERM or the end of standard input (with --until-eof)."""
-    parser = argparse.ArgumentParser(prog="python -m sim_backends.peers.rtde", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m sim_backends.peers.arm.rtde.server", description=main.__doc__)
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second")
     parser.add_argument("--host", default=None, help="loopback address, default: a free one")
     parser.add_argument("--model", choices=sorted(TABLES), default="UR10e", help="which arm")

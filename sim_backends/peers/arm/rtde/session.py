@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from sim_backends.peers.controller_ports import Client
-from sim_backends.peers.dashboard import VERSION
-from sim_backends.peers.rtde_recipes import InputRecipe, OutputRecipe
-from sim_backends.peers.rtde_registers import View
-from sim_backends.peers.rtde_variables import FORMATS, INPUTS, OUTPUTS
+from sim_backends.peers.arm.controller_ports import Client
+from sim_backends.peers.arm.dashboard import VERSION
+from sim_backends.peers.arm.rtde.recipes import InputRecipe, OutputRecipe
+from sim_backends.peers.arm.rtde.registers import View
+from sim_backends.peers.arm.rtde.variables import FORMATS, INPUTS, OUTPUTS
 
 _HEADER = struct.Struct(">HB")
 _CATCH_UP = 4

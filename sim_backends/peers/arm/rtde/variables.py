@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 from sim_backends.models.arm import Power
-from sim_backends.peers.rtde_registers import BITS, REGISTERS, View
+from sim_backends.peers.arm.rtde.registers import BITS, REGISTERS, View
 
 FORMATS = {
     "BOOL": "?",

@@ -7,13 +7,13 @@ Primary (30001) and secondary (30002) tell the state ten times a second, the pri
 from __future__ import annotations
 
 from sim_backends.models.arm import ArmModel, Power, Safety
-from sim_backends.peers.controller_ports import Client
-from sim_backends.peers.dashboard import VERSION
-from sim_backends.peers.real_time_port import real_time_packet
-from sim_backends.peers.rtde_registers import View
-from sim_backends.peers.script import Announcement, ControlProgram
-from sim_backends.peers.script_port import message, robot_state, safety_message, version_message
-from sim_backends.peers.urscript.words import Collector
+from sim_backends.peers.arm.controller_ports import Client
+from sim_backends.peers.arm.dashboard import VERSION
+from sim_backends.peers.arm.real_time_port import real_time_packet
+from sim_backends.peers.arm.rtde.registers import View
+from sim_backends.peers.arm.script.port import message, robot_state, safety_message, version_message
+from sim_backends.peers.arm.script.script import Announcement, ControlProgram
+from sim_backends.peers.arm.urscript.words import Collector
 
 _PRIMARY, _SECONDARY, _REAL_TIME = (30001, 30011), (30002, 30012), (30003, 30013)
 _READ_ONLY = (30011, 30012, 30013)

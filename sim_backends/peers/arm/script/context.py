@@ -14,7 +14,7 @@ import numpy as np
 from sim_backends.models.arm import ArmModel
 from sim_backends.models.arm_kinematics import Matrix, Vector, invert, matrix_from_pose
 from sim_backends.models.arm_motion import Motion
-from sim_backends.peers.rtde_registers import Registers
+from sim_backends.peers.arm.rtde.registers import Registers
 
 Job = Generator[None, None, None]
 

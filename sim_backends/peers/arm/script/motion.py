@@ -10,7 +10,7 @@ import numpy as np
 from sim_backends.models.arm_kinematics import Matrix, Vector, matrix_from_pose
 from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
-from sim_backends.peers.script_context import Context, Job
+from sim_backends.peers.arm.script.context import Context, Job
 
 _CONTACT_FORCE = 10.0
 """Force in N along the direction of motion that counts as contact."""

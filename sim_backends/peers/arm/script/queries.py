@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim_backends.models.arm_kinematics import pose_from_matrix
-from sim_backends.peers.script_context import CYCLE, Context
+from sim_backends.peers.arm.script.context import CYCLE, Context
 
 
 def _inverse_near(c: Context) -> None:

@@ -18,8 +18,8 @@ from sim_backends.models.arm_kinematics import (
     rotation_matrix,
     rotation_vector,
 )
-from sim_backends.peers.urscript.environment import Environment
-from sim_backends.peers.urscript.values import MOST_ELEMENTS, List, Pose, Struct, shown
+from sim_backends.peers.arm.urscript.environment import Environment
+from sim_backends.peers.arm.urscript.values import MOST_ELEMENTS, List, Pose, Struct, shown
 
 
 def matrix(pose: Any) -> Matrix:

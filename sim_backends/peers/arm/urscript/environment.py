@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 from sim_backends.models.arm_motion import Motion, Stop
 from sim_backends.models.arm_streams import ForceMode
-from sim_backends.peers.script_context import CYCLE, Context, Job, ProgramError
-from sim_backends.peers.script_outputs import HeldOutputs
+from sim_backends.peers.arm.script.context import CYCLE, Context, Job, ProgramError
+from sim_backends.peers.arm.script.outputs import HeldOutputs
 
 Announce = Callable[[str, str], None]
 """Tells the clients of the primary port: the kind of message (text, popup) and its words."""

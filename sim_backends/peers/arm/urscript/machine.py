@@ -10,12 +10,12 @@ from collections.abc import Callable, Generator
 from traceback import walk_tb
 from typing import Any
 
-from sim_backends.peers.script_context import Context, Job, ProgramError
-from sim_backends.peers.urscript import arithmetic, motions, sensing, settings, sockets
-from sim_backends.peers.urscript.environment import Environment
-from sim_backends.peers.urscript.translate import translate
-from sim_backends.peers.urscript.values import List, Pose, own
-from sim_backends.peers.urscript.words import ScriptError
+from sim_backends.peers.arm.script.context import Context, Job, ProgramError
+from sim_backends.peers.arm.urscript import arithmetic, motions, sensing, settings, sockets
+from sim_backends.peers.arm.urscript.environment import Environment
+from sim_backends.peers.arm.urscript.translate import translate
+from sim_backends.peers.arm.urscript.values import List, Pose, own
+from sim_backends.peers.arm.urscript.words import ScriptError
 
 Thread = Generator[None, None, Any]
 _MOST_TURNS = 20000

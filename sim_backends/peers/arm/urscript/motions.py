@@ -16,11 +16,11 @@ from sim_backends.models.arm_circle import ArcMove
 from sim_backends.models.arm_kinematics import Matrix, Vector
 from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
-from sim_backends.peers.script_context import CYCLE, Job, ProgramError
-from sim_backends.peers.script_motion import tool_contact
-from sim_backends.peers.urscript.arithmetic import matrix
-from sim_backends.peers.urscript.environment import Environment
-from sim_backends.peers.urscript.values import Pose
+from sim_backends.peers.arm.script.context import CYCLE, Job, ProgramError
+from sim_backends.peers.arm.script.motion import tool_contact
+from sim_backends.peers.arm.urscript.arithmetic import matrix
+from sim_backends.peers.arm.urscript.environment import Environment
+from sim_backends.peers.arm.urscript.values import Pose
 
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""

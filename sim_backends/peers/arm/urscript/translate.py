@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from sim_backends.peers.urscript.words import ScriptError, Token, syntax_error, tokens
+from sim_backends.peers.arm.urscript.words import ScriptError, Token, syntax_error, tokens
 
 _LEVELS = (("or",), ("xor",), ("and",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
 """Binary operators, those that bind least first."""

@@ -1,1 +1,1 @@
-"""The stripe of pictures that are not ordinary: its profile is learnt, its neighbours and surroundings are looked at."""
+"""The stripe of pictures that are not ordinary: its profile is learnt, and its surroundings are looked at."""

@@ -13,18 +13,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.belief import MISFIT_SIGMAS
-from cell.vision.stripe.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
-from cell.vision.stripe.learning import FREE_SCALE, learn_profile
-from cell.vision.stripe.look import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
-from cell.vision.stripe.pieces import fill_gaps
-from cell.vision.stripe.planes import MIXES, Laser, Picture
-from cell.vision.stripe.shape import Shape
-from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
-from cell.vision.stripe.surroundings import around, carried, surrounded, wander
+from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
+from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
+from cell.measure.vision.stripe.careful.segments import fill_gaps
+from cell.measure.vision.stripe.careful.shape import Shape
+from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
+from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
+from cell.measure.vision.stripe.careful.validation import MISFIT_SIGMAS
+from cell.measure.vision.stripe.overview import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
+from cell.measure.vision.stripe.planes import MIXES, Laser, Picture
 
 if TYPE_CHECKING:
-    from cell.vision.stripe.profile import StripeSettings
+    from cell.measure.vision.stripe.profile import StripeSettings
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
-from cell.vision.stripe.find import CENTRE, ENERGY, WIDTH
+from cell.base.compiled import compiled
+from cell.measure.vision.stripe.ordinary.find import CENTRE, ENERGY, WIDTH
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.vision.pictures import PictureRefused, Reason
-from cell.vision.stripe.follow import LEAST, MOST, Candidates, Chain, follow
-from cell.vision.stripe.look import Look
+from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.stripe.careful.follow import LEAST, MOST, Candidates, Chain, follow
+from cell.measure.vision.stripe.overview import Look
 
 CLEAR = 10.0
 """A line that says this much for itself, over noise and what else is in the picture, a row on average, is taken."""

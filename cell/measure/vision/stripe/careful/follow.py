@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
+from cell.base.compiled import compiled
 
 Array = NDArray[np.float64]
 

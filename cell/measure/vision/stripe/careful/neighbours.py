@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled
+from cell.base.compiled import compiled
 
 BLOCK, BESIDE = 16, 24
 """Lines that are judged by one curve; lines on either side that shape it: more than a spot covers."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cell.vision.stripe.careful import Careful
+    from cell.measure.vision.stripe.careful.careful import Careful
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
+from cell.base.compiled import compiled
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
-from cell.vision.stripe.shape import Shape
+from cell.base.compiled import compiled
+from cell.measure.vision.stripe.careful.shape import Shape
 
 Array = NDArray[np.float64]
 

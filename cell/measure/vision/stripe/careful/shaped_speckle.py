@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.shape import Shape
-from cell.vision.stripe.shaped_fit import Fitted, Noise
-from cell.vision.stripe.speckle import ASSUMED_GRAIN
+from cell.measure.vision.stripe.careful.shape import Shape
+from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise
+from cell.measure.vision.stripe.careful.speckle import ASSUMED_GRAIN
 
 Array = NDArray[np.float64]
 

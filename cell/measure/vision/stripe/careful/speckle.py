@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.compiled import compiled
-from cell.vision.stripe.find import CORE, ENERGY
-from cell.vision.stripe.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
-from cell.vision.stripe.lanes import LAGS
+from cell.base.compiled import compiled
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
+from cell.measure.vision.stripe.ordinary.lanes import LAGS
 
 # Correlation of two pixels at distance r is exp(−r²/4 grain²); a lens at f/4 to f/8 with pixels of 5 µm gives .3 to 1.
 GRAINS = np.array([0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.stripe.shaped_fit import Fitted, Noise, Plane
+from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane
 
 Array = NDArray[np.float64]
 

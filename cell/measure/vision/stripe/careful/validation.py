@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled
-from cell.vision.stripe.find import CENTRE, CORE
-from cell.vision.stripe.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, WIDTH
+from cell.base.compiled import compiled
+from cell.measure.vision.stripe.ordinary.find import CENTRE, CORE
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, WIDTH
 
 # A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
 MISFIT_SIGMAS = 3.0

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled
-from cell.vision.stripe.find import CORE, ENERGY
-from cell.vision.stripe.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH
+from cell.base.compiled import compiled
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH
 
 BINS, WITHIN = 28, 3.5
 """Of the mean residual across the stripe, and how far out it goes, in widths."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled, compiled_fast
+from cell.base.compiled import compiled, compiled_fast
 
 # Start values of a candidate: start[line, candidate, …]; an energy of 0 says that there is none.
 CENTRE, WIDTH, HEIGHT, BACKGROUND, ENERGY, CORE = range(6)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled, compiled_fast
-from cell.vision.stripe import lanes as lane
-from cell.vision.stripe.find import BACKGROUND, CENTRE, CORE, CUT, HEIGHT
-from cell.vision.stripe.lanes import HALF, LANES, MIDDLE, ROWS
+from cell.base.compiled import compiled, compiled_fast
+from cell.measure.vision.stripe.ordinary import lanes as lane
+from cell.measure.vision.stripe.ordinary.find import BACKGROUND, CENTRE, CORE, CUT, HEIGHT
+from cell.measure.vision.stripe.ordinary.lanes import HALF, LANES, MIDDLE, ROWS
 
 # Rows of the result. SIGMA is the centre's standard deviation with the noise as it is correlated, FISHER without.
 FIT_CENTRE, SIGMA, AMPLITUDE, WIDTH, LEVEL, SLOPE, CHI2, FISHER = range(8)

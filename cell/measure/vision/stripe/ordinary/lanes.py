@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled_fast
+from cell.base.compiled import compiled_fast
 
 LANES = 32
 LAGS = 6

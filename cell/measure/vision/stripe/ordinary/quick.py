@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.vision.pictures import PictureRefused, Reason
-from cell.vision.stripe import find as find
-from cell.vision.stripe import fit as fit
-from cell.vision.stripe import search as stripe_search
-from cell.vision.stripe.belief import believe
-from cell.vision.stripe.noise import pixel_noise
-from cell.vision.stripe.ordinary import (
+from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.stripe.careful.competing_peaks import choose, survey
+from cell.measure.vision.stripe.careful.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
+from cell.measure.vision.stripe.careful.validation import believe
+from cell.measure.vision.stripe.noise import pixel_noise
+from cell.measure.vision.stripe.ordinary import find, fit
+from cell.measure.vision.stripe.ordinary import search as stripe_search
+from cell.measure.vision.stripe.ordinary.conditions import (
     HARDLY_ANY,
     has_rivals,
     is_line_whole,
@@ -29,9 +30,7 @@ from cell.vision.stripe.ordinary import (
     is_textured,
     is_too_wide,
 )
-from cell.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
-from cell.vision.stripe.rivals import choose, survey
-from cell.vision.stripe.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
+from cell.measure.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
 
 ASSUMED_CONTRAST = 0.15
 """Of the speckle where a picture shows too few lines to measure it."""

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from cell.compiled import compiled, compiled_fast
-from cell.vision.stripe.find import (
+from cell.base.compiled import compiled, compiled_fast
+from cell.measure.vision.stripe.ordinary.find import (
     BACKGROUND,
     CENTRE,
     CORE,
@@ -28,7 +28,7 @@ from cell.vision.stripe.find import (
     rival_limit,
     width_of,
 )
-from cell.vision.stripe.lanes import LANES
+from cell.measure.vision.stripe.ordinary.lanes import LANES
 
 PIXELS = 2 * SEARCH + 1
 # What is noted of a line: its brightest pixel's place and value, the largest value outside of the window there, and
