@@ -10,83 +10,82 @@ import os
 from pathlib import Path
 
 import pytest
-from xdist.scheduler import LoadFileScheduling
 
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests.report_runs import CONFIG, Ended, Ends, Make, pot
+from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 
 GROUPS = (
     # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
     (
-        "wire/test_commands.py",
-        "wire/test_serve.py",
-        "wire/test_one_authority.py",
-        "wire/test_whole_job.py",
-        "browser/test_screen.py",
+        "integration/wire/cell/test_commands.py",
+        "integration/wire/cell/test_serve.py",
+        "integration/wire/cell/test_one_authority.py",
+        "integration/wire/cell/test_whole_job.py",
+        "integration/browser/test_screen.py",
     ),
     # One device at a time; they mostly wait.
     (
-        "wire/test_rail_driver.py",
-        "wire/test_vehicle_driver.py",
-        "wire/test_modbus_rail.py",
-        "wire/test_contracts_over_wires.py",
-        "test_canopen_vehicle.py",
-        "wire/test_other_module.py",
-        "wire/test_other_vehicle.py",
-        "wire/test_other_drives.py",
-        "wire/test_other_master.py",
-        "wire/test_canopen_contract.py",
-        "wire/test_sim_rail.py",
-        "wire/test_sim_vehicle.py",
+        "integration/wire/rail/test_rail_driver.py",
+        "integration/wire/vehicle/test_vehicle_driver.py",
+        "integration/wire/rail/test_modbus_rail.py",
+        "integration/wire/cell/test_contracts_over_wires.py",
+        "integration/wire/vehicle/test_canopen_vehicle.py",
+        "integration/wire/rail/test_other_module.py",
+        "integration/wire/vehicle/test_other_vehicle.py",
+        "integration/wire/rail/test_other_drives.py",
+        "integration/wire/vehicle/test_other_master.py",
+        "integration/wire/vehicle/test_canopen_contract.py",
+        "integration/wire/rail/test_sim_rail.py",
+        "integration/wire/vehicle/test_sim_vehicle.py",
     ),
     # The arm; last those whose times are compared most closely: at first others still compile.
     (
-        "wire/test_sim_arm.py",
-        "wire/test_sim_arm_ports.py",
-        "wire/test_arm_others.py",
-        "wire/test_factory_kinematics.py",
-        "wire/test_last_words.py",
-        "wire/test_safe_stop_over_wires.py",
-        "wire/test_arm_endings.py",
-        "wire/test_arm_driver.py",
-        "wire/test_camera_driver.py",
-        "wire/test_gige_camera.py",
-        "wire/test_aravis_fake_camera.py",
-        "wire/test_sim_frames.py",
-        "wire/test_relay_boards.py",
-        "wire/test_robotiq_claw.py",
+        "integration/wire/arm/test_sim_arm.py",
+        "integration/wire/arm/test_sim_arm_ports.py",
+        "integration/wire/arm/test_arm_others.py",
+        "integration/wire/arm/test_factory_kinematics.py",
+        "integration/wire/safety/test_last_words.py",
+        "integration/wire/safety/test_safe_stop_over_wires.py",
+        "integration/wire/arm/test_arm_endings.py",
+        "integration/wire/arm/test_arm_driver.py",
+        "integration/wire/camera/test_camera_driver.py",
+        "integration/wire/camera/test_gige_camera.py",
+        "integration/wire/camera/test_aravis_fake_camera.py",
+        "integration/wire/camera/test_sim_frames.py",
+        "integration/wire/switches/test_relay_boards.py",
+        "integration/wire/switches/test_robotiq_claw.py",
     ),
     # The virtual job, and what is told of its ends.
     (
-        "test_virtual_door.py",
-        "test_report.py",
-        "test_report_page.py",
-        "test_figures.py",
-        "test_end_screen.py",
-        "test_direct_devices.py",
-        "test_described_jobs.py",
-        "test_verify_job.py",
-        "test_touch.py",
-        "test_confirmed_turn.py",
-        "test_quiet.py",
-        "test_unmoved.py",
-        "test_second_look.py",
-        "test_droop.py",
-        "test_causes.py",
-        "test_standing.py",
-        "test_timing.py",
-        "test_fixed_vehicle.py",
-        "test_record.py",
+        "integration/virtual/test_virtual_door.py",
+        "unit/cell/run/report/test_report.py",
+        "unit/cell/run/report/page/test_make.py",
+        "unit/cell/run/report/test_figures.py",
+        "unit/cell/apps/cli/test_end_screen.py",
+        "unit/cell/devices/simulated/test_direct.py",
+        "integration/virtual/test_described_jobs.py",
+        "integration/virtual/test_verify_job.py",
+        "unit/cell/procedures/arm/test_touch.py",
+        "unit/cell/procedures/verify/test_confirm.py",
+        "unit/cell/procedures/drive/test_settled.py",
+        "unit/cell/procedures/drive/test_station_check.py",
+        "unit/cell/procedures/sweep/test_second_look.py",
+        "unit/cell/measure/inversion/effects/test_droop.py",
+        "unit/cell/measure/inversion/effects/test_causes.py",
+        "unit/cell/measure/inversion/test_obstruction.py",
+        "unit/cell/measure/calibration/drift/test_timing_fit.py",
+        "unit/drivers/vehicle/test_fixed.py",
+        "unit/cell/run/record/test_recorder.py",
     ),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
-    ("test_calibration_archive.py",),
-    ("test_board_campaign.py",),
-    ("console", "browser"),
+    ("unit/cell/measure/calibration/test_archive.py",),
+    ("unit/lab/bench/board/test_campaign.py",),
+    ("integration/console", "integration/browser"),
     # Long ones begin early, so that no worker is left with one of them at the end.
-    ("recorded/test_recorded_calibration.py", "recorded/test_recorded_command.py"),
-    ("test_inversion.py",),
-    ("test_interlocks.py",),
-    ("test_calibration.py", "test_board_size.py"),
+    ("integration/recorded/test_recorded_calibration.py", "integration/recorded/test_recorded_command.py"),
+    ("unit/cell/measure/inversion/test_registration.py",),
+    ("unit/cell/devices/gate/test_interlocks.py",),
+    ("unit/cell/measure/calibration/solve/test_joint.py", "unit/cell/measure/calibration/judge/test_board_size.py"),
 )
 """Groups of files or folders in the order in which they begin, the wires first. Other files over the wires end the
 first one; any other is a group of its own, after them."""
@@ -96,8 +95,9 @@ VIRTUAL_JOB = 3
 
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
-SCREENS = (HERE / "browser", HERE / "console")
-ON_THE_WALL = frozenset((HERE / "wire", *SCREENS, HERE / "test_canopen_vehicle.py", HERE / "test_vehicle_bus.py"))
+WIRES = HERE / "integration" / "wire"
+SCREENS = (HERE / "integration" / "browser", HERE / "integration" / "console")
+ON_THE_WALL = (WIRES, *SCREENS, HERE / "unit" / "drivers" / "vehicle" / "test_agilex.py")
 WHOLE_CELL, COMPUTES = 5, 19
 """How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
 deadlines of seconds on the wall, and what only computes gets what the others leave."""
@@ -110,11 +110,12 @@ def place(file: Path) -> tuple[int, int]:
     for found in (file, file.parent):
         if found in PLACES:
             return PLACES[found]
-    return (0, len(GROUPS[0])) if file.parent == HERE / "wire" else (len(GROUPS), 0)
+    return (0, len(GROUPS[0])) if file.is_relative_to(WIRES) else (len(GROUPS), 0)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with what lasts longest.
+    """Begin with what lasts longest, a group of files on one worker.
 
     Devices keep deadlines on the wall, which more workers than cores cannot always: a failure there is looked at again
     a little later, and listed. What is wrong fails each time.
@@ -122,22 +123,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: place(item.path))
     again = config.pluginmanager.hasplugin("rerunfailures")
     for item in items:
-        if again and ON_THE_WALL.intersection((item.path, item.path.parent)):
+        group, _ = place(item.path)
+        item.add_marker(pytest.mark.xdist_group(str(item.path) if group == len(GROUPS) else f"group {group}"))
+        if again and any(item.path.is_relative_to(folder) for folder in ON_THE_WALL):
             item.add_marker(pytest.mark.flaky(reruns=3, reruns_delay=5))
-
-
-class Grouped(LoadFileScheduling):
-    """Gives a worker a whole group of files at a time."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        file = super()._split_scope(nodeid)
-        group, _ = place(self.config.rootpath / file)
-        return file if group == len(GROUPS) else f"group {group}"
-
-
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling | None:
-    """Files by their groups where the tests are distributed by file."""
-    return Grouped(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -160,7 +149,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if group >= VIRTUAL_JOB:
         wanted = COMPUTES
     else:
-        wanted = WHOLE_CELL if group == 0 or item.path.parent in SCREENS else 0
+        wanted = WHOLE_CELL if group == 0 or any(map(item.path.is_relative_to, SCREENS)) else 0
     if os.nice(0) < wanted:
         os.nice(wanted - os.nice(0))
 
@@ -176,7 +165,7 @@ def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
 
 @pytest.fixture(scope="session")
 def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ends:
-    """Gives the run that ends as `tests.report_runs` says; each is made once."""
+    """Gives the run that ends as `tests.support.report_runs` says; each is made once."""
     root = tmp_path_factory.mktemp("cell") / "runs"
     made: dict[Make, Ended] = {}
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.support import ROOT
+
 CODE = ("cell", "drivers", "statemachine", "sim_backends", "tests")
 DOCUMENT = re.compile(r"docs/[\w-]+\.md")
 # A citation may go on in the next line, with or without a comment's sign.

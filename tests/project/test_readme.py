@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +12,9 @@ import typer
 from cell.apps.cli.app import app
 from cell.procedures.steps.kinds import PLACE
 from statemachine.sequence import mermaid
+from tests.support import ROOT
 
-README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def block(language: str) -> str:

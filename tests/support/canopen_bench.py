@@ -19,7 +19,7 @@ from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
-from tests.inner_bus import Driven, InnerBus
+from tests.support.inner_bus import Driven, InnerBus
 
 RATE = 3.0
 TRACK = 0.58

@@ -14,6 +14,7 @@ from cell.apps.recordings.frames import RecordedFrame
 from cell.measure.vision.board.spec import parse_board
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.stripe.extract import StripeProfile
+from tests.support import ROOT
 
 SIZE = (1280, 1024)
 MATRIX = np.array([[1400.0, 0.0, 655.0], [0.0, 1405.0, 500.0], [0.0, 0.0, 1.0]])
@@ -24,7 +25,8 @@ SECOND_NORMAL, SECOND_FURTHER = cv2.Rodrigues(np.array([0.0, 0.15, 0.0]))[0] @ N
 BOARD = parse_board("chessboard:7x6:18mm")
 EDGE = 5
 DOTS_PX, STRIPE_PX = 0.08, 0.15
-RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", ROOT.parent / "shared" / "data"))
 
 
 def recording(name: str) -> Path:

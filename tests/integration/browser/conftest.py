@@ -8,8 +8,8 @@ import pytest
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-from tests.browser.screen import Console, Screen, browser_path, console_of, opened_browser  # noqa: E402
-from tests.browser.watcher import Watcher  # noqa: E402
+from tests.support.browser.screen import Console, Screen, browser_path, console_of, opened_browser  # noqa: E402
+from tests.support.browser.watcher import Watcher  # noqa: E402
 
 
 @pytest.fixture(scope="module")

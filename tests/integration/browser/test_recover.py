@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from tests.browser.pressing import idle
-from tests.browser.screen import Console, Screen
-from tests.browser.watcher import Watcher
-from tests.wire.cells import ask, served, started
+from tests.support.browser.pressing import idle
+from tests.support.browser.screen import Console, Screen
+from tests.support.browser.watcher import Watcher
+from tests.support.wire.cells import ask, served, started
 
 pytestmark = pytest.mark.wire
 

@@ -7,9 +7,9 @@ import time
 import pytest
 from playwright.sync_api import Browser, Route
 
-from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, leave, press
-from tests.browser.screen import LOCAL, Console, Screen
-from tests.browser.watcher import Watcher
+from tests.support.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, leave, press
+from tests.support.browser.screen import LOCAL, Console, Screen
+from tests.support.browser.watcher import Watcher
 
 # As in tests/wire: devices keep deadlines on the wall, which a busy machine cannot always.
 pytestmark = pytest.mark.wire

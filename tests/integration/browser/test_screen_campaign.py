@@ -13,10 +13,10 @@ import pytest
 from playwright.sync_api import Browser, Playwright
 
 from lab.bench.wires.soak import counted
-from tests.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, kill, press
-from tests.browser.screen import LOCAL, PHONE, Console, Screen, console_of, opened_browser
-from tests.browser.watcher import Watcher
-from tests.wire.cells import started
+from tests.support.browser.pressing import SEEN_S, STOPS_WITHIN_S, idle, joint, kill, press
+from tests.support.browser.screen import LOCAL, PHONE, Console, Screen, console_of, opened_browser
+from tests.support.browser.watcher import Watcher
+from tests.support.wire.cells import started
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 

@@ -17,7 +17,7 @@ from cell.apps.cli.commands.console import page_teller
 from cell.apps.console.host.console import Address, Console
 from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
-from tests.console.server import Browser, until
+from tests.support.console.server import Browser, until
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from cell.apps.console.messages import CloudPart, Picture, Show
 from lab.bench.wires.pages import cpu, looking
-from tests.console.server import Served, serving
+from tests.support.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign
 

@@ -26,7 +26,7 @@ from drivers.errors import CellError, ConfigError, InterlockError, LimitError, M
 from statemachine.policy import Failure, Outcome
 from statemachine.script import Again
 from statemachine.step import Event
-from tests.console.server import until
+from tests.support.console.server import until
 
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
 

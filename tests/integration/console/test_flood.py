@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from tests.console.server import Served, serving
+from tests.support.console.server import Served, serving
 
 WITHIN_S = 0.5
 SESSIONS, PER_S = 4, 250.0

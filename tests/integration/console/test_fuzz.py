@@ -19,7 +19,7 @@ from cell.apps.console.host.console import Console
 from cell.apps.console.messages import Answer, Beat, Do, Joined, Left
 from cell.apps.console.server.commands import COMMANDS, MESSAGES
 from cell.run.session.supervisor import Cell
-from tests.console.server import Served, serving
+from tests.support.console.server import Served, serving
 
 ODD: list[Any] = [
     10**400, -(10**400), 1e308, float("nan"), float("inf"), -0.0, 2**63, True, None, "", "x" * 3000, "\ud800", "\x00",

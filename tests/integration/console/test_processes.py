@@ -19,9 +19,9 @@ from cell.apps.console.host.rehearsal import Rehearsals
 from cell.apps.console.messages import Beat
 from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
-from tests.browser.screen import Console as Going
-from tests.browser.screen import console_of
-from tests.console.server import Browser, until
+from tests.support.browser.screen import Console as Going
+from tests.support.browser.screen import console_of
+from tests.support.console.server import Browser, until
 
 
 def running(pid: int) -> bool:

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from cell.apps.console.messages import Beat, CloudPart, Joined, Left, Show
 from cell.apps.console.server.access import Access
 from cell.apps.console.server.serve import PING_S
-from tests.console.server import Served, serving, until
+from tests.support.console.server import Served, serving, until
 
 TOKEN = "a-token-of-a-file-that-is-long-enough-0123456789"
 

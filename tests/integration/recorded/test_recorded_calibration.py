@@ -12,7 +12,7 @@ import pytest
 from cell.apps.recordings.command import calibrate_folder
 from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
-from tests.recorded_scenes import recording
+from tests.support.recorded_scenes import recording
 
 CHESS = parse_board("chessboard:7x6:10mm")
 RECORDED_FRAMES = range(2, 9)

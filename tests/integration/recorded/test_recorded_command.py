@@ -17,7 +17,7 @@ from cell.apps.cli.calibration.recorded_tables import verdicts
 from cell.apps.recordings.command import calibrate_folder
 from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
-from tests.recorded_scenes import recording
+from tests.support.recorded_scenes import recording
 
 pytestmark = pytest.mark.recorded
 

@@ -23,7 +23,7 @@ from cell.run.jogging import Jog, jog
 from cell.run.run import Run
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
-from tests.console.server import until
+from tests.support.console.server import until
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from cell import Cell
 from cell.config.calibrations.store import save_calibration
 from lab.bench.job.whole_job import JobRecord
-from tests.described_cells import Changes, described, pose, write_saddle
+from tests.support.described_cells import Changes, described, pose, write_saddle
 
 FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
 SADDLE: Changes = {

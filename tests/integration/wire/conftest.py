@@ -13,8 +13,8 @@ from cell import Cell
 from cell.apps.cli import main
 from cell.run.files.folder import list_runs
 from cell.run.files.reading import read_report
-from tests.test_readme import block
-from tests.wire.cells import Supervised
+from tests.project.test_readme import block
+from tests.support.wire.cells import Supervised
 
 
 @pytest.fixture(scope="session")

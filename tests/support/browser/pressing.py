@@ -8,8 +8,8 @@ from typing import Any
 
 from playwright.sync_api import Browser
 
-from tests.browser.screen import Screen
-from tests.browser.watcher import Watcher
+from tests.support.browser.screen import Screen
+from tests.support.browser.watcher import Watcher
 
 STOPS_WITHIN_S = 0.25
 SEEN_S = 0.15

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, Page, Playwright, Request, WebSocketRoute, expect
 
-from tests.wire.cells import started
+from tests.support.wire.cells import started
 
 WIDE, PHONE = (1280, 800), (390, 844)
 LINK = re.compile(r"https?://\S+/enter\?token=\S+")

@@ -23,7 +23,7 @@ from drivers.camera.genicam.connection import Setup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
-from tests.wire.gige_bench import require_aravis
+from tests.support.wire.gige_bench import require_aravis
 
 HOST = "127.0.0.1"
 TRIGGERS_HZ = 100.0

@@ -20,7 +20,7 @@ from drivers.interfaces import Frame
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec
 from sim_backends.peers.camera.gige import GigePeer
-from tests.wire.clocks import ahead
+from tests.support.wire.clocks import ahead
 
 SPEED = 3.0
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)

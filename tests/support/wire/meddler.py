@@ -6,7 +6,7 @@ import socket
 import struct
 from collections.abc import Callable, Iterable
 
-from cable import Cable
+from tests.support.wire.cable import Cable
 
 RTDE = 30004
 HEADER = struct.Struct(">HB")

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm_bench import ArmBench, soon, stand_at_home
 from scipy.spatial.transform import Rotation
 
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Arm, ArmSafety
+from tests.support.wire.arm_bench import ArmBench, soon, stand_at_home
 
 pytestmark = pytest.mark.wire
 

@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from arm_bench import HOME, ArmBench, soon, stand_at_home
-from cable import Cable
 
 from cell.devices.devices import Devices
 from cell.devices.gate.gate import Gate
@@ -26,6 +24,8 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import ArmSafety
+from tests.support.wire.arm_bench import HOME, ArmBench, soon, stand_at_home
+from tests.support.wire.cable import Cable
 
 pytestmark = pytest.mark.wire
 

@@ -10,8 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arm_bench import ArmBench, soon
-from cable import Cable
 
 from cell.measure.geometry.poses import to_ur
 from cell.motion.arm_models import arm_kinematics
@@ -20,6 +18,8 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
 from drivers.interfaces import ArmSafety
+from tests.support.wire.arm_bench import ArmBench, soon
+from tests.support.wire.cable import Cable
 
 pytestmark = pytest.mark.wire
 

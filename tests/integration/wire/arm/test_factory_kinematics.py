@@ -9,8 +9,6 @@ import threading
 import numpy as np
 import pinocchio as pin
 import pytest
-from arm_bench import ArmBench
-from cable import Cable
 
 from cell.devices.diagnosis.diagnosis import _arm_state
 from cell.measure.geometry.poses import to_ur
@@ -20,6 +18,8 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault
 from drivers.interfaces import why_untold
+from tests.support.wire.arm_bench import ArmBench
+from tests.support.wire.cable import Cable
 
 pytestmark = pytest.mark.wire
 

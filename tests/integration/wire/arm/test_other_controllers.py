@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable
 
 import pytest
-from arm_bench import ArmBench
-from meddler import Change, Meddler, packet
 
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
+from tests.support.wire.arm_bench import ArmBench
+from tests.support.wire.meddler import Change, Meddler, packet
 
 pytestmark = pytest.mark.wire
 

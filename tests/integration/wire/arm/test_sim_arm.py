@@ -13,7 +13,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -26,11 +25,11 @@ from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 from drivers.clock import Clock
+from tests.support import ROOT
 
 pytestmark = pytest.mark.wire
 
 SPEED = 5.0
-ROOT = Path(__file__).parents[2]
 CLOCK = Clock()
 DH = [
     (0.0, 0.1807, math.pi / 2),

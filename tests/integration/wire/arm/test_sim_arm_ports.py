@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from itertools import islice, pairwise
 
 import pytest
-from arm_bench import ArmBench
+
+from tests.support.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
 

@@ -11,7 +11,7 @@ from cell.devices.contracts import Bench
 from cell.devices.contracts.camera import EXPOSURE_S, PATIENCE_S, RATE_HZ, CameraContract
 from drivers.clock import Clock
 from drivers.interfaces import Camera
-from tests.wire.aravis_fake import fake_camera, opened
+from tests.support.wire.aravis_fake import fake_camera, opened
 
 # This camera sends a picture in one burst and sends nothing again: what the receiver is too late for is lost.
 pytestmark = pytest.mark.wire

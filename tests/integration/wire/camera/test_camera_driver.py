@@ -35,7 +35,7 @@ from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
 from sim_backends.peers.camera.frame_wire import message
 from sim_backends.peers.camera.frames import CameraSpec, FramePeer
-from tests.wire.clocks import ahead
+from tests.support.wire.clocks import ahead
 
 SPEED = 4.0
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)

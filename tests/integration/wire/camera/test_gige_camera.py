@@ -22,7 +22,7 @@ from drivers.camera.genicam.settings import Region, Trigger
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Camera
-from tests.wire.gige_bench import SPEC, WHOLE, Bench, require_aravis, served
+from tests.support.wire.gige_bench import SPEC, WHOLE, Bench, require_aravis, served
 
 pytestmark = pytest.mark.wire
 

@@ -10,7 +10,7 @@ import pytest
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from sim_backends.world.world import World
-from tests.wire.aravis_fake import fake_camera, opened
+from tests.support.wire.aravis_fake import fake_camera, opened
 
 # Aravis' camera sends a picture in one burst and sends nothing again: what the receiver is too late for is lost.
 pytestmark = pytest.mark.wire

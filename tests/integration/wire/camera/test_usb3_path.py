@@ -20,7 +20,7 @@ from drivers.camera.genicam.connection import Setup
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
 from drivers.interfaces import Camera
-from tests.wire.gige_bench import require_aravis
+from tests.support.wire.gige_bench import require_aravis
 
 pytestmark = pytest.mark.wire
 

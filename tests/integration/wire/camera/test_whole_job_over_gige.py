@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from cell.config.cell_config import default_toml
-from tests.wire.cells import cell
-from tests.wire.gige_bench import require_aravis
+from tests.support.wire.cells import cell
+from tests.support.wire.gige_bench import require_aravis
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 

@@ -19,8 +19,8 @@ from cell.devices.assembly import connect
 from cell.devices.lock import CellLock
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.errors import InterlockError, NotConnectedError
-from tests.packages import RAIL, install, with_acme_rail
-from tests.wire.cells import ask, cell, served
+from tests.support.packages import RAIL, install, with_acme_rail
+from tests.support.wire.cells import ask, cell, served
 
 pytestmark = pytest.mark.wire
 

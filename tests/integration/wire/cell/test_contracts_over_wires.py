@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cell.makes.table import make_of
-from tests.wire.cells import served
+from tests.support.wire.cells import served
 
 pytestmark = pytest.mark.wire
 

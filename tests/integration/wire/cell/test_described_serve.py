@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from cell.config.cell_config import load_config
-from tests.described_cells import described, write_saddle
-from tests.test_described_jobs import SADDLE
-from tests.wire.cells import ask, served
+from tests.integration.virtual.test_described_jobs import SADDLE
+from tests.support.described_cells import described, write_saddle
+from tests.support.wire.cells import ask, served
 
 pytestmark = pytest.mark.wire
 

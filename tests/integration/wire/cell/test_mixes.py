@@ -19,10 +19,10 @@ from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.described_cells import changed, described, pose
-from tests.wire.cells import SPEED, served
-from tests.wire.cells import cell as command
-from tests.wire.gige_bench import require_aravis
+from tests.support.described_cells import changed, described, pose
+from tests.support.wire.cells import SPEED, served
+from tests.support.wire.cells import cell as command
+from tests.support.wire.gige_bench import require_aravis
 
 pytestmark = pytest.mark.wire
 

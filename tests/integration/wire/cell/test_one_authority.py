@@ -21,7 +21,7 @@ from cell.run.run import Run
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from statemachine.journal import request
-from tests.wire.cells import ask, assert_safe, cell, served, started
+from tests.support.wire.cells import ask, assert_safe, cell, served, started
 
 pytestmark = pytest.mark.wire
 

@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 
 from cell.config.cell_config import default_toml
-from tests.wire.cells import cell, served
+from tests.support import ROOT
+from tests.support.wire.cells import cell, served
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 BLOCKS = re.findall(
     r"```toml\n(.*?)```",
-    (Path(__file__).parents[2] / "docs" / "other-makes.md").read_text(encoding="utf-8"),
+    (ROOT / "docs" / "other-makes.md").read_text(encoding="utf-8"),
     re.DOTALL,
 )
 

@@ -14,7 +14,7 @@ from cell.run.files.reading import awaited_word
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from statemachine.journal import request
-from tests.wire.cells import ask, cell, served, started, wait_for_step
+from tests.support.wire.cells import ask, cell, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.wire.cells import cell
+from tests.support.wire.cells import cell
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 

@@ -12,7 +12,7 @@ import pytest
 from cell.apps.watch.watch import watching
 from cell.config.cell_config import load_config
 from drivers.clock import Clock
-from tests.wire.cells import served, started
+from tests.support.wire.cells import served, started
 
 pytestmark = pytest.mark.wire
 

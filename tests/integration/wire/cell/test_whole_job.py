@@ -20,8 +20,8 @@ from cell.run.files.reading import read_report
 from cell.run.record.export import as_candump
 from cell.run.record.information import information
 from drivers.vehicle.agilex_link import load_database
-from tests.wire.cells import Supervised, assert_safe, served, started, wait_for_step
-from tests.wire.conftest import supervise
+from tests.integration.wire.conftest import supervise
+from tests.support.wire.cells import Supervised, assert_safe, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 

@@ -33,7 +33,7 @@ from drivers.rail.modbus.registers import Action
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.modbus_drive import ModbusDrive, ModbusPeer
-from tests.modbus_maps import EDGES, PATHS, RAIL
+from tests.support.modbus_maps import EDGES, PATHS, RAIL
 
 pytestmark = pytest.mark.wire
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import can
 import pytest
-from other_drives import OtherDrives
 
 from cell.makes.canopen_nodes import look_at_nodes
 from drivers.clock import Clock
@@ -18,7 +17,8 @@ from drivers.errors import DeviceFault
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
-from tests.test_canopen_parts import config
+from tests.support.wire.other_drives import OtherDrives
+from tests.unit.drivers.vehicle.cia402.test_feedback import config
 
 pytestmark = pytest.mark.wire
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from other_module import NAMES, Order, OtherModule
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.rail.tmcl.rail import TmclRail
+from tests.support.wire.other_module import NAMES, Order, OtherModule
 
 pytestmark = pytest.mark.wire
 ACCELERATION, SPEED = 1.0, 0.05

@@ -35,7 +35,7 @@ from drivers.rail.tmcl.rail import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.wire.clocks import ahead
+from tests.support.wire.clocks import ahead
 
 SPEED = 5.0
 MAX_SPEED = 0.05

@@ -20,7 +20,7 @@ from sim_backends.models import ramp
 from sim_backends.models.rail import RailModel, RailParams, RailSettings
 from sim_backends.models.screw import Screw
 from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.wire.clocks import until
+from tests.support.wire.clocks import until
 
 STEPS = 200 * 256
 LEAD = 0.002

@@ -16,7 +16,7 @@ from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.wire.arm_bench import ArmBench
+from tests.support.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
 

@@ -17,8 +17,8 @@ from websockets.sync.client import ClientConnection
 from cell.apps.console.host.console import Console
 from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
-from tests.console.server import until
-from tests.console.test_console import Browser
+from tests.integration.console.test_console import Browser
+from tests.support.console.server import until
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 

@@ -17,7 +17,7 @@ from cell.run.files.reading import read_report, run_row
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from tests.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
+from tests.support.wire.cells import ask, assert_safe, cell, served, started, wait_for_step
 
 # Long runs over the wires of what the virtual clock shows in seconds.
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from drivers.clock import Clock
-from tests.wire.cells import ask, served
+from tests.support.wire.cells import ask, served
 
 pytestmark = pytest.mark.wire
 

@@ -11,7 +11,7 @@ from cell.config.cell_config import load_config
 from cell.devices.assembly import connect
 from drivers.errors import Aborted
 from statemachine.cancel import CancelToken
-from tests.wire.cells import ask, assert_safe, served
+from tests.support.wire.cells import ask, assert_safe, served
 
 pytestmark = pytest.mark.wire
 

@@ -16,7 +16,7 @@ from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.canopen import CanopenPeer
-from tests.canopen_bench import SETTINGS, TRACK, WHEELS
+from tests.support.canopen_bench import SETTINGS, TRACK, WHEELS
 
 pytestmark = pytest.mark.wire
 

@@ -14,7 +14,7 @@ from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockErr
 from drivers.vehicle.cia402.last_words import last_words
 from sim_backends.models.wheel_drive import State
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort
-from tests.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
+from tests.support.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 
 RAMP_WALL_S = 0.3
 """From 0.3 m/s to standstill, and the time to notice, on the wall at three times its pace."""

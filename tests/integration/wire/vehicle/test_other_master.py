@@ -12,7 +12,7 @@ from canopen.objectdictionary import ODVariable as Variable
 from canopen.profiles.p402 import BaseNode402
 from canopen.sdo.exceptions import SdoAbortedError
 
-from tests.canopen_bench import Bench
+from tests.support.canopen_bench import Bench
 
 pytestmark = pytest.mark.wire
 

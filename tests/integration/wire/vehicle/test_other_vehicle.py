@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from typing import Literal
 
 import pytest
-from other_vehicle import OtherVehicle
 
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
 from drivers.vehicle.agilex import AgilexVehicle
+from tests.support.wire.other_vehicle import OtherVehicle
 
 pytestmark = pytest.mark.wire
 

@@ -9,7 +9,6 @@ import struct
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import can
@@ -20,9 +19,10 @@ import pytest
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, State, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.wire.clocks import until
+from tests.support import ROOT
+from tests.support.wire.clocks import until
 
-DBC = Path(__file__).parents[2] / "drivers" / "vehicle" / "agilex_v2.dbc"
+DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
 
 
 def vehicle(seed: int = 1, **params: Any) -> VehicleModel:

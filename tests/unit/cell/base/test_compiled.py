@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support import ROOT
+
 WITHOUT_NUMBA = """
 import sys, warnings
 
@@ -42,7 +44,7 @@ from cell.measure.vision import stripe
 from lab.bench.stripe.truth import Cell, draw
 from cell.procedures.sweep.swath import rehearse
 from cell.measure.vision import StripeStream
-from test_reconstruction import GEOMETRY
+from tests.unit.cell.measure.reconstruction.test_build import GEOMETRY
 
 def loaded():
     found = pkgutil.walk_packages(stripe.__path__, f"{stripe.__name__}.")
@@ -61,9 +63,7 @@ print(sum(before.values()) < sum(rehearsed.values()), loaded() == rehearsed)
 
 
 def test_nothing_is_loaded_or_compiled_any_more_when_a_sweep_has_begun() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", REHEARSED], capture_output=True, text=True, timeout=300, cwd=Path(__file__).parent
-    )
+    done = subprocess.run([sys.executable, "-c", REHEARSED], capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert done.stdout.split() == ["True", "True"], done.stdout + done.stderr
 
 

@@ -14,7 +14,7 @@ from cell.devices.stopping import require_healthy, require_no_emergency_stop, st
 from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, DeviceFault
 from statemachine.cancel import CancelToken
-from tests.test_fixed_vehicle import fixed_cell
+from tests.unit.drivers.vehicle.test_fixed import fixed_cell
 
 CONFIG = load_config(None)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,14 +25,15 @@ from drivers.rail.modbus.registers import Number, Rate
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World
-from tests.modbus_maps import EDGES, PATHS, RAIL
-from tests.test_direct_contracts import DirectFaults
+from tests.integration.virtual.test_direct_contracts import DirectFaults
+from tests.support import ROOT
+from tests.support.modbus_maps import EDGES, PATHS, RAIL
 
 PRINTED = [
     tomllib.loads(block)
     for block in re.findall(
         r"```toml\n(.*?)```",
-        (Path(__file__).parent.parent / "docs" / "other-makes.md").read_text(encoding="utf-8"),
+        (ROOT / "docs" / "other-makes.md").read_text(encoding="utf-8"),
         re.DOTALL,
     )
 ]

@@ -20,7 +20,7 @@ from cell.makes.table import installed
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Rail
-from tests.packages import RAIL, install, with_acme_rail
+from tests.support.packages import RAIL, install, with_acme_rail
 
 TWIN = """
 from typing import Literal

@@ -14,7 +14,7 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.pace import LEAST, Pace
 from cell.procedures.steps.drive_to_target import drive_to_target
 from drivers.errors import ConfigError
-from tests.test_whereabouts import JOB, VEHICLE_FROM_BASE, Site
+from tests.unit.cell.procedures.drive.test_whereabouts import JOB, VEHICLE_FROM_BASE, Site
 
 CONFIG = load_config(None)
 

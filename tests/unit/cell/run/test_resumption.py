@@ -14,8 +14,6 @@ from typing import Any, cast
 import numpy as np
 import pinocchio as pin
 import pytest
-from test_rail_sweep import CONFIG, sweep
-from test_stored_calibration import made
 
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
@@ -37,6 +35,8 @@ from drivers.interfaces import Frame
 from lab.bench.job.whole_job import NoFrames
 from statemachine.journal import FILE_NAME, Journal
 from statemachine.step import Event, StepContext
+from tests.unit.cell.config.calibrations.test_store import made
+from tests.unit.cell.procedures.sweep.test_rail_sweep import CONFIG, sweep
 
 CALIBRATION = made()
 SIGMA_M, SIGMA_RAD = 1e-4, 2e-4

@@ -21,7 +21,7 @@ from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.inner_bus import Driven, InnerBus
+from tests.support.inner_bus import Driven, InnerBus
 
 RATE = 4.0
 TRACK = 0.583

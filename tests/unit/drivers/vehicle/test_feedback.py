@@ -9,7 +9,7 @@ from drivers.interfaces import LinkStatistics
 from drivers.vehicle.faults import driver_trouble, system_trouble
 from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, Feedback
 from drivers.vehicle.version import VersionAnswer
-from tests.inner_bus import Hand
+from tests.support.inner_bus import Hand
 
 
 class Bench:

@@ -13,7 +13,6 @@ import pytest
 from cell import Cell
 from cell.check.fit import require_fit
 from cell.check.place import way_problems
-from cell.config import job as job_module
 from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import load_job
@@ -31,9 +30,10 @@ from drivers.errors import ConfigError, InterlockError, NotConnectedError, Refus
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
 from lab.bench.job.whole_job import JobRecord
+from tests.support import ROOT
 
 JOB = load_job("pot")[0]
-JOB_FILE = Path(job_module.__file__).parent / "jobs" / "pot.toml"
+JOB_FILE = ROOT / "cell" / "jobs" / "pot.toml"
 
 
 class TestFixedVehicle(DeviceContract):

@@ -12,6 +12,7 @@ from cell.apps.cli import completion as completing
 from cell.config.cell_config import DEVICES
 from cell.config.job import shipped_jobs
 from sim_backends.world.effects import Effects
+from tests.support import ROOT
 
 ASK = """
 source <(cell --show-completion bash)
@@ -36,7 +37,7 @@ def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
     command.parent.mkdir()
     command.write_text(f"#!{sys.executable}\nfrom cell.apps.cli import main\nmain()\n")
     command.chmod(0o755)
-    environment = {"PATH": f"{command.parent}:/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parent.parent)}
+    environment = {"PATH": f"{command.parent}:/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
     told = subprocess.run(
         ["/bin/bash", "--norc", "-c", ASK], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
     )

@@ -16,8 +16,8 @@ from cell.run.files.folder import new_run, write_json
 from cell.run.files.reading import read_report, run_row
 from drivers.errors import CellError
 from statemachine.journal import Journal
-from tests import report_runs
-from tests.report_runs import NAMES, Ended, Ends, Make
+from tests.support import report_runs
+from tests.support.report_runs import NAMES, Ended, Ends, Make
 
 MAKES: list[tuple[Make, str]] = [
     (report_runs.placed, "placed"),

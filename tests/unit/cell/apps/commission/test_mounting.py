@@ -27,6 +27,7 @@ from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError, RefusedError
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import ArmModel, ArmParams
+from tests.support import ROOT
 
 DRAWN = from_parts((0.09, -0.05, 0.08), pin.rpy.rpyToMatrix(0.0, 0.0, math.radians(90.0)))
 
@@ -258,5 +259,5 @@ def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
 
 
 def test_the_documents_table_is_current() -> None:
-    text = (Path(__file__).parent.parent / "docs" / "commission.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "commission.md").read_text(encoding="utf-8")
     assert table() in text

@@ -23,7 +23,7 @@ from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.vision import parse_board
 from drivers.errors import DeviceFault
-from tests.described_cells import described
+from tests.support.described_cells import described
 
 SEED = 3
 

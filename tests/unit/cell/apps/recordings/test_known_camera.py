@@ -12,9 +12,9 @@ from cell.base.storage import sealed, write_json
 from cell.measure.calibration.solve.intrinsics import choose_lens
 from cell.measure.geometry.camera import CameraModel
 from drivers.errors import ConfigError, RefusedError
-from tests import recorded_scenes
-from tests.recorded_scenes import LENS, MATRIX, SIZE, scene
-from tests.test_no_confident_wrong_answer import right, solved
+from tests.support import recorded_scenes
+from tests.support.recorded_scenes import LENS, MATRIX, SIZE, scene
+from tests.unit.cell.apps.recordings.test_solution import right, solved
 
 SENSIBLE = CameraModel(1280, 960, 1400, 1400, 650, 470)
 

@@ -19,8 +19,8 @@ from cell.apps.recordings.texts import Record
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.vision.board.board import board_pose
 from drivers.errors import ConfigError
-from tests.recorded_scenes import BOARD, DOTS_PX, FLANGE_FROM_CAMERA, LENS, MATRIX, SIZE, scene
-from tests.test_no_confident_wrong_answer import right, solved
+from tests.support.recorded_scenes import BOARD, DOTS_PX, FLANGE_FROM_CAMERA, LENS, MATRIX, SIZE, scene
+from tests.unit.cell.apps.recordings.test_solution import right, solved
 
 
 def repeated(frames: list[RecordedFrame], times: int) -> list[RecordedFrame]:

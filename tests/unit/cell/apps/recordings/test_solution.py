@@ -27,7 +27,7 @@ from cell.measure.calibration.solve.intrinsics import choose_lens
 from cell.measure.calibration.solve.joint import solve_staged, start_state, view_data
 from cell.measure.geometry.camera import CameraModel
 from drivers.errors import RefusedError
-from tests.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
+from tests.support.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
 
 Z = 3.5
 PLACE = 0.40

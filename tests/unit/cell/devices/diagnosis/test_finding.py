@@ -19,7 +19,7 @@ from cell.config.cell_config import CellConfig, default_toml, load_config
 from cell.devices.diagnosis.finding import ask_module, configured, find, gige_camera
 from cell.devices.diagnosis.local_devices import Found, barred, cameras, can_interfaces, opened_by, serial_ports
 from cell.devices.lock import CellLock, who_holds
-from tests.wire.other_module import OtherModule
+from tests.support.wire.other_module import OtherModule
 
 
 def write(root: Path, **files: str) -> Path:

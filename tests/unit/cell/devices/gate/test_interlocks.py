@@ -33,10 +33,11 @@ from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, Int
 from drivers.interfaces import Laser
 from sim_backends.models.arm import Power
 from sim_backends.models.arm_kinematics import Kinematics
+from tests.support import ROOT
 
 CONFIG = load_config(None)
 LASER = CONFIG.laser.output
-DOCUMENT = Path(__file__).parent.parent / "docs" / "interlocks.md"
+DOCUMENT = ROOT / "docs" / "interlocks.md"
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from sim_backends.world.drawing import STOCK, Drawing, read
 from sim_backends.world.nominal import inverse
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
-from tests.described_cells import Changes, Numbers, described, pose, saddle, write_saddle
+from tests.support.described_cells import Changes, Numbers, described, pose, saddle, write_saddle
 
 
 def drawing(folder: Path, config: Changes | None = None, job: Changes | None = None) -> Drawing:

@@ -20,7 +20,7 @@ from lab.bench.job.expected import mean_distance
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
-from tests.report_runs import pot
+from tests.support.report_runs import pot
 
 CONFIG = load_config(None)
 Run = dict[str, Any]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import perturbed
 from cell.measure.inversion import Prior, invert_pose
 from drivers.errors import RefusedError
-from tests.test_inversion import JOB, TRUE, freeform, nominal, scanned
+from tests.unit.cell.measure.inversion.test_registration import JOB, TRUE, freeform, nominal, scanned
 
 Array = NDArray[np.float64]
 PITCH = 0.005

@@ -12,7 +12,7 @@ from cell.measure.inversion.correlated_errors import PATCH_M, shared_by_patches
 from cell.measure.inversion.correspondences import SIGMA_FLOOR, Scan
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction import Cloud
-from tests.test_inversion import BOARD, JOB, TRUE, ledges, nominal, scanned
+from tests.unit.cell.measure.inversion.test_registration import BOARD, JOB, TRUE, ledges, nominal, scanned
 
 Array = NDArray[np.float64]
 FORM = np.random.default_rng(5).standard_normal((40, 40))

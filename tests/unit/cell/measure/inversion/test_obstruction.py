@@ -19,7 +19,7 @@ from cell.procedures.steps.place import STEP
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.runner import StepContext
-from tests.report_runs import CONFIG, at_station, pot, work_of
+from tests.support.report_runs import CONFIG, at_station, pot, work_of
 
 
 def with_chip(

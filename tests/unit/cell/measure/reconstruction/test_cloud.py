@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from test_reconstruction import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
 
 from cell.measure.geometry.poses import from_ur, to_ur
 from cell.measure.reconstruction import (
@@ -25,6 +24,7 @@ from cell.motion.track import FlangeTrack
 from drivers.clock_map import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
+from tests.unit.cell.measure.reconstruction.test_build import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

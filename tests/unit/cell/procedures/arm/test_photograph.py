@@ -21,7 +21,7 @@ from cell.procedures.arm.photograph import BoardFix, photograph
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
 from sim_backends.world.nominal import inverse
-from tests.test_stored_calibration import made
+from tests.unit.cell.config.calibrations.test_store import made
 
 CONFIG = load_config(None)
 JOB, _ = load_job("pot")

@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 import pytest
-from test_rail_sweep import CONFIG, ERRORS, GEOMETRY, SCAN
 
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
@@ -20,6 +19,7 @@ from cell.procedures.sweep.swath import Collector, Swath
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
 from sim_backends.direct.arm import DirectArm
+from tests.unit.cell.procedures.sweep.test_rail_sweep import CONFIG, ERRORS, GEOMETRY, SCAN
 
 LENGTH = 0.02
 

@@ -32,7 +32,7 @@ from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
 from sim_backends.world.world import World
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext
-from tests.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
+from tests.support.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
 
 
 def slid(cell: VirtualCell, shift: tuple[float, float], turn: float = 0.0) -> None:

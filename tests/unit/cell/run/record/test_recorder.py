@@ -43,7 +43,8 @@ from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink
 from lab.bench.job.whole_job import JobRecord
-from tests.report_runs import CONFIG
+from tests.support import ROOT
+from tests.support.report_runs import CONFIG
 
 Messages = dict[str, list[tuple[int, Any]]]
 """By topic: times in ns and messages."""
@@ -559,6 +560,6 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
 def test_the_documentation_lists_the_channels() -> None:
     from cell.run.record.channels import table
 
-    text = (Path(__file__).parents[1] / "docs" / "record.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "record.md").read_text(encoding="utf-8")
     assert table() in text
     assert len({topic for channel in CHANNELS for topic in channel.topics}) == len(BY_TOPIC)

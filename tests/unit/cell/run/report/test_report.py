@@ -27,10 +27,10 @@ from cell.run.report.report import strict
 from drivers.errors import CellError, Measured, RefusedError
 from drivers.interfaces import Frame
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests import report_runs
-from tests.report_runs import CONFIG, Ended, Ends, Make, pot
+from tests.support import ROOT, report_runs
+from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "report.md"
+DOCUMENT = ROOT / "docs" / "report.md"
 REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
     (report_runs.no_board, "drive_to_target", None, True, False),
     (report_runs.blurred_board, "drive_to_target", "board's dots off their places, RMS", True, False),

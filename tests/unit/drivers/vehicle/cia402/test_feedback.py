@@ -21,7 +21,8 @@ from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.objects import HEARTBEAT, MOTION, STATUS
 from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
 from drivers.vehicle.cia402.units import UnitCheck
-from tests.inner_bus import Hand
+from tests.support import ROOT
+from tests.support.inner_bus import Hand
 
 WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), 0.58, 0.5, 1.0)
 
@@ -215,7 +216,7 @@ def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
 
 
 def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
-    page = (Path(__file__).parent.parent / "docs" / "canopen.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "canopen.md").read_text(encoding="utf-8")
     printed = page.split("```toml\n")[1].split("```")[0]
     text = default_toml()
     path = tmp_path / "cell.toml"

@@ -24,7 +24,7 @@ from sim_backends.world.bodies.collisions import DECK, Collisions
 from sim_backends.world.drawing import read
 from sim_backends.world.truth import truth
 from sim_backends.world.world import World
-from tests.described_cells import described, pose
+from tests.support.described_cells import described, pose
 
 OVER_DECK = np.deg2rad([0.0, -100.0, 100.0, -90.0, -90.0, 0.0])
 

@@ -22,8 +22,9 @@ from cell.devices.gate.interlocks import Situation
 from cell.motion.bodies import BASE, PLACED, box, station_bodies
 from drivers.errors import ConfigError
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+from tests.support import ROOT
 
-PAGE = Path(__file__).parent.parent / "cell" / "console" / "page"
+PAGE = ROOT / "cell" / "apps" / "console" / "page"
 POSTURES = np.random.default_rng(5).uniform(-2.5, 2.5, (20, 6))
 
 

@@ -45,7 +45,7 @@ from cell.run.run import Run
 from drivers.errors import CalibrationStale, RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import scene
-from tests.test_rail_sweep import ERRORS, sweep
+from tests.unit.cell.procedures.sweep.test_rail_sweep import ERRORS, sweep
 
 CONFIG = load_config(None)
 CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)

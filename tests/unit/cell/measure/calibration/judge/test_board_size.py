@@ -13,7 +13,14 @@ from cell.measure.calibration.solve.cameras import adjust_target
 from cell.measure.calibration.solve.joint import Joint
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError
-from tests.test_calibration import BOARD, FLANGE_FROM_CAMERA, NOMINAL, PRIORS, RAIL, observe
+from tests.unit.cell.measure.calibration.solve.test_joint import (
+    BOARD,
+    FLANGE_FROM_CAMERA,
+    NOMINAL,
+    PRIORS,
+    RAIL,
+    observe,
+)
 
 
 @pytest.fixture(scope="module")

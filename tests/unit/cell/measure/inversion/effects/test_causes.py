@@ -15,7 +15,7 @@ from cell.procedures.steps.invert_pose import Lines
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests.report_runs import CONFIG, pot
+from tests.support.report_runs import CONFIG, pot
 
 VEHICLE = CONFIG.arm.vehicle_from_base.se3().inverse()
 NAMES = {

@@ -15,7 +15,7 @@ from cell.procedures.steps.invert_pose import Lines
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import NotObservable
 from lab.bench.job.whole_job import JobRecord
-from tests.report_runs import CONFIG, pot
+from tests.support.report_runs import CONFIG, pot
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,8 +9,8 @@ import pytest
 from cell.measure.vision.stripe.extract import StripeSettings, extract
 from lab.bench.stripe.truth import Cell
 from lab.bench.stripe.truth import draw as drawn
+from tests.support.recorded_scenes import RECORDED
 
-RECORDED = Path(os.environ.get("CELL_RECORDED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 HEIGHT, WIDTH = 480, 640
 PHOTONS_ONLY = StripeSettings(speckle_contrast=0.0)
 

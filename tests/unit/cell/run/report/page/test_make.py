@@ -26,8 +26,8 @@ from cell.run.report.page.trend import past_runs
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import Journal
-from tests import report_runs
-from tests.report_runs import Ended, Ends, pot
+from tests.support import report_runs
+from tests.support.report_runs import Ended, Ends, pot
 
 VOID = {"meta", "img", "line", "rect", "circle"}
 
