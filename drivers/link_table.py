@@ -13,7 +13,8 @@ _MOST = {"theta": 100.0, "a": 10.0, "d": 10_000.0, "alpha": 2.0 * math.pi}
 
 @dataclass(frozen=True)
 class LinkTable:
-    """One number a joint, each tuple (6,): theta and alpha in rad, a and d in m (docs/protocols.md, section 1).
+    """One number a joint, each tuple (6,): theta and alpha in rad, a and d in m (docs/reference/protocols.md, section
+    1).
 
     A link turns about z by the joint's angle plus theta, moves along z by d, along the new x by a, and turns about it
     by alpha. In a factory table d of joints 2 to 4 may be hundreds of metres and cancel: their axes are almost

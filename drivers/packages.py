@@ -1,6 +1,7 @@
 """Packages that not every platform has a wheel of: imported when they are needed, and asked for by name.
 
-Which platforms those are is said once, by the markers of `pyproject.toml`; docs/platforms.md shows what that leaves.
+Which platforms those are is said once, by the markers of `pyproject.toml`; docs/reference/platforms.md shows what that
+leaves.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def lacking(module: str, package: str) -> str:
         return f"{package} is not installed for {here}: pip install '{wanted.name}{wanted.specifier}'"
     return (
         f"{package} has no wheel for {here}. Install the cell with Python 3.12 on Linux x86-64, where it has one; "
-        "docs/platforms.md shows what works where"
+        "docs/reference/platforms.md shows what works where"
     )
 
 

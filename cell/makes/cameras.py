@@ -1,6 +1,6 @@
 """Makes of cameras that can be bought, and recordings: their records in `cell.toml` and how each is connected.
 
-docs/cameras.md tells what each key does, and what of it has run on what.
+docs/how-to/cameras.md tells what each key does, and what of it has run on what.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class CanVehicleConfig(VehicleConfig):
 
 
 class CanopenVehicleConfig(CanVehicleConfig):
-    """Two wheel drives, left and right, of CiA 402; docs/canopen.md explains each key."""
+    """Two wheel drives, left and right, of CiA 402; docs/how-to/canopen.md explains each key."""
 
     CAUTION: ClassVar[str] = (
         "never run on a real drive: the first time with the wheels off the floor, and look which way each turns"

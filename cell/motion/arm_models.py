@@ -1,7 +1,7 @@
 """The arms that the cell knows by name: the maker's table, and how thick their links are.
 
 A controller's own table, calibrated in the factory, belongs to one of them: it is told apart here from that of another
-model. Sources: docs/protocols.md, section 1.
+model. Sources: docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class Unreachable(RefusedError):
 class DenavitHartenberg:
     """Table of an arm, by joint: d and a in m, alpha and theta in rad; theta is added to the joint's angle.
 
-    Default: UR10e (docs/protocols.md, section 1).
+    Default: UR10e (docs/reference/protocols.md, section 1).
     """
 
     d: tuple[float, ...] = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)

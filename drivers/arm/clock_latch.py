@@ -5,7 +5,7 @@ the states: the first that shows the number was measured after it was sent, and 
 tell the same clock, so this bounds the times of states that come by any of them, however late those are.
 
 What cannot be known from outside: how long the controller held the joints' angles back before it stamped them.
-Source: the maker's RTDE guide, version 2; docs/protocols.md, section 1.
+Source: the maker's RTDE guide, version 2; docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

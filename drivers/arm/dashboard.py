@@ -1,7 +1,7 @@
 """The arm's dashboard server: one line of text each way, for who the arm is and for what works without a program.
 
 A plain socket with a deadline on every call, so that it can stop the arm when everything else has failed.
-Source: the maker's dashboard reference; docs/protocols.md, section 1.
+Source: the maker's dashboard reference; docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Read once for each connection of the driver, over sockets of its own that send nothing. An arm that does not tell is no
 error here: the user's own model of it is compared with the flange that it reports, whatever that model rests on.
-Source: docs/protocols.md, section 1.
+Source: docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How an arm's stream of states comes, and what its controller tells of supply and temperatures.
 
 A connection of its own that only reads: an output recipe sets nothing. Limits that the maker does not publish are ours.
-Source: the maker's RTDE guide, version 2; docs/protocols.md, section 1.
+Source: the maker's RTDE guide, version 2; docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 `look` is the first use of it: does the arm speak as an e-series does? The vendor's library hangs, or fails without a
 reason, at a controller that answers otherwise. Here each question has its own answer in words.
 
-Source: the maker's RTDE guide, version 2; docs/protocols.md, section 1.
+Source: the maker's RTDE guide, version 2; docs/reference/protocols.md, section 1.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ Forward = Callable[[Vector], Vector]
 
 MOST_WAY, MOST_TURN = 0.05e-3, 0.1e-3
 """How far the two may be apart, m and rad. With the same table they agree to the last digits; with the maker's table
-instead of the factory's it is 2 to 4 mm and 7 to 15 mrad (docs/protocols.md, section 1)."""
+instead of the factory's it is 2 to 4 mm and 7 to 15 mrad (docs/reference/protocols.md, section 1)."""
 
 MOST_MASS, MOST_OFFSET = 1e-3, 1e-4
 """How far the payloads may be apart, kg and m: a controller shows what it was given."""

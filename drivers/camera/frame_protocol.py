@@ -1,4 +1,5 @@
-"""Messages of the frame stream protocol, version 1 (docs/frame-stream.md): magic, lengths, JSON header, payload."""
+"""Messages of the frame stream protocol, version 1 (docs/reference/frame-stream.md): magic, lengths, JSON header,
+payload."""
 
 from __future__ import annotations
 

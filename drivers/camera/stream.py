@@ -1,4 +1,4 @@
-"""A camera behind the frame stream protocol, version 1 (docs/frame-stream.md).
+"""A camera behind the frame stream protocol, version 1 (docs/reference/frame-stream.md).
 
 Frames carry the device's time of the start of their exposure, which is mapped to the host's clock through latches
 taken before each acquisition. A frame is handed out once and never as an answer to a later question.

@@ -1,7 +1,7 @@
 """The text protocol of a Robotiq gripper: variables that are read with GET and written with SET, over one TCP socket.
 
 Replies have no end mark: `ack` for a SET, `NAME value` for a GET. All of what the gripper knows is in the gripper, so a
-connection that was lost is simply made again by the next request. Source: docs/other-makes.md, section 3.
+connection that was lost is simply made again by the next request. Source: docs/how-to/other-makes.md, section 3.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Two families of relay boards: one that can be asked for its relays and inputs, and one that only listens.
 
-Sources: docs/other-makes.md, section 2.
+Sources: docs/how-to/other-makes.md, section 2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A skid-steered vehicle that speaks AgileX protocol v2 over CAN (docs/protocols.md, section 3).
+"""A skid-steered vehicle that speaks AgileX protocol v2 over CAN (docs/reference/protocols.md, section 3).
 
 The set velocity is kept alive by a thread of the driver, which falls back to zero when nobody renews it; the vehicle
 itself stops 0.5 s after the last command. Brake feedback is not on the bus: `braked` is what was commanded last, and

@@ -1,6 +1,6 @@
 """How the vehicle's CAN bus is used, how evenly its feedback comes, and what it tells of voltages and temperatures.
 
-Limits that nobody publishes are ours. Source: docs/protocols.md, section 3; error counters: ISO 11898-1.
+Limits that nobody publishes are ours. Source: docs/reference/protocols.md, section 3; error counters: ISO 11898-1.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Which platform and Python has wheels of what the cell needs, asked of the package index; writes docs/platforms.md.
+"""Which platform and Python has wheels of what the cell needs, asked of the package index; writes
+docs/reference/platforms.md.
 
-    python -m lab.bench.platforms docs/platforms.md
+    python -m lab.bench.platforms docs/reference/platforms.md
 
 The questions are those of an installation, put by `uv pip compile`: nothing is downloaded but what wheels say of
 themselves. What a platform has is what can be installed there; only where the docs say so was it run as well.
@@ -29,7 +30,7 @@ OPTIONAL = ("ur-rtde", "ompl", "embreex")
 HEAD = """# Platforms
 
 What `pip install -e .` finds on the package index: wheels of each package and of what it needs in turn. Asked on {date}
-by `python -m lab.bench.platforms docs/platforms.md`, which needs `uv` and writes this page.
+by `python -m lab.bench.platforms docs/reference/platforms.md`, which needs `uv` and writes this page.
 
 - Tested is Linux x86-64: Python 3.11 by the whole test suite, and the newest other Python that `.ci/run` finds by a dry
   run. The other rows say what can be installed, and were not run. The devices' drivers are for Linux.

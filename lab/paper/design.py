@@ -1,7 +1,8 @@
 """The design study behind the paper's Figure 2: error and light over the sensor for a baseline and a focal length.
 
-docs/theory.md, section 3. Two families of heads are told apart, because the paper mixes them: those whose light plane
-meets the optical axis at the same distance Z0 (θ follows from the baseline), and those with the same θ (Z0 follows).
+docs/explanation/theory.md, section 3. Two families of heads are told apart, because the paper mixes them: those whose
+light plane meets the optical axis at the same distance Z0 (θ follows from the baseline), and those with the same θ (Z0
+follows).
 """
 
 from __future__ import annotations
@@ -109,7 +110,8 @@ class Light:
 
 
 def row_power(head: Head, x: ArrayLike, light: Light) -> Array:
-    """Power in W that one image row receives from the stripe at x' in m: P_row of docs/theory.md, section 3."""
+    """Power in W that one image row receives from the stripe at x' in m: P_row of docs/explanation/theory.md, section
+    3."""
     xs = np.asarray(x, dtype=np.float64)
     z = head.depth(xs)
     cos = head.focal / np.hypot(head.focal, xs)

@@ -55,7 +55,7 @@ def eq4_printed(image: Array, theta_1: float, theta_2: float, distance: float, p
 def eq4_corrected(
     image: Array, theta_1: float, theta_2: float, distance: float, principal: float, tilt: float
 ) -> Array:
-    """X (n,) with the axial term L2 + x' sinβ, β the detector's tilt (docs/theory.md, section 13)."""
+    """X (n,) with the axial term L2 + x' sinβ, β the detector's tilt (docs/explanation/theory.md, section 13)."""
     flat, both = image * np.cos(tilt), theta_1 + theta_2
     below = (principal + image * np.sin(tilt)) * np.sin(both) + flat * np.cos(both)
     return np.asarray(flat * distance * np.cos(theta_1) / below, dtype=np.float64)

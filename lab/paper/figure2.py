@@ -1,6 +1,6 @@
 """Figure 2 in numbers: what 30 and 35 mm of baseline give, which rule chooses 35 mm, and where the paper is wrong.
 
-docs/theory.md, section 3; the functions behind it are in `design`, the picture in `figure2_pictures`.
+docs/explanation/theory.md, section 3; the functions behind it are in `design`, the picture in `figure2_pictures`.
 """
 
 from __future__ import annotations

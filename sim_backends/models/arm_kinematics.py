@@ -1,8 +1,8 @@
 """Kinematics of a six-axis arm from its Denavit-Hartenberg table: forward, Jacobian and numerical inverse.
 
 Angles are in rad, lengths in m. A pose is a (4, 4) matrix `base_from_flange` or the controller's 6-vector
-(x, y, z, rx, ry, rz) with a rotation vector. Sources: the maker's DH table (docs/protocols.md, section 1); damped
-least squares after Nakamura and Hanafusa 1986.
+(x, y, z, rx, ry, rz) with a rotation vector. Sources: the maker's DH table (docs/reference/protocols.md, section 1);
+damped least squares after Nakamura and Hanafusa 1986.
 """
 
 from __future__ import annotations

@@ -62,8 +62,8 @@ class CameraOptics:
     def blur_px(self, distance: float | Vector) -> float | Vector:
         """Standard deviation in pixels of point spread and defocus together at `distance` (m) along the axis.
 
-        Defocus is a disc of diameter (f/N) f |s2 − s1| / (s2 (s1 − f)) (docs/theory.md, section 4); a disc of
-        diameter b has the standard deviation b/4 along each axis.
+        Defocus is a disc of diameter (f/N) f |s2 − s1| / (s2 (s1 − f)) (docs/explanation/theory.md, section 4); a disc
+        of diameter b has the standard deviation b/4 along each axis.
         """
         disc = blur_disc(self.focal, self.f_number, self.focus_distance, distance) / self.pixel
         return np.sqrt(self.psf_px**2 + disc**2 / 16)

@@ -14,8 +14,8 @@ Image = NDArray[np.float32]
 def sensor(image_dn: Image, optics: CameraOptics, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Expose: `image_dn` (height, width) expected DN → uint8 picture.
 
-    Variance in DN² = DN / (electrons per DN) + read noise², drawn as a Gaussian (docs/theory.md, section 4); the same
-    state of `rng` gives the same picture.
+    Variance in DN² = DN / (electrons per DN) + read noise², drawn as a Gaussian (docs/explanation/theory.md, section
+    4); the same state of `rng` gives the same picture.
     """
     picture = np.empty(image_dn.shape, dtype=np.uint8)
     seed = rng.integers(0, 2**63, dtype=np.uint64)

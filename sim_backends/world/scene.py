@@ -229,7 +229,7 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
 
 
 def _light_plane(d: _Draws, sigma: Deviations, cell: CellDrawing) -> tuple[Vector, float, Vector]:
-    """Unit normal, distance and exit point, in C: as drawn X = −l + Z cot θ (docs/theory.md, section 2)."""
+    """Unit normal, distance and exit point, in C: as drawn X = −l + Z cot θ (docs/explanation/theory.md, section 2)."""
     plain = np.array([1.0, 0.0, -1.0 / cell.tan_theta])
     normal = rotation(d.vector("light_plane.tilt", sigma.light_plane_tilt)) @ (plain / np.linalg.norm(plain))
     origin = np.array([-cell.baseline, 0.0, 0.0]) + d.vector("light_plane.offset", sigma.light_plane_offset)

@@ -9,16 +9,16 @@ import pytest
 
 from tests.support import ROOT
 
-CODE = ("cell", "drivers", "statemachine", "sim_backends", "tests")
-DOCUMENT = re.compile(r"docs/[\w-]+\.md")
+CODE = ("cell", "drivers", "statemachine", "sim_backends", "lab", "tests")
+DOCUMENT = re.compile(r"docs/[\w/-]+\.md")
 # A citation may go on in the next line, with or without a comment's sign.
-SECTION = re.compile(r"(docs/[\w-]+\.md),\s+(?:#\s+)?sections?\s+(?:#\s+)?(\d+)")
+SECTION = re.compile(r"(docs/[\w/-]+\.md),\s+(?:#\s+)?sections?\s+(?:#\s+)?(\d+)")
 
 
 def texts() -> Iterator[tuple[str, str]]:
     """Path and content of each file of code, and of the documents themselves."""
     files = [path for room in CODE for path in (ROOT / room).rglob("*.py")]
-    for path in [*files, ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+    for path in [*files, ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
         yield str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
 
 
@@ -36,11 +36,11 @@ def test_every_document_that_is_named_exists() -> None:
 
 def test_every_section_that_is_cited_exists() -> None:
     cited = {(document, int(number), path) for path, text in texts() for document, number in SECTION.findall(text)}
-    assert {document for document, _, _ in cited} >= {"docs/theory.md", "docs/protocols.md"}
+    assert {document for document, _, _ in cited} >= {"docs/explanation/theory.md", "docs/reference/protocols.md"}
     assert [entry for entry in sorted(cited) if entry[1] not in sections(entry[0])] == []
 
 
-@pytest.mark.parametrize("document", ["docs/theory.md", "docs/protocols.md"])
+@pytest.mark.parametrize("document", ["docs/explanation/theory.md", "docs/reference/protocols.md"])
 def test_sections_are_numbered_without_gaps(document: str) -> None:
     assert sections(document) == list(range(1, len(sections(document)) + 1))
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import typer
 
+import lab.cli
 from cell.apps.cli.app import app
 from cell.procedures.steps.kinds import PLACE
 from statemachine.sequence import mermaid
@@ -37,7 +38,11 @@ def test_the_diagram_is_current() -> None:
 
 @pytest.mark.parametrize("line", command_lines())
 def test_every_command_that_is_shown_exists_with_its_options(line: str) -> None:
-    command: Any = typer.main.get_command(app)
+    # The laboratory's commands come by its entry point, where it is installed.
+    commands = typer.Typer() if line.startswith(("cell bench", "cell paper")) else app
+    if commands is not app:
+        lab.cli.register(commands)
+    command: Any = typer.main.get_command(commands)
     for word in shlex.split(line)[1:]:
         for name in word.split("|"):
             if name.startswith("--") or re.fullmatch(r"-[a-z]", name):

@@ -187,7 +187,7 @@ def chosen(only: Sequence[str], until: str | None) -> list[Check]:
 
 
 def table() -> str:
-    """The checks as the table of docs/commission.md."""
+    """The checks as the table of docs/how-to/commission.md."""
     rows = ["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|"]
     rows += [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
     return "\n".join(rows)

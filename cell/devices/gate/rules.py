@@ -1,6 +1,6 @@
 """The interlocks as a table: which commands each is asked for, what has to hold, and how that is looked up.
 
-`python -m cell.devices.gate.rules` prints the table of docs/interlocks.md; a test keeps that current.
+`python -m cell.devices.gate.rules` prints the table of docs/reference/interlocks.md; a test keeps that current.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Following:
             thread.join(2.0)
 
     def figures(self) -> dict[str, Any]:
-        """How late readings reach the world, for report and screen: see docs/report.md."""
+        """How late readings reach the world, for report and screen: see docs/reference/report.md."""
         told: dict[str, Any] = self._link.ask(op="figures")["figures"]
         return {**told, "clocks_known_ms": round(1e3 * self._clocks_known, 4)}
 

@@ -1,6 +1,7 @@
 """Where the middle of a printed dot is seen: the centre of its ellipse, which is not the image of its centre.
 
-For a dot of 1.2 mm radius at 130 mm the difference is .05 px at 20° and .07 px at 40° (docs/theory.md, section 6).
+For a dot of 1.2 mm radius at 130 mm the difference is .05 px at 20° and .07 px at 40° (docs/explanation/theory.md,
+section 6).
 """
 
 from __future__ import annotations

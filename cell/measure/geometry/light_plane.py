@@ -2,7 +2,7 @@
 
 The general form holds for any plane; the closed form of the paper (its equation 1, corrected) is the special case of a
 laser on the camera's x axis, kept because a test proves the two equal. A sheet may be bowed across the stripe's length:
-what lens and laser leave of it, a few hundredths of a millimetre. docs/theory.md, section 2.
+what lens and laser leave of it, a few hundredths of a millimetre. docs/explanation/theory.md, section 2.
 """
 
 from __future__ import annotations
@@ -101,8 +101,8 @@ class LightPlane:
     def intersect_with_jacobians(self, rays: ArrayLike) -> tuple[Array, Array, Array, Array]:
         """Points P (n, 3), ∂P/∂u (n, 3, 3), ∂P/∂n (n, 3, 3) and ∂P/∂d (n, 3) for unit rays u (n, 3).
 
-        ∂P/∂u = s(I − u nᵀ/(n·u)) with s = d/(n·u); ∂P/∂n = −P Pᵀ/d; ∂P/∂d = P/d (docs/theory.md, section 2). On a bowed
-        sheet n is its normal where the ray meets it.
+        ∂P/∂u = s(I − u nᵀ/(n·u)) with s = d/(n·u); ∂P/∂n = −P Pᵀ/d; ∂P/∂d = P/d (docs/explanation/theory.md,
+        section 2). On a bowed sheet n is its normal where the ray meets it.
         """
         u = np.atleast_2d(np.asarray(rays, dtype=np.float64))
         s = self._range(u)

@@ -16,7 +16,7 @@ from drivers.errors import Measured, NotObservable
 
 FREE = 1e-3
 """Smallest eigenvalue of the scan's information, per point and σ, below which a motion counts as not determined by the
-scan (docs/theory.md, section 9)."""
+scan (docs/explanation/theory.md, section 9)."""
 
 
 FEW = 0.01

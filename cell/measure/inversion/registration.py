@@ -1,8 +1,8 @@
 """Where the nominal surface lies in the scan: robust point-to-plane Gauss–Newton with the board's pose as a prior.
 
 The prior is anchored: its gradient pulls to the board's pose, so that a direction that the scan does not determine
-stays where the board put it (docs/theory.md, section 8). Correspondences are gated from coarse to fine. What the
-uncertainty means for the job is judged in `observability`.
+stays where the board put it (docs/explanation/theory.md, section 8). Correspondences are gated from coarse to fine.
+What the uncertainty means for the job is judged in `observability`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Fitted as if they lay right, two strips side by side turn what their heights differ by into a tilt. But every sweep sees
 the same surface, and how much its pose may be off is known: both together tell the errors apart. Least squares with
-one more unknown for each of them, known beforehand to its standard deviation (docs/theory.md, section 8).
+one more unknown for each of them, known beforehand to its standard deviation (docs/explanation/theory.md, section 8).
 """
 
 from __future__ import annotations

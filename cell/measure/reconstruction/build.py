@@ -1,8 +1,8 @@
 """From stripe profiles to the organised cloud: each profile is triangulated as it arrives, no frame is kept.
 
 Stripe pixel → ray → light plane while the frames come; carriage and flange → arm base once the sweep has ended and it
-is known where they were (paper, equation 2 with the calibrated sweep direction; docs/theory.md, section 2). What
-belongs to the surface and what does not is decided in `outliers`.
+is known where they were (paper, equation 2 with the calibrated sweep direction; docs/explanation/theory.md, section 2).
+What belongs to the surface and what does not is decided in `outliers`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Points of an organised cloud that do not lie on the surface around them.
 
 The depth of each point is compared with the median of its 5×5 neighbours (line × row), in units of its noise and of
-the deviations around it, so that near outliers and streaks stand out (docs/theory.md, section 7). Compiled.
+the deviations around it, so that near outliers and streaks stand out (docs/explanation/theory.md, section 7). Compiled.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
 
     Each time is anywhere within its bound, for all lines alike: uniform, so a third of the square. Raises `DeviceFault`
     (late_readings of the rail, the arm or the camera) of the worst device when it may be more than `errors.shift`.
-    docs/theory.md, section 10.
+    docs/explanation/theory.md, section 10.
     """
     shift = speed * sum(one.bound for one in known)
     if not shift <= errors.shift:

@@ -1,4 +1,5 @@
-"""The channels of a record: their topics, what their messages are, in which schema. docs/record.md has them as a table.
+"""The channels of a record: their topics, what their messages are, in which schema. docs/reference/record.md has them
+as a table.
 
 Geometry is in Foxglove's Protobuf schemas, which viewers know; what only this cell knows is JSON with a schema.
 """

@@ -1,6 +1,6 @@
 """`report.json` and the picture of a run: what happened, what was placed, and in a simulated cell how true it is.
 
-Every key is told in `docs/report.md`.
+Every key is told in `docs/reference/report.md`.
 """
 
 from __future__ import annotations

@@ -227,7 +227,7 @@ class Cell:
 
     @contextmanager
     def maintenance(self, reason: str, lift: Sequence[str]) -> Iterator[None]:
-        """Inside this context the interlocks named in `lift` do not hold (docs/interlocks.md lists them).
+        """Inside this context the interlocks named in `lift` do not hold (docs/reference/interlocks.md lists them).
 
         On a person's responsibility, and recorded: in the log of the run that is going on, else as a run of its own;
         runs that are begun meanwhile say so in their report. `ConfigError` without a reason, or for a name that is

@@ -1,4 +1,4 @@
-"""Child side: the process in which ur-rtde lives, since it can crash or hang (docs/protocols.md, section 7).
+"""Child side: the process in which ur-rtde lives, since it can crash or hang (docs/reference/protocols.md, section 7).
 
 It ends by itself, with the motion stopped and the safe outputs off, as soon as its owner is gone (the pipe ends, or
 another parent has taken over), and at once when the arm is gone. Run by the driver; with `--safe ADDRESS 0,3` it only

@@ -3,7 +3,7 @@
 Its time stamps are mapped to the host's clock through latches of its clock before each acquisition; where it has no
 latch, through triggered pictures, which began after the trigger was sent and ended before they came. Each triggered
 picture is also held against that interval, every other one against its end: a camera whose stamps do not lie in it is
-refused. Nothing of this has run on a camera of any maker yet; docs/cameras.md says with what it was tested.
+refused. Nothing of this has run on a camera of any maker yet; docs/how-to/cameras.md says with what it was tested.
 """
 
 from __future__ import annotations

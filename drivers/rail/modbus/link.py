@@ -2,7 +2,7 @@
 
 One frame at a time, with the silence between frames that the line's speed asks for; a reply belongs to its request or
 is thrown away; what may be said twice is tried twice. A stop overtakes: commands that were issued before it and have
-not been sent yet are refused. Source: docs/other-makes.md, section 1.
+not been sent yet are refused. Source: docs/how-to/other-makes.md, section 1.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """TMCL's binary telegrams: nine bytes each way, summed to eight bits.
 
-Source: the maker's TMCL firmware manual; docs/protocols.md, section 2. Bytes only: no port, no units.
+Source: the maker's TMCL firmware manual; docs/reference/protocols.md, section 2. Bytes only: no port, no units.
 """
 
 from __future__ import annotations

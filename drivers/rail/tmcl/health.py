@@ -1,6 +1,6 @@
 """What a rail's module tells of its motor driver's health; it tells no voltage.
 
-Source: docs/protocols.md, section 2.
+Source: docs/reference/protocols.md, section 2.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def unguarded(name: str, who: str, took: float, allowed: float) -> DeviceFault:
         f"without our heartbeat the {who} drive stays enabled, {took:.1f} s long (vehicle.watchdog is {allowed:g} s): "
         "it would drive on if this program died",
         recoverable=False,
-        hint="Set object 6007h of the drive to 1, or try the other vehicle.guarding; see docs/canopen.md.",
+        hint="Set object 6007h of the drive to 1, or try the other vehicle.guarding; see docs/how-to/canopen.md.",
     )
 
 
@@ -60,5 +60,5 @@ def unfit(name: str, what: str) -> DeviceFault:
         SETUP,
         what,
         recoverable=False,
-        hint="Compare the drive's manual with docs/canopen.md, which lists what a drive must have.",
+        hint="Compare the drive's manual with docs/how-to/canopen.md, which lists what a drive must have.",
     )

@@ -1,4 +1,5 @@
-"""A vehicle of two wheel drives on CANopen CiA 402, in profile velocity mode (docs/canopen.md). Never run on hardware.
+"""A vehicle of two wheel drives on CANopen CiA 402, in profile velocity mode (docs/how-to/canopen.md). Never run on
+hardware.
 
 When this program is gone, the drives stop by their own watchdog. That they do is tried at speed 0, once per connection.
 """

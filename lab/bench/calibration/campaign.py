@@ -35,7 +35,7 @@ THEORY_MM = {
     "scan_radial_lens": {"mean": 0.047, "max": 0.112, "p85": 0.063},
     "base": {"mean": 0.067, "max": 0.108, "p85": 0.082},
 }
-"""What a prototype reached for the same noise: docs/theory.md, section 12."""
+"""What a prototype reached for the same noise: docs/explanation/theory.md, section 12."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The campaign behind `cell bench inversion`: starts from near and far on every part.
 
 A task is one part and one seed. Times are CPU times of one thread, so that a busy machine changes them little. What
-small_gicp and Open3D made of the same clouds and starts is in docs/libraries.md.
+small_gicp and Open3D made of the same clouds and starts is in docs/explanation/libraries.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Pictures of a stripe with known centres, and the Cramér–Rao bound of their noise: nothing here is the estimator's.
 
 A Gaussian integrated over pixels, on a gradient; Poisson electrons, Gaussian read noise, 8 bits; speckle as the
-intensity of a smoothed complex Gaussian field. docs/theory.md, section 5: 40 electrons per DN, read noise 0.4 DN.
+intensity of a smoothed complex Gaussian field. docs/explanation/theory.md, section 5: 40 electrons per DN, read noise
+0.4 DN.
 """
 
 from __future__ import annotations

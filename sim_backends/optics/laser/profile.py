@@ -1,7 +1,7 @@
 """The light of one row crossing of the stripe: how bright, how wide, and spread over which pixels.
 
-Radiometry, docs/theory.md, section 4: the irradiance of the light sheet falls with the distance from the laser and the
-cosine of incidence; a diffuse surface's image does not depend on the camera's distance.
+Radiometry, docs/explanation/theory.md, section 4: the irradiance of the light sheet falls with the distance from the
+laser and the cosine of incidence; a diffuse surface's image does not depend on the camera's distance.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 The cut of every object is a set of straight segments; each is followed to the image rows' centres exactly, seen from
 the camera and lit by the laser or not at all. What is drawn is the Gaussian of the sheet's thickness as the camera
-sees it on the slope, widened by point spread and defocus, integrated over pixels (docs/theory.md, section 4).
+sees it on the slope, widened by point spread and defocus, integrated over pixels (docs/explanation/theory.md, section
+4).
 """
 
 from __future__ import annotations

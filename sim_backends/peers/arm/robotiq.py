@@ -1,6 +1,6 @@
 """The socket that a Robotiq gripper's program opens on the arm's controller: GET and SET of variables, in text.
 
-Written from the protocol as docs/other-makes.md, section 3, has it. Replies carry no end mark.
+Written from the protocol as docs/how-to/other-makes.md, section 3, has it. Replies carry no end mark.
 """
 
 from __future__ import annotations

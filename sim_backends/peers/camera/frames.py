@@ -1,4 +1,4 @@
-"""A camera on the network: frame stream protocol, version 1 (`docs/frame-stream.md`).
+"""A camera on the network: frame stream protocol, version 1 (`docs/reference/frame-stream.md`).
 
 Here are the requests and the rule that a camera has one client; the pictures are the session's.
 """

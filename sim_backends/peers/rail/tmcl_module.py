@@ -1,7 +1,8 @@
 """A stepper module as seen through TMCL: axis and global parameters, motion commands, status codes.
 
-Modelled on the TMCM-1260 (docs/protocols.md, section 2). One request of nine bytes gives one reply; no transport here.
-The module's serial number stands in user variable 0 (bank 2), where it is written when a module is put into service.
+Modelled on the TMCM-1260 (docs/reference/protocols.md, section 2). One request of nine bytes gives one reply; no
+transport here. The module's serial number stands in user variable 0 (bank 2), where it is written when a module is put
+into service.
 """
 
 from __future__ import annotations

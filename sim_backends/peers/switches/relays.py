@@ -1,6 +1,6 @@
 """Relay boards on a serial line: one with a command line in text, and one that takes four bytes and says nothing.
 
-Written from the makers' descriptions as docs/other-makes.md, section 2, has them.
+Written from the makers' descriptions as docs/how-to/other-makes.md, section 2, has them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The vehicle on its CAN bus: AgileX protocol v2, 500 kbit/s, Motorola byte order.
 
-Encoded here from the protocol's description (docs/protocols.md, section 3), independently of any DBC. Feedback keeps
-its cycles in world time; in a fast world a frame is sent at most once per `_FAST` or `_SLOW` of wall time, with the
-newest values.
+Encoded here from the protocol's description (docs/reference/protocols.md, section 3), independently of any DBC.
+Feedback keeps its cycles in world time; in a fast world a frame is sent at most once per `_FAST` or `_SLOW` of wall
+time, with the newest values.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""A CAN bus behind slcan adapters on TCP, every client an adapter on the same bus (docs/protocols.md, section 4).
+"""A CAN bus behind slcan adapters on TCP, every client an adapter on the same bus (docs/reference/protocols.md, section
+4).
 
 What one client sends reaches the owner of the bus and all other clients; an adapter that is not open, is set to
 another bit rate or listens only takes no part in sending.

@@ -1,4 +1,4 @@
-"""Who may talk to the console's server: by clients that know nothing of it (docs/console.md, "Who may")."""
+"""Who may talk to the console's server: by clients that know nothing of it (docs/reference/console.md, "Who may")."""
 
 from __future__ import annotations
 

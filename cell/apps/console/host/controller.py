@@ -104,7 +104,8 @@ class Desk:
         self.holders.left(client)
 
     def do(self, client: str, words: Words) -> Answer:
-        """Do what a page asks; its answer as docs/console.md has it. Raises `CellError` for what is refused."""
+        """Do what a page asks; its answer as docs/reference/console.md has it. Raises `CellError` for what is
+        refused."""
         checked, name = checked_command(words), str(words["do"])
         if name not in FREE:
             self.holders.require(client)

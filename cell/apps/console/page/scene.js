@@ -1,4 +1,4 @@
-// The cell in 3-D: bodies as the planner has them, turned and shifted by what the devices read. Frames: docs/console.md.
+// The cell in 3-D: bodies as the planner has them, turned and shifted by what the devices read. Frames: docs/reference/console.md.
 
 import * as THREE from './vendor/three.module.min.js';
 import { OrbitControls } from './vendor/OrbitControls.js';

@@ -1,4 +1,5 @@
-"""The schemas of what a page may say: commands of `POST /api/do` and messages of the live link (docs/console.md).
+"""The schemas of what a page may say: commands of `POST /api/do` and messages of the live link
+(docs/reference/console.md).
 
 Both the server and the desk check by them: numbers finite and in range, texts of bounded length, no unknown keys.
 """
@@ -94,7 +95,7 @@ def _checked(schemas: Mapping[str, type[Said]], kind: str, words: Mapping[str, A
     schema = schemas.get(name) if isinstance(name, str) else None
     if schema is None:
         given = f"called {name[:40]!r}" if isinstance(name, str) else "without a name"
-        raise ConfigError(f"there is nothing {given} to do; docs/console.md lists what there is")
+        raise ConfigError(f"there is nothing {given} to do; docs/reference/console.md lists what there is")
     try:
         told = schema.model_validate({key: value for key, value in words.items() if key != kind})
     except ValidationError as error:
@@ -103,5 +104,5 @@ def _checked(schemas: Mapping[str, type[Said]], kind: str, words: Mapping[str, A
             f"{'.'.join(str(part)[:40] for part in problem['loc'])}: {problem['msg']}"
             for problem in error.errors(include_url=False, include_input=False)[:4]
         )
-        raise ConfigError(f"{name} is not understood: {wrong}. docs/console.md lists what it takes") from None
+        raise ConfigError(f"{name} is not understood: {wrong}. docs/reference/console.md lists what it takes") from None
     return told.model_dump()

@@ -250,7 +250,7 @@ class Server:
 
 
 def packed(header: Mapping[str, Any], payload: bytes) -> bytes:
-    """A binary message: length of the header, the header, the payload (docs/console.md)."""
+    """A binary message: length of the header, the header, the payload (docs/reference/console.md)."""
     words = json.dumps(header).encode()
     return struct.pack("<I", len(words)) + words + payload
 

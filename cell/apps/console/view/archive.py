@@ -40,7 +40,7 @@ class Archive:
         self._drawing = threading.Lock()
 
     def runs(self) -> list[dict[str, Any]]:
-        """Newest first; see docs/console.md."""
+        """Newest first; see docs/reference/console.md."""
         folders = reversed(list_runs(self._root)[-MOST_RUNS:])
         return [self._row(folder) for folder in folders if self._folder(folder.name) is not None]
 

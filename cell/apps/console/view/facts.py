@@ -27,7 +27,8 @@ ANGLES = [0.1 * DEG, 1 * DEG, 5 * DEG]
 
 
 def cell_facts(cell: Cell, job: str) -> dict[str, Any]:
-    """The answer of `/api/cell` (docs/console.md), with the station of `job`; `ConfigError` for one that is none."""
+    """The answer of `/api/cell` (docs/reference/console.md), with the station of `job`; `ConfigError` for one that is
+    none."""
     config, simulated = cell.config, cell.simulated
     loaded, _ = load_job(job)
     facts = {} if simulated is None else simulated.facts

@@ -29,8 +29,8 @@ def moves(record: Path) -> bool:
 
 
 def motion(record: Path) -> dict[str, Any]:
-    """Ten times a second from the record's beginning, as docs/console.md has it: joints in rad, rail in m, vehicle in m
-    and rad; None where not told yet. Raises `CellError` for a file that is no record."""
+    """Ten times a second from the record's beginning, as docs/reference/console.md has it: joints in rad, rail in m,
+    vehicle in m and rad; None where not told yet. Raises `CellError` for a file that is no record."""
     told = sorted(messages(record, (JOINTS, VEHICLE, EVENT)), key=lambda message: message[1])
     begun = told[0][1] if told else 0
     rows: list[tuple[float, Any, Any, Any]] = []

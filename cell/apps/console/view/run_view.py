@@ -47,7 +47,7 @@ class RunView:
         return self.run.done and self._events.closed
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page: see docs/console.md."""
+        """For the page: see docs/reference/console.md."""
         run = self.run
         paused = run.control.paused()
         state = "asking" if self.asked is not None else "paused" if self._held else "pausing" if paused else "running"

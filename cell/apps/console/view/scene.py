@@ -38,7 +38,8 @@ SIGHT_M = {"scan": 0.15, "target": 0.30}
 def scene(
     config: CellConfig, job: str | Path | None = None, table: LinkTable | None = None, meshes: Path | None = None
 ) -> dict[str, Any]:
-    """What stands and moves in the cell, as a JSON object (docs/console.md); without a job neither part nor station.
+    """What stands and moves in the cell, as a JSON object (docs/reference/console.md); without a job neither part nor
+    station.
 
     `table` is what the arm's controller told of its links, `meshes` a folder of pictures of them (`link_meshes`).
     Raises `ConfigError` for a job or a mesh that cannot be read.

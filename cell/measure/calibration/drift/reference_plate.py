@@ -3,7 +3,7 @@
 At one end of its travel the rail shows the scan camera that plate, always at the same place. Where the line lies on it
 is looked at with each calibration and before each job. What it has moved is taken for a turn of the light plane about
 the laser's exit and the stripe's direction; a shift of the camera's picture looks the same there and does the same to
-depths, so the turn is right for both. docs/theory.md, section 7.
+depths, so the turn is right for both. docs/explanation/theory.md, section 7.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 What a camera holds back before it stamps a frame looks, in one sweep, like a shift of the whole scan. Swept the other
 way it is a shift to the other side, and it grows with the speed, which the play of a screw does not. How it differs
 between two exposures tells where in an exposure the stamp is put, and how it differs from row to row whether the camera
-has a rolling shutter. docs/theory.md, section 10.
+has a rolling shutter. docs/explanation/theory.md, section 10.
 """
 
 from __future__ import annotations

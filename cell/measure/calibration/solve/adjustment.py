@@ -2,7 +2,7 @@
 
 The arm's poses and the rail's readings are unknowns too, held by their repeatability; groups of measurements whose
 noise is not known get it from their own residuals (variance components). Views between which only the rail moved share
-the flange's pose, wherever that was. docs/theory.md, section 6.
+the flange's pose, wherever that was. docs/explanation/theory.md, section 6.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The bow of the light sheet: found beside everything else of the joint adjustment, and only where the stripes show it.
 
 A flat sheet is the rule. A bow is one more parameter of the adjustment, and kept only where the stripes' residuals ask
-for it. docs/theory.md, section 6.
+for it. docs/explanation/theory.md, section 6.
 """
 
 from __future__ import annotations

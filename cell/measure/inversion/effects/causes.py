@@ -2,7 +2,7 @@
 
 A jump at one line is the laser's, the frames' or the carriage's; a ramp over the lines is drift; a sine is vibration.
 What is fixed to the surface is wear or oil, what stays with the rows is the sensor's. Each model is fitted together
-with the pose; BIC compares them (docs/theory.md, section 8). No scan is accepted for it.
+with the pose; BIC compares them (docs/explanation/theory.md, section 8). No scan is accepted for it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A vehicle, floor or arm that creeps: its rate from two sweeps of one strip, taken out of the first one's lines.
 
 An arm that has not moved between two sweeps sees the surface in one place, or something moves: vehicle, floor, table,
-or the arm itself. The rate is taken as even; half of it is counted as unknown, as it may not be (docs/theory.md,
-section 8).
+or the arm itself. The rate is taken as even; half of it is counted as unknown, as it may not be
+(docs/explanation/theory.md, section 8).
 """
 
 from __future__ import annotations

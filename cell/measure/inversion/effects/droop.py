@@ -22,7 +22,8 @@ GATE_M = 0.5e-3
 LEAST_LINES, LEAST_SHARE = 40, 0.1
 LEAST_POINTS = 8
 LEAST_SAG = 36e-6
-"""At the end of the travel, m. Calibration and facets make a bow of up to 33 µm (docs/theory.md, section 8)."""
+"""At the end of the travel, m. Calibration and facets make a bow of up to 33 µm (docs/explanation/theory.md, section
+8)."""
 EVIDENCE = 4.0
 """The bow over its own standard deviation."""
 BLOCK = 12

@@ -1,7 +1,7 @@
 """Finds dots in a picture and measures their centres from their edges, to some hundredths of a pixel.
 
 Blobs come from a local threshold at several scales; a dot's edge is then looked for along rays from its middle, so that
-a laser line across a dot spoils some rays and not the centre. docs/theory.md, section 6.
+a laser line across a dot spoils some rays and not the centre. docs/explanation/theory.md, section 6.
 """
 
 from __future__ import annotations

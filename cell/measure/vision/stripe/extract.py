@@ -1,7 +1,8 @@
 """Sub-pixel centres of the laser stripe, one per image row (or column), with an honest standard deviation each.
 
-`extract` is the way in, to all pictures; a centre is the likeliest one, which attains the bound (docs/theory.md,
-section 5, with what other ways make of the same pictures). What it means in space is the business of the geometry.
+`extract` is the way in, to all pictures; a centre is the likeliest one, which attains the bound
+(docs/explanation/theory.md, section 5, with what other ways make of the same pictures). What it means in space is the
+business of the geometry.
 """
 
 from __future__ import annotations

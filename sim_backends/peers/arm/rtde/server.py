@@ -1,7 +1,7 @@
 """RTDE version 2 over TCP: the simulated arm's controller as a client on the network sees it.
 
 One thread advances the arm and serves RTDE, the dashboard and the script ports every 2 ms on the wall, on absolute
-deadlines. Source: the maker's RTDE guide; docs/protocols.md, section 1. Physics is elsewhere.
+deadlines. Source: the maker's RTDE guide; docs/reference/protocols.md, section 1. Physics is elsewhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""A cell with a Modbus rail, a laser on a relay board and a Robotiq-style claw, as docs/other-makes.md has it."""
+"""A cell with a Modbus rail, a laser on a relay board and a Robotiq-style claw, as docs/how-to/other-makes.md has
+it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 BLOCKS = re.findall(
     r"```toml\n(.*?)```",
-    (ROOT / "docs" / "other-makes.md").read_text(encoding="utf-8"),
+    (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"),
     re.DOTALL,
 )
 

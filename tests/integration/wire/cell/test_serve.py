@@ -86,7 +86,8 @@ def camera_request(address: str, operation: str) -> dict[str, Any]:
 
 
 class Rtde:
-    """Just enough of the protocol's second version to write digital outputs (docs/protocols.md, section 1)."""
+    """Just enough of the protocol's second version to write digital outputs (docs/reference/protocols.md, section
+    1)."""
 
     def __init__(self, address: str) -> None:
         self._socket = socket.create_connection((address, 30004), 5.0)

@@ -1,4 +1,4 @@
-"""Makes beside the stock cell's: their records as docs/other-makes.md prints them, what is refused, no wires."""
+"""Makes beside the stock cell's: their records as docs/how-to/other-makes.md prints them, what is refused, no wires."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PRINTED = [
     tomllib.loads(block)
     for block in re.findall(
         r"```toml\n(.*?)```",
-        (ROOT / "docs" / "other-makes.md").read_text(encoding="utf-8"),
+        (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"),
         re.DOTALL,
     )
 ]

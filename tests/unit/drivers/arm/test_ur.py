@@ -146,7 +146,7 @@ def test_pose_difference_agrees_with_an_independent_one():
     ],
 )
 def test_safety_bits_have_the_makers_meaning(bit, code):
-    # docs/protocols.md, section 1
+    # docs/reference/protocols.md, section 1
     assert safety_code(1 << bit) == code
     assert safety_code(1) == ""
 

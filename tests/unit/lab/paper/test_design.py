@@ -1,4 +1,5 @@
-"""The paper's design study and equations, against the figures of docs/theory.md, section 3, and the simulator."""
+"""The paper's design study and equations, against the figures of docs/explanation/theory.md, section 3, and the
+simulator."""
 
 from __future__ import annotations
 

@@ -143,7 +143,8 @@ def test_light_doubles_with_exposure_and_with_the_lamp():
 
 
 def test_a_board_out_of_focus_is_blurred_by_the_thin_lens_formula():
-    # The scan camera, focused at 130 mm, blurs a point at 1 m over a disc of 24 px (docs/theory.md, section 4).
+    # The scan camera, focused at 130 mm, blurs a point at 1 m over a disc of 24 px (docs/explanation/theory.md, section
+    # 4).
     disc = 8e-3 / 4 * 8e-3 * 0.87 / (1.0 * 0.122) / 4.8e-6
     assert disc == pytest.approx(23.8, abs=0.1)
     assert float(SCAN.blur_px(1.0)) == pytest.approx(np.hypot(0.6, disc / 4))

@@ -132,7 +132,7 @@ def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World
 def test_how_late_the_readings_came_is_told_as_it_is_documented(pair: tuple[World, World, Following]) -> None:
     figures = pair[2].figures()
     told = {f"following.{key}" for key in figures} | {f"following.devices.*.{key}" for key in figures["devices"]["arm"]}
-    text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "report.md").read_text(encoding="utf-8")
     assert {key for key in told - {"following.devices"} if f"`{key}" not in text} == set()
     assert set(figures["devices"]["arm"]["latency_ms"]) == {"p50", "p99", "most"}
 

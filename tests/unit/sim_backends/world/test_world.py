@@ -134,7 +134,8 @@ def test_the_ideal_world_is_the_nominal_geometry() -> None:
     assert scene.world_from_surface == pytest.approx(nominal.WORLD_FROM_PLACE)
     assert scene.flange_from_scan_camera == pytest.approx(nominal.FLANGE_FROM_SCAN_CAMERA)
     assert scene.flange_from_part == pytest.approx(nominal.FLANGE_FROM_PART)
-    # Where the light plane meets the optical axis: l tan θ = 122.5 mm (paper, equation 6; docs/theory.md, section 2).
+    # Where the light plane meets the optical axis: l tan θ = 122.5 mm (paper, equation 6; docs/explanation/theory.md,
+    # section 2).
     assert scene.light_plane_distance / scene.light_plane_normal[2] == pytest.approx(0.1225)
     assert scene.scan_lens.fx == pytest.approx(0.008 / 4.8e-6)
     assert scene.scan_lens.dist == (0, 0, 0, 0, 0)
@@ -293,7 +294,8 @@ def above(point: tuple[float, float, float]) -> np.ndarray:
 
 
 def test_the_stripe_on_the_table_is_where_the_closed_form_puts_it(ideal: StandingWorld) -> None:
-    """x' = f (cot θ − l/Z), docs/theory.md, section 2, on the bare table beside the surface at Z = 130 mm."""
+    """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table beside the surface at Z = 130
+    mm."""
     picture = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130)), laser=True).astype(float)
     dark = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130))).astype(float)
     light = (picture - dark)[40:440]

@@ -1,7 +1,8 @@
 """The stripe's own profile across the line: a Gaussian until the picture shows otherwise, then what the picture shows.
 
 Registered lines give many samples of one profile at all sub-pixel places. What they differ from a Gaussian by is
-fitted by a penalised cubic spline. It is kept where it foretells held-out lines better (docs/theory.md, section 5).
+fitted by a penalised cubic spline. It is kept where it foretells held-out lines better (docs/explanation/theory.md,
+section 5).
 """
 
 from __future__ import annotations

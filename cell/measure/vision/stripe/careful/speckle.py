@@ -4,7 +4,7 @@ Residuals of fitted lines are compared with what the fit leaves of photon noise 
 grain: the fit swallows much of a coarse speckle, and that share is computed, not guessed. The grain is seen across the
 lines, where nothing is swallowed: round grains correlate a line with the next as they correlate a pixel with the next.
 Without speckle in the weights centres scatter 1.6 to 2 times as far, and a stated σ is 3 to 4 times too small
-(docs/theory.md, section 5).
+(docs/explanation/theory.md, section 5).
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The likeliest centre of the stripe in each line: the compiled maximum likelihood fit (docs/theory.md, section 5).
+"""The likeliest centre of the stripe in each line: the compiled maximum likelihood fit (docs/explanation/theory.md,
+section 5).
 
 Fisher scoring on centre, amplitude, width and linear background, `LANES` lines at a time; one step is in
 `lanes.py`.

@@ -259,5 +259,5 @@ def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
 
 
 def test_the_documents_table_is_current() -> None:
-    text = (ROOT / "docs" / "commission.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "how-to" / "commission.md").read_text(encoding="utf-8")
     assert table() in text

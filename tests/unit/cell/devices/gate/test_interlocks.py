@@ -37,7 +37,7 @@ from tests.support import ROOT
 
 CONFIG = load_config(None)
 LASER = CONFIG.laser.output
-DOCUMENT = ROOT / "docs" / "interlocks.md"
+DOCUMENT = ROOT / "docs" / "reference" / "interlocks.md"
 
 
 @pytest.fixture

@@ -131,7 +131,7 @@ def test_lens_sensor_and_light_plane_are_those_of_the_configuration(tmp_path: Pa
 
 
 def test_the_stripe_of_a_described_head_is_where_the_closed_form_puts_it(tmp_path: Path) -> None:
-    """x' = f (cot θ − l/Z), docs/theory.md, section 2, on the bare table at Z = 130 mm."""
+    """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table at Z = 130 mm."""
     camera = {"focal_length": '"6 mm"', "pixel": '"3.45 um"', "width": "800", "height": "600"}
     laser = {"baseline": '"45 mm"', "tan_theta": "2.8"}
     cell = ideal(tmp_path, {"scan_camera": camera, "laser": laser})
@@ -168,7 +168,7 @@ def test_station_vehicle_and_arm_stand_where_job_and_configuration_put_them(tmp_
     assert true(cell, "world_from_board")[:3, 3] == pytest.approx([0.2, 0.38, 0.7])
     on_vehicle = inverse(true(cell, "world_from_vehicle")) @ true(cell, "world_from_base")
     assert on_vehicle[:3, 3] == pytest.approx([0.25, 0.05, 0.6])
-    # Stretched out along −x: a2 + a3 of the maker's table (docs/protocols.md, section 1).
+    # Stretched out along −x: a2 + a3 of the maker's table (docs/reference/protocols.md, section 1).
     reach = cell.world.arm.kinematics.forward(np.zeros(6))[:3, 3]
     assert reach[0] == pytest.approx(-0.425 - 0.3922)
 

@@ -560,6 +560,6 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
 def test_the_documentation_lists_the_channels() -> None:
     from cell.run.record.channels import table
 
-    text = (ROOT / "docs" / "record.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "record.md").read_text(encoding="utf-8")
     assert table() in text
     assert len({topic for channel in CHANNELS for topic in channel.topics}) == len(BY_TOPIC)

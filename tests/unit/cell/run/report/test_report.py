@@ -30,7 +30,7 @@ from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support import ROOT, report_runs
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 
-DOCUMENT = ROOT / "docs" / "report.md"
+DOCUMENT = ROOT / "docs" / "reference" / "report.md"
 REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
     (report_runs.no_board, "drive_to_target", None, True, False),
     (report_runs.blurred_board, "drive_to_target", "board's dots off their places, RMS", True, False),
@@ -196,7 +196,7 @@ def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp
     assert strict({"at": np.array([[1.0, np.nan]]), "file": Path("x")}) == {"at": [[1.0, None]], "file": "x"}
 
 
-# --- docs/report.md ---
+# --- docs/reference/report.md ---
 
 
 def keys(value: object, at: str = "") -> set[str]:

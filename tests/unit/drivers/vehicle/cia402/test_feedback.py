@@ -216,7 +216,7 @@ def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
 
 
 def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "canopen.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "canopen.md").read_text(encoding="utf-8")
     printed = page.split("```toml\n")[1].split("```")[0]
     text = default_toml()
     path = tmp_path / "cell.toml"

@@ -42,7 +42,8 @@ def test_relief_stays_between_the_table_and_15_mm(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("unseen", [0.0, 0.008])
 def test_every_direction_is_observable(name: str, unseen: float) -> None:
-    """Smallest eigenvalue of the normalised information (docs/theory.md, section 9), also when the view is cut."""
+    """Smallest eigenvalue of the normalised information (docs/explanation/theory.md, section 9), also when the view is
+    cut."""
     x, y = grid(name)
     seen = y <= surface(name).half_y - unseen
     heights, normals = surface(name).sample(x[seen], y[seen])
