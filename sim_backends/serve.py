@@ -40,7 +40,7 @@ from sim_backends.peers.vehicle.wired_vehicle import vehicle_peer
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.bodies.surfaces import SURFACES
 from sim_backends.world.drawing import STOCK, read
-from sim_backends.world.following import FOLLOWED, Following
+from sim_backends.world.following import FOLLOWED, WorldFollowing
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
 from sim_backends.world.truth import truth
@@ -89,7 +89,7 @@ class ServedCell:
         """
         self.world = world
         clock = world.clock
-        self.following = Following(world, [name for name in FOLLOWED if name in follow])
+        self.following = WorldFollowing(world, [name for name in FOLLOWED if name in follow])
         with contextlib.ExitStack() as bound:
             self._arm = None if "arm" in follow else _bound(bound, RtdePeer(world.arm, clock))
             self._rail = None if "rail" in follow else _bound(bound, rail_peer(world))

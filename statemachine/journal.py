@@ -87,7 +87,7 @@ class EventRow:
 
 
 @dataclass(frozen=True)
-class Request:
+class RunRequest:
     """Something that another process asked for; `number` is that of the question that a "confirm" answers."""
 
     kind: str
@@ -156,7 +156,7 @@ class Journal:
             *ended, _crc(run, started, *ended, *rest), run,
         )  # fmt: skip
 
-    def take_requests(self) -> list[Request]:
+    def take_requests(self) -> list[RunRequest]:
         """What other processes have asked for since the last call, oldest first; asked by one thread.
 
         It only reads, over a connection of its own: a write that stalls keeps nobody from being heard.
@@ -169,7 +169,7 @@ class Journal:
             raise JournalError(f"the journal {self.path} cannot be read: {error}") from error
         if rows:
             self._taken = rows[-1][0]
-        return [Request(*row) for _, *row in rows]
+        return [RunRequest(*row) for _, *row in rows]
 
     def close(self) -> None:
         """Close the file; the record is complete without it as well."""
@@ -190,7 +190,7 @@ class Journal:
 
 
 @dataclass(frozen=True)
-class Record:
+class JournalRecord:
     """A journal as it was read: all runs, and the steps and events of the newest."""
 
     runs: tuple[RunRow, ...]
@@ -213,14 +213,14 @@ class Record:
         return {step.name: step.result or {} for step in self.steps if step.state == "done"}
 
 
-def read(folder: Path, *, whole: bool = False) -> Record:
+def read(folder: Path, *, whole: bool = False) -> JournalRecord:
     """Read the journal in a run's folder, also while it is being written.
 
     With `whole` the file's structure is checked as well, which takes longer. `JournalError` if there is none, or one
     with a row that is not as it was written.
     """
 
-    def rows(base: sqlite3.Connection) -> Record:
+    def rows(base: sqlite3.Connection) -> JournalRecord:
         if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
             raise JournalError(f"the journal in {folder} is damaged: {found[0] if found else 'no word of it'}")
 
@@ -248,7 +248,7 @@ def read(folder: Path, *, whole: bool = False) -> Record:
             EventRow(_is(at, float), _is(kind, str), may(step, str), _table(data))
             for _, at, kind, step, data in _checked(base, "events", "run, at, kind, step, data", *own)
         )
-        return Record(runs, steps, events)
+        return JournalRecord(runs, steps, events)
 
     try:
         return _in_existing(folder, rows)

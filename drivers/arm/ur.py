@@ -23,7 +23,7 @@ from drivers.arm.dashboard import unknown
 from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.faults import late_words
 from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.session import ArmSession
 from drivers.arm.wrong_arm import Forward
@@ -93,7 +93,7 @@ class UrArm:
         self._numbers = itertools.count(1)
         self._starting = threading.Lock()
         self._motion: UrMotion | None = None
-        setup = Setup(
+        setup = ChildSetup(
             address,
             clock.rate,
             tuple(_check_output(name, index) for index in safe_off_outputs),

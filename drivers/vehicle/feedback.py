@@ -52,7 +52,7 @@ def patience(clock: Clock, seconds: float) -> float:
     return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
-class Feedback:
+class MessageFeedback:
     """The newest messages by name, each with its host time; filled by the receive thread through `take`."""
 
     def __init__(

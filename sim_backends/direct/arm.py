@@ -18,7 +18,7 @@ from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import ArmSetup, within
 from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.models.arm_kinematics import matrix_from_pose, pose_from_matrix
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 
 _BRAKING = 4.0
 _FIRST_POINT = 0.02
@@ -184,7 +184,7 @@ class DirectArm:
         """Brake now, and wait until the arm stands."""
         self._stops += 1
         self.end_motion(Aborted(f"{self.name}: stopped before the end of its motion"))
-        self.model.start(Stop(_BRAKING))
+        self.model.start(StopMotion(_BRAKING))
         while self.model.moving:
             self.clock.sleep(TICK_S)
 

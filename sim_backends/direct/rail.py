@@ -11,7 +11,7 @@ import numpy as np
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState
 from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import CarriageWatch, RailSetup, within
+from sim_backends.direct.product import CarriageCheck, RailSetup, within
 from sim_backends.direct.rail_motion import POLL_S, DirectSweep, RailMove
 from sim_backends.models.rail import RailModel
 
@@ -197,7 +197,7 @@ class DirectRail:
 
     # --- inside ---
 
-    def _watch(self, length: float | None) -> CarriageWatch:
+    def _watch(self, length: float | None) -> CarriageCheck:
         return self.setup.watch(self.name, self.clock, length)
 
     def _set_up(self) -> None:

@@ -68,7 +68,7 @@ class Declined(Exception):
 
 
 @dataclass
-class Desk:
+class CommissionWorkplace:
     """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures.
 
     `simulated`: all of its devices are, and their world can be told what to do.

@@ -17,7 +17,7 @@ from cell.config.calibrations.validation import require_valid
 from cell.config.cell_config import CameraConfig, CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
-from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.judge.faults import refuse_wrong_lead
 from cell.measure.calibration.solve.cameras import adjust_scan, adjust_target
 from cell.measure.calibration.solve.joint import Joint
@@ -64,7 +64,7 @@ class CellCalibration:
         identities: dict[str, str],
         config: CellConfig,
         kinematics: str = "",
-        witness: Witness | None = None,
+        witness: PlateLine | None = None,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
         return solve_observations(gathered(scan, target, identities, config, kinematics, witness)).calibration
@@ -172,7 +172,7 @@ def gathered(
     identities: dict[str, str],
     config: CellConfig,
     kinematics: str = "",
-    witness: Witness | None = None,
+    witness: PlateLine | None = None,
 ) -> Observations:
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(

@@ -31,7 +31,7 @@ from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
-from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+from sim_backends.direct.product import ArmSetup, CameraSetup, DirectSetup, RailSetup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
 
 AGILEX_COUNT_M = 0.001
@@ -101,11 +101,11 @@ class VirtualCell(DirectCell):
         """The world ends with this object."""
 
 
-def setup_of(config: CellConfig) -> Setup:
+def setup_of(config: CellConfig) -> DirectSetup:
     """What the devices are given: the configuration's values and the drivers' logic."""
     count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
-    return Setup(
+    return DirectSetup(
         ArmSetup(
             ArmLimits(
                 joint_speeds=(arm.max_joint_speed,) * 6,

@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.base.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
-from cell.measure.calibration.drift.reference_plate import Witness, read_edge
+from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
 from cell.measure.calibration.observations import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
@@ -55,7 +55,7 @@ class Observations:
     configuration: str
     made: float
     kinematics: str = ""
-    witness: Witness | None = None
+    witness: PlateLine | None = None
 
 
 def write_archive(path: Path, observations: Observations) -> None:
@@ -143,13 +143,13 @@ def read_archive(path: Path) -> Observations:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
 
 
-def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness | None:
+def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> PlateLine | None:
     if "witness_rail" not in about:
         return None
     columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
     if columns.ndim != 1 or columns.shape != sigma.shape or not (sigma[np.isfinite(columns)] > 0).all():
         raise ValueError("the witness needs a deviation above 0 for each of its columns")
-    return Witness(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
+    return PlateLine(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from cell.measure.calibration.drift.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
-from cell.measure.calibration.timing import Timing
+from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.arm_models import HOME
@@ -55,7 +55,7 @@ def collect_timing(
     check: Check,
     progress: Progress,
     keep: Keep,
-) -> Timing:
+) -> StampTiming:
     """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.

@@ -14,7 +14,7 @@ from cell.procedures.arm.camera_poses import photo_pose
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.settled import swing_covariance, words
-from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.step import JobStep
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from statemachine.policy import Step
@@ -81,7 +81,7 @@ def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str]
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:
-    arrival, job = context.made(Arrival), here.job
+    arrival, job = context.made(VehicleArrival), here.job
     here.mover.meet_station(arrival.base_from_place, job, here.board, here.nominal.extent)
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)
@@ -90,4 +90,4 @@ def _at(here: Workplace, context: StepContext) -> BoardFix:
     return fix
 
 
-STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(Arrival,))
+STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(VehicleArrival,))

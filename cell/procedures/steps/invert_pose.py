@@ -28,7 +28,7 @@ from statemachine.runner import StepContext
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class LineTimes:
     """When each line of the cloud was taken, (lines,) in s, what the arm's base stands on, and the scan head that a
     rail carried, None where the arm did.
 
@@ -46,7 +46,7 @@ def invert_pose(
     job: Job,
     nominal: NominalSurface,
     kinematic: Vector,
-    taken: Lines | None = None,
+    taken: LineTimes | None = None,
 ) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
@@ -124,7 +124,7 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
     if here.job.scan.mode == "rail":
         known, travel = here.calibration.scan, here.config.rail.travel[1]
         head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
-    taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
+    taken = LineTimes(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
         return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
     except NotObservable as refused:

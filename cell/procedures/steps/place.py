@@ -19,7 +19,7 @@ from cell.motion.bodies import TOUCHES
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.part import PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.arm.touch import Touch, TouchCheck, expected_touch, felt_touch
+from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.drive.station_check import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -76,7 +76,7 @@ class PlaceResult:
 def place(
     job: Job,
     base_from_surface: pin.SE3,
-    expected: Touch,
+    expected: TouchHeight,
     mover: Mover,
     arm: Arm,
     claw: Claw,

@@ -23,7 +23,7 @@ from cell.measure.reconstruction import (
 )
 from cell.measure.reconstruction.cloud import Array, Indices
 from cell.measure.reconstruction.seams import Motions
-from cell.procedures.observed import Lines
+from cell.procedures.observed import TimedCloud
 from cell.procedures.steps.step import JobStep
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.sweep_record import SweepRecord
@@ -114,7 +114,7 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
 def _at(here: Workplace, context: StepContext) -> Reconstruction:
     sweep = context.made(SweepRecord)
     made = reconstructed(here, sweep)
-    here.devices.gate.seen("scan_camera", Lines(made.cloud, sweep.times))
+    here.devices.gate.seen("scan_camera", TimedCloud(made.cloud, sweep.times))
     return made
 
 

@@ -24,7 +24,7 @@ from cell.procedures.drive.settled import APART_S
 from cell.procedures.drive.whereabouts import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.pace import Pace
-from cell.procedures.sweep.swath import Collector
+from cell.procedures.sweep.swath import SweepCollector
 from drivers.interfaces import Vector
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Workplace:
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
     needs_part: bool = True
-    sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None
+    sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
     pace: Pace = field(default_factory=Pace)

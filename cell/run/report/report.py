@@ -25,7 +25,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.sweep_record import SweepRecord
 from cell.run.files.folder import REPORT, timeless, when
 from cell.run.report.evidence import last_frames, measured, refusal
-from cell.run.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
+from cell.run.report.truth import TruthRecorder, expected_error, place_error, pose_error, sensor_error
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
 from statemachine.step import summary_of
@@ -42,7 +42,7 @@ def make_report(
     result: RunResult,
     info: dict[str, Any],
     started: float,
-    witness: Witness | None,
+    witness: TruthRecorder | None,
     frames: FrameStore,
 ) -> dict[str, Any]:
     """Everything about a run as JSON-ready data; also `report.json` and `picture.png` in its folder.
@@ -197,7 +197,7 @@ def _add_truth(
     nominal: NominalSurface,
     repeatability: Vector,
     result: RunResult,
-    witness: Witness,
+    witness: TruthRecorder,
 ) -> None:
     """The comparison with the simulated world; raises when that does not answer any more."""
     now = witness.ask()

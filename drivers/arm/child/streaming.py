@@ -12,8 +12,8 @@ from itertools import pairwise
 from typing import Any
 
 from drivers.arm.child.program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
-from drivers.arm.messages import Pace, Setup, Six, Snapshot
-from drivers.arm.motion import Trajectory
+from drivers.arm.messages import ChildSetup, Six, Snapshot, StreamTiming
+from drivers.arm.motion import JointTrajectory
 from drivers.clock import Clock
 
 _LOOKAHEAD, _GAIN = 0.05, 500
@@ -27,7 +27,9 @@ reaches the arm in one go after a halt of its computer is a jump of so much."""
 class Streaming:
     """Streams through ur-rtde's control `interface`, beside which `program` watches and stops the arm."""
 
-    def __init__(self, setup: Setup, interface: Any, program: ControlProgram, latest: Callable[[], Snapshot]) -> None:
+    def __init__(
+        self, setup: ChildSetup, interface: Any, program: ControlProgram, latest: Callable[[], Snapshot]
+    ) -> None:
         self._setup = setup
         self._control = interface
         self._program = program
@@ -36,13 +38,13 @@ class Streaming:
         self._sent: list[float] = []
 
     @property
-    def pace(self) -> Pace | None:
+    def pace(self) -> StreamTiming | None:
         """How regularly the points of the newest trajectory were sent."""
         return pace_of(self._sent)
 
     # --- streaming ---
 
-    def stream(self, trajectory: Trajectory, force_limit: float | None) -> End:
+    def stream(self, trajectory: JointTrajectory, force_limit: float | None) -> End:
         """Stream the trajectory, time running `rate` times as fast as the wall, then stand still.
 
         A stop slows time down to nothing, so that the arm brakes on its way: the controller's own stop takes all its
@@ -94,7 +96,7 @@ class Streaming:
             return self._program.settled(lambda snapshot: _missed(snapshot, trajectory))
         return self._program.brake() or (how, text) if how in ("stopped", "contact") else (how, text)
 
-    def _over(self, trajectory: Trajectory, elapsed: float, before: Six, force_limit: float | None) -> End:
+    def _over(self, trajectory: JointTrajectory, elapsed: float, before: Six, force_limit: float | None) -> End:
         """Whether streaming is over, and why; an empty reason to go on."""
         snapshot = self._latest()
         if (problem := self._program.problem()) is not None:
@@ -116,16 +118,16 @@ class Streaming:
         return tuple(sum(values) / len(samples) for values in zip(*samples, strict=True))
 
 
-def _missed(snapshot: Snapshot, trajectory: Trajectory) -> str:
+def _missed(snapshot: Snapshot, trajectory: JointTrajectory) -> str:
     return joints_off(snapshot, trajectory.end, "the trajectory's end")
 
 
-def pace_of(times: list[float]) -> Pace | None:
+def pace_of(times: list[float]) -> StreamTiming | None:
     """The pace of points that were sent at these times, s on the wall; None of less than three."""
     if len(times) < 3:
         return None
     gaps = sorted(after - before for before, after in pairwise(times))
     count = len(gaps)
-    return Pace(
+    return StreamTiming(
         len(times), count / (times[-1] - times[0]), gaps[count // 2], gaps[min(count - 1, count * 99 // 100)], gaps[-1]
     )

@@ -26,7 +26,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Trigger:
+class ExposureTrigger:
     """What begins an exposure.
 
     "software": a photograph is triggered by a command, a stream runs free. "free": both run free. "line": both wait for
@@ -109,7 +109,7 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
     return Wish(taken, wish.frame_rate)
 
 
-def set_trigger(device: GenicamDevice, trigger: Trigger, wish: Wish, *, photograph: bool) -> bool:
+def set_trigger(device: GenicamDevice, trigger: ExposureTrigger, wish: Wish, *, photograph: bool) -> bool:
     """Set what begins the exposures of a photograph, or of a stream; whether a command has to trigger them.
 
     Raises `DeviceFault` when the camera does not offer it.

@@ -19,7 +19,7 @@ from drivers.vehicle.cia402 import health, polling
 from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402.bus import CanopenBus
 from drivers.vehicle.cia402.faults import TOLD_ONCE
-from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.feedback import DriveFeedback
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.master import Master
 from drivers.vehicle.cia402.setup import Watchdog, compare_units
@@ -61,7 +61,7 @@ class CanopenVehicle:
         self._max_speed, self._max_yaw_rate = max_speed, max_yaw_rate
         self._clock = clock
         self._look = look
-        self._feedback = Feedback(
+        self._feedback = DriveFeedback(
             name, clock, wheels, max_speed=max_speed, max_yaw_rate=max_yaw_rate, statistics=self.statistics
         )
         self._in_command = False
@@ -151,7 +151,7 @@ class CanopenVehicle:
         return self._feedback.state(max_age, braked, in_command)
 
     def check(self) -> None:
-        """Raise the `DeviceFault` that the drives show now; see `Feedback.check`. Returns at once otherwise.
+        """Raise the `DeviceFault` that the drives show now; see `DriveFeedback.check`. Returns at once otherwise.
 
         A vehicle that somebody else commands, or that does not obey, is out of command from then on, until it is
         enabled again.

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, Mode, VehicleModel
-from sim_backends.models.vehicle import State as VehicleState
+from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, ChassisState, Mode, VehicleModel
 from sim_backends.models.wheel_drive import WheelDrive
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort, CanopenNode, Value
 from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
@@ -128,7 +127,7 @@ class CanopenPeer:
         self.model.tick(t)
         told = self.model.feedback(t)
         for drive, motors in zip(self.drives, _MOTORS, strict=True):
-            drive.wheel.power(told.state is not VehicleState.EMERGENCY_STOP)
+            drive.wheel.power(told.state is not ChassisState.EMERGENCY_STOP)
             if bits := told.drivers[motors[0]] | told.drivers[motors[1]]:
                 drive.fault(BLOCKED if bits & DRIVER_OVERLOAD else CURRENT)
             drive.wheel.step(dt, told.speed + drive.side * 0.5 * self.model.params.track * told.yaw_rate)

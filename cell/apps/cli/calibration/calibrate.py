@@ -24,7 +24,7 @@ from cell.apps.cli.options import (  # fmt: skip
 
 if TYPE_CHECKING:
     from cell.apps.recordings.attach import Options
-    from cell.measure.vision import Laser
+    from cell.measure.vision import LaserChannel
 
 
 def register(app: typer.Typer) -> None:
@@ -142,14 +142,14 @@ def _setup(text: str | None) -> str | None:
     return None if text is None else text.replace("-", "_")
 
 
-def _laser(text: str | None) -> Laser | None:
-    from cell.measure.vision import Laser
+def _laser(text: str | None) -> LaserChannel | None:
+    from cell.measure.vision import LaserChannel
     from drivers.errors import ConfigError
 
     allowed = ("none", "red", "green", "blue", "grey", "auto")
     if text not in (None, *allowed):
         raise ConfigError(f"--laser {text}: allowed are {', '.join(allowed)}")
-    return None if text == "none" else Laser(text or "auto")
+    return None if text == "none" else LaserChannel(text or "auto")
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:

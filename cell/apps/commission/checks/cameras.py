@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.measuring import measure
 from cell.apps.commission.mounting import RoughMounting, against_drawing
 from cell.apps.commission.seeing import Eye, eye_of, find_view
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.vision import BoardSpec
 from drivers.interfaces import Image
 
@@ -29,7 +29,7 @@ LEAST_CONTRAST = 25.0
 MOST_SATURATED = 1.0
 
 
-def _look(name: str, desk: Desk, result: Result) -> None:
+def _look(name: str, desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, name)
     seen = find_view(desk, result, eye)
     desk.keep(result, f"{name}-focus", seen.frame, seen.view.pixels)
@@ -65,7 +65,7 @@ def picture_figures(result: Result, image: Image, points: object, eye: Eye) -> N
     )  # fmt: skip
 
 
-def _mounting(name: str, desk: Desk, result: Result) -> None:
+def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, name)
     axes, found = measure(desk, result, eye)
     drawn = eye.config.flange_from_camera.se3()
@@ -92,7 +92,7 @@ def _mounting(name: str, desk: Desk, result: Result) -> None:
     _board(eye, result, axes.across, axes.along, found)
 
 
-def _carriage(desk: Desk, name: str) -> tuple[float, float]:
+def _carriage(desk: CommissionWorkplace, name: str) -> tuple[float, float]:
     """Between which ways along its x axis the camera may be from where it is drawn, m: at rail position 0."""
     if name != "scan_camera":
         return 0.0, 0.0
@@ -171,19 +171,19 @@ def _numbers(pose: pin.SE3) -> tuple[list[float], list[float]]:
     return at, turned
 
 
-def _camera_check(name: str, other: tuple[str, ...]) -> list[Check]:
+def _camera_check(name: str, other: tuple[str, ...]) -> list[CommissionCheck]:
     kind = name.removesuffix("_camera")
     plate = "calibration.fine" if kind == "scan" else "calibration.large"
     depth = "130" if kind == "scan" else "650"
     keys = (name, plate, "arm.model", "arm.vehicle_from_base", "rail.travel")[: 5 if kind == "scan" else 4]
     return [
-        Check(
+        CommissionCheck(
             f"{kind}_picture", f"{name}: light, focus and board in the picture",
             "the arm, in planned ways, until the board is seen", f"to {depth} mm above the board on the deck",
             "15 deg/s, 150 mm/s", "board found; brightness, contrast and sharpness in their limits",
             keys, other, partial(_look, name),
         ),
-        Check(
+        CommissionCheck(
             f"{kind}_mounting", f"{name}: its mounting, and the board's pitch, from shifted and turned views",
             "the flange by small steps before the board", "5 mm and 12 deg" if kind == "scan" else "30 mm and 12 deg",
             "15 deg/s, 150 mm/s", "within 8 deg and 20 mm of the drawing, board within 2.5 % of its name",

@@ -41,7 +41,7 @@ Answer = dict[str, Any]
 log = logging.getLogger(__name__)
 
 
-class Desk:
+class ConsoleController:
     """One cell's desk. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
 
     def __init__(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence
 from cell.measure.calibration.drift.hypotheses import (
     SCAN_DEPTH,
     SHIFT,
@@ -24,7 +24,7 @@ from cell.measure.calibration.drift.hypotheses import (
     log_mean,
     quadratic,
 )
-from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, State, tangents
+from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, AdjustmentState, tangents
 from cell.measure.geometry.camera import Array
 
 DETECTED = 0.95
@@ -94,7 +94,7 @@ def _shown(size: float, unit: str) -> float:
     return 1e3 * size if unit == "m" else float(np.degrees(size))
 
 
-def changes(chain: str, state: State) -> list[Change]:
+def changes(chain: str, state: AdjustmentState) -> list[Change]:
     """Every kind of change of the "scan" or the "target" chain, for its calibrated state."""
     unit = np.eye(SHARED)
     mount, lens, *others = dict.fromkeys(h.part for h in hypotheses(chain, state.camera.fx))
@@ -124,8 +124,8 @@ def changes(chain: str, state: State) -> list[Change]:
 
 
 def detectable(
-    evidences: Mapping[str, Evidence],
-    states: Mapping[str, State],
+    evidences: Mapping[str, DriftEvidence],
+    states: Mapping[str, AdjustmentState],
     tests: Sequence[tuple[str, Hypothesis]],
     scores: Mapping[str, Array],
     factors: Array,

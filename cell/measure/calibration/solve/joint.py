@@ -16,7 +16,7 @@ from cell.measure.calibration.solve.blocks import (
     CAMERA,
     COLUMNS,
     HAND,
-    State,
+    AdjustmentState,
     ViewData,
     dots_block,
     rests_of,
@@ -154,9 +154,9 @@ def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
     )
 
 
-def start_state(staged: Staged) -> State:
+def start_state(staged: Staged) -> AdjustmentState:
     """The joint adjustment's start."""
-    return State(
+    return AdjustmentState(
         staged.camera,
         None if staged.plane is None else staged.plane.plane,
         staged.hand_eye.rail_direction,
@@ -202,7 +202,7 @@ def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted
     return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
 
 
-def residuals_as_reported(state: State, view: ViewData) -> tuple[Array, Array]:
+def residuals_as_reported(state: AdjustmentState, view: ViewData) -> tuple[Array, Array]:
     """Residuals of the dots (n, 2) in px and of the stripe (m,) in m at the flange pose that the arm reports."""
     off, away = np.zeros((0, 2)), np.zeros(0)
     if len(view.points):

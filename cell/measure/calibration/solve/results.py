@@ -10,12 +10,12 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing, Witness, turned
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, turned
 from cell.measure.calibration.drift.roll import rolled
-from cell.measure.calibration.solve.blocks import HAND, SHARED, State
+from cell.measure.calibration.solve.blocks import HAND, SHARED, AdjustmentState
 from cell.measure.calibration.solve.bow import FLAT
 from cell.measure.calibration.solve.joint import Joint, effective_hand_eye_covariance
-from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.light_plane import LightPlane
@@ -79,11 +79,11 @@ class ScanCalibration:
     bow_sigma: float = 0.0
     bow_gain: Array = field(default_factory=lambda: np.zeros(KEPT))
     notes: tuple[str, ...] = ()
-    witness: Witness | None = None
+    witness: PlateLine | None = None
     pointing: Pointing | None = None
     exit_point: Array = field(default_factory=lambda: np.zeros(3))
     confirmed: ConfirmedTurn | None = None
-    timing: Timing | None = None
+    timing: StampTiming | None = None
     shutter: Shutter | None = None
     unread: tuple[str, ...] = ()
     refused: str = ""
@@ -121,7 +121,7 @@ class ScanCalibration:
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
-        state = State(
+        state = AdjustmentState(
             self.camera,
             self.light_plane,
             self.rail_direction,
@@ -191,7 +191,7 @@ class ScanCalibration:
                 return None
 
         again = "jobs go on with scan_camera.late until `cell calibrate timing` has measured it again"
-        timing = found("timing", Timing.read, again)
+        timing = found("timing", StampTiming.read, again)
         shutter = found("shutter", Shutter.read, "run `cell calibrate timing`, which looks at it again")
         alone = "jobs go by the plate on the claw alone until `cell calibrate verify` has seen the laser again"
         confirmed = found("confirmed", ConfirmedTurn.read, alone)
@@ -206,7 +206,7 @@ class ScanCalibration:
             float(plane.get("bow_sigma", 0.0)),
             np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
             tuple(data.get("notes", ())),
-            Witness.read(data.get("witness")),
+            PlateLine.read(data.get("witness")),
             confirmed=confirmed,
             timing=timing,
             shutter=shutter,

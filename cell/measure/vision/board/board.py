@@ -142,7 +142,7 @@ def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _PoseFit:
     """A pose, the residuals (n, 2) in px and in σ, the weights (n,) and the normal matrix (6, 6) in units of σ."""
 
     pose: pin.SE3
@@ -172,7 +172,7 @@ class _Fit:
         return float(np.sum(np.minimum(lengths, OUTLYING) ** 2 + 2 * OUTLYING**2 * np.log(far)))
 
 
-def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
+def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _PoseFit:
     """The pose nearest to `start`; points that the others contradict, as in a glint or a shadow's edge, count less."""
     fit = _refined(view, camera, start, np.ones(len(view.ids)))
     for _ in range(ROUNDS):
@@ -185,7 +185,7 @@ def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
     return fit
 
 
-def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _Fit:
+def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _PoseFit:
     """Levenberg's method on the pose, the points weighted by `weights` (n,) over their variances."""
     points, pixels = np.ascontiguousarray(view.object_points), np.empty(view.pixels.shape)
     lens, radius, factor = camera.parameters, float(view.dot_radius), np.sqrt(weights) / view.sigma
@@ -217,4 +217,4 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
             damping *= 10
             if damping > 1e6:
                 break
-    return _Fit(pose, residual, residual / view.sigma[:, None], weights, normal)
+    return _PoseFit(pose, residual, residual / view.sigma[:, None], weights, normal)

@@ -14,13 +14,13 @@ import numpy as np
 
 from sim_backends.models.arm_circle import ArcMove
 from sim_backends.models.arm_kinematics import Matrix, Vector
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 from sim_backends.peers.arm.script.context import CYCLE, Job, ProgramError
 from sim_backends.peers.arm.script.motion import tool_contact
 from sim_backends.peers.arm.urscript.arithmetic import matrix
 from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import Pose
+from sim_backends.peers.arm.urscript.values import ScriptPose
 
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""
@@ -41,10 +41,10 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     e = environment
 
     def joints(target: Any) -> Vector:
-        return e.context.solve(matrix(target)) if isinstance(target, Pose) else _six(target)
+        return e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)
 
     def tool(target: Any) -> Matrix:
-        return matrix(target) if isinstance(target, Pose) else e.context.forward(_six(target))
+        return matrix(target) if isinstance(target, ScriptPose) else e.context.forward(_six(target))
 
     def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
         goal = joints(q)
@@ -73,10 +73,10 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         yield from movel(pose, 2.5 * a, v)
 
     def stopj(a: float = 2.0) -> Job:
-        yield from e.move(Stop(a))
+        yield from e.move(StopMotion(a))
 
     def stopl(a: float = 1.2, aRot: float = 0) -> Job:
-        yield from e.move(Stop(a, linear=True))
+        yield from e.move(StopMotion(a, linear=True))
 
     def servoj(
         q: Any, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
@@ -101,7 +101,7 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     def end_force_mode() -> Job:
         if e.force is not None:
             e.force = None
-            yield from e.move(Stop(10.0, linear=True))
+            yield from e.move(StopMotion(10.0, linear=True))
 
     def tool_contact_(direction: Any = (0.0,) * 6) -> int:
         return tool_contact(e.context, _six(direction))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
+from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, StripeChain, candidates, follow
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
 from cell.measure.vision.stripe.careful.segments import fill_gaps
 from cell.measure.vision.stripe.careful.shape import Shape
@@ -21,7 +21,7 @@ from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, 
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
 from cell.measure.vision.stripe.careful.validation import MISFIT_SIGMAS
 from cell.measure.vision.stripe.overview import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
-from cell.measure.vision.stripe.planes import MIXES, Laser, Picture
+from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
 
 if TYPE_CHECKING:
     from cell.measure.vision.stripe.profile import StripeSettings
@@ -65,7 +65,7 @@ class Careful:
 
 
 def read_carefully(
-    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None = None,
+    picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None = None,
     starts: Array | None = None,
 ) -> Careful:  # fmt: skip
     """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
@@ -83,7 +83,7 @@ def read_carefully(
 
 
 def _of_one_width(
-    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None,
+    picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None,
     starts: Array | None,
 ) -> Careful:  # fmt: skip
     """`read_carefully` without what differs in width from the rest by more than twice."""
@@ -127,14 +127,14 @@ def _of_one_width(
     )  # fmt: skip
 
 
-def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float, float]:
+def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, StripeChain, float, float]:
     """Candidates and chain in all rows, the scale in px that answers most, and by how many px rows were blurred."""
     scales = np.asarray(SCALES)
     typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
     if not typical:
         found, chain, along = coarse(value)
         if not len(chain.rows) or chain.score < LEAST_SCORE:
-            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
+            return found, StripeChain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))
     typical = min(typical, SCALES[-1])
@@ -160,7 +160,7 @@ def _bridge(place: Array) -> Array:
     return filled
 
 
-def _rivals(found: Candidates, chain: Chain) -> Array:
+def _rivals(found: Candidates, chain: StripeChain) -> Array:
     """Response of the best candidate beside the chain over the chain's, of each row (m,), 0 where none is clear."""
     rival = np.zeros(len(found.rows))
     own = found.response[chain.rows, chain.which]
@@ -171,7 +171,7 @@ def _rivals(found: Candidates, chain: Chain) -> Array:
     return np.maximum(rival, _second_line(found, chain))
 
 
-def _second_line(found: Candidates, chain: Chain) -> Array:
+def _second_line(found: Candidates, chain: StripeChain) -> Array:
     """Response of a second line that runs beside the chain over the chain's (m,): its mean in rows where it hides."""
     scale = float(np.median(found.scale[chain.rows, chain.which]))
     own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])

@@ -54,7 +54,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Chain:
+class StripeChain:
     """The line that was followed: `rows` (k,), indices of those of the candidates, `which` of them, and the `piece`
     each belongs to. `score` is what it says for itself, a row on average, less what in the picture says otherwise."""
 
@@ -128,7 +128,7 @@ def _noise(response: NDArray[np.float32]) -> float:
     return max(float(middle - low) / 0.5244, 0.05)
 
 
-def follow(found: Candidates, spacing: float = 1.0) -> Chain:
+def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
     """The chain through `found` whose rows are `spacing` px apart on average."""
     m = len(found.rows)
     # Of two lines that are clear alike the one with more light; not so much that a dark spot makes the chain jump.
@@ -152,10 +152,10 @@ def follow(found: Candidates, spacing: float = 1.0) -> Chain:
     return _believed(found, order, chosen, piece)
 
 
-def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
+def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> StripeChain:
     """Without the pieces that noise may have made."""
     if not len(rows):
-        return Chain(rows, which, piece, 0.0)
+        return StripeChain(rows, which, piece, 0.0)
     said = np.minimum(found.clear[rows, which], MOST) - LEAST
     keep = np.zeros(len(rows), np.bool_)
     scale = found.scale[rows, which]
@@ -172,7 +172,7 @@ def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
     rows, which, piece, said = rows[keep], which[keep], piece[keep], said[keep]
     rivals = np.clip(others.max(axis=1) - 2 * LEAST, 0.0, MOST).sum()
     score = float(said.sum() - JUMP * len(np.unique(piece)) - AGAINST * rivals)
-    return Chain(rows, which, piece, score / len(found.rows))
+    return StripeChain(rows, which, piece, score / len(found.rows))
 
 
 @compiled

@@ -43,7 +43,7 @@ MISTAKABLE = 0.02
 """Share of the lines with a second peak from which the quick search may have followed the wrong one."""
 
 
-class Verdict(Enum):
+class QuickVerdict(Enum):
     """What the quick way says of its own result."""
 
     ORDINARY = "nothing more to be said"
@@ -53,7 +53,7 @@ class Verdict(Enum):
 
 def read_quickly(
     image: Image, dark: Any, axis: Axis, settings: StripeSettings, like: StripeProfile | None
-) -> tuple[StripeProfile, Verdict]:
+) -> tuple[StripeProfile, QuickVerdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
@@ -96,9 +96,9 @@ def read_quickly(
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
     profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
     if like is not None and like.speckle is not None:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     ordinary = (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
@@ -109,9 +109,9 @@ def read_quickly(
         and not is_textured(seen)
     )
     if ordinary:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     second = float(np.mean(start[profile.valid, 1, find.ENERGY] > 0)) if profile.valid.any() else 1.0
-    return profile, Verdict.UNMISTAKABLE if second < MISTAKABLE else Verdict.NOT_ORDINARY
+    return profile, QuickVerdict.UNMISTAKABLE if second < MISTAKABLE else QuickVerdict.NOT_ORDINARY
 
 
 def _lines(part: Any, axis: Axis) -> Any:
