@@ -113,9 +113,13 @@ class ServedCell:
             self._told = _bound(bound, FollowingPeer(world, self.following)) if follow else None
             self._truth = _bound(bound, TruthPeer(self.truth, self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
+        self._faults = self._fault_actions()
+
+    def _fault_actions(self) -> dict[str, Callable[[], None]]:
+        """What causes each fault, by its name; none of devices that are real."""
         arm, rail, vehicle = self._arm, self._rail, self._vehicle
-        self._faults: dict[str, Callable[[], None]] = {
-            **({name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS} if arm else {}),
+        return {
+            **({name: partial(self.world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS} if arm else {}),
             **({name: partial(arm.fault, name) for name in CONTROLLER_FAULTS} if arm else {}),
             **({name: partial(rail.fault, name) for name in RAIL_FAULTS} if rail else {}),
             **({name: partial(vehicle.fault, name) for name in VEHICLE_FAULTS} if vehicle else {}),

@@ -133,6 +133,12 @@ class AgilexPeer:
     def _receive(self, frame: CanFrame) -> None:
         if frame.extended or frame.remote or not frame.data:
             return
+        if frame.id in (VERSION_REQUEST, VERSION_TEXT):
+            self._tell_version(frame)
+        else:
+            self._obey(frame)
+
+    def _obey(self, frame: CanFrame) -> None:
         t, model, first = self._clock.now(), self.model, frame.data[0]
         if frame.id == MOTION_COMMAND and len(frame.data) >= 4:
             speed, yaw_rate = struct.unpack_from(">hh", frame.data)
@@ -145,10 +151,13 @@ class AgilexPeer:
             model.set_motion_mode(t, first)
         elif frame.id == CLEAR:
             model.clear_errors(t)
-        elif frame.id == VERSION_REQUEST and first == 1:
-            self._bus.send([CanFrame(VERSION_NUMBERS, struct.pack(">4H", *model.params.versions))])
-        elif frame.id == VERSION_TEXT and frame.data == b"\x01":
-            self._bus.send([CanFrame(VERSION_TEXT, part) for part in _version_text(model.params.versions)])
+
+    def _tell_version(self, asked: CanFrame) -> None:
+        versions = self.model.params.versions
+        if asked.id == VERSION_REQUEST and asked.data[0] == 1:
+            self._bus.send([CanFrame(VERSION_NUMBERS, struct.pack(">4H", *versions))])
+        elif asked.id == VERSION_TEXT and asked.data == b"\x01":
+            self._bus.send([CanFrame(VERSION_TEXT, part) for part in _version_text(versions)])
 
 
 def _version_text(versions: tuple[int, int, int, int]) -> list[bytes]:
